@@ -1,0 +1,327 @@
+"""PPO (Schulman et al. 2017) for P members at once; a single agent is P = 1.
+
+Read down the page: State, Actor, init, act, loss, update. The settings are ``config.PPO``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.config import PPO
+from skillweave.networks.stacked import Layout, Views, mlp, mlp_init_, mlp_shapes
+from skillweave.ops.distributions import (
+    categorical_sample,
+    categorical_stats,
+    gumbel,
+    mask_logits,
+    normal_stats,
+)
+from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
+from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate, merge_moments
+from skillweave.ops.returns import explained_variance, gae, normalise
+from skillweave.seeding import Seeds
+from skillweave.spaces import action_codec, obs_codec
+from skillweave.types import Transition
+
+_LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
+
+
+@dataclass
+class State:
+    """Everything PPO learns and counts; P members, D parameters, O observation numbers."""
+
+    params: Tensor  # (P, D), actor first, then critic
+    mu: Tensor  # (P, D), Adam's first moment
+    nu: Tensor  # (P, D), Adam's second moment
+    count: Tensor  # (P,), Adam's steps
+    obs_mean: Tensor  # (P, O)
+    obs_var: Tensor  # (P, O)
+    obs_count: Tensor  # (P,)
+    return_mean: Tensor  # (P, 1)
+    return_var: Tensor  # (P, 1)
+    return_count: Tensor  # (P,)
+    learning_rate: Tensor  # (P,); this and all below are settings, one a member
+    gamma: Tensor  # (P,)
+    gae_lambda: Tensor  # (P,)
+    clip_coef: Tensor  # (P,)
+    ent_coef: Tensor  # (P,)
+    vf_coef: Tensor  # (P,)
+    max_grad_norm: Tensor  # (P,)
+
+
+@dataclass
+class Actor:
+    """What acting needs of a State: a copy, so that learning may go on beside it."""
+
+    views: dict[str, Tensor]  # the actor's parameters, each (P, *shape)
+    shift: Tensor | None  # (P, 1, O), where observations are normalised
+    scale: Tensor | None  # (P, 1, O)
+
+
+@dataclass
+class Rollout:
+    """Transitions with what the acting policy's distribution was (``head``: logits, or mean)."""
+
+    transition: Transition
+    head: Tensor  # (P, T, B, A)
+    log_std: Tensor | None  # (P, 1, 1, A), continuous actions
+
+
+class PPOAlgorithm:
+    """PPO on one pair of spaces. Holds no learnt state: that is in ``State``."""
+
+    def __init__(
+        self, config: PPO, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+    ) -> None:
+        self.config = config
+        self.observation_space, self.action_space = observation_space, action_space
+        self.obs, self.action = obs_codec(observation_space), action_codec(action_space)
+        self.critic_net = config.critic or config.network
+        actor = mlp_shapes("actor", self.obs.size, config.network, self.action.size)
+        if not self.action.discrete:
+            actor["actor.log_std"] = (1, self.action.size)
+        critic = mlp_shapes("critic", self.obs.size, self.critic_net, 1)
+        self.actor_layout, self.layout = Layout(actor), Layout(actor | critic)
+        self.normalize_obs = config.normalize_obs and self.obs.scaled
+
+    def init(self, seeds: list[Seeds]) -> State:
+        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+        members, cfg = len(seeds), self.config
+        params = torch.zeros(members, self.layout.size)
+        views = self.layout.views(params)
+        generators = [(s / "init").torch() for s in seeds]
+        mlp_init_(views, "actor", cfg.network, 0.01, generators)
+        mlp_init_(views, "critic", self.critic_net, 1.0, generators)
+        if not self.action.discrete:
+            views["actor.log_std"].fill_(cfg.action_std_init).log_()
+
+        def setting(value: float) -> Tensor:
+            return torch.full((members,), value)
+
+        return State(
+            params=params,
+            mu=torch.zeros_like(params),
+            nu=torch.zeros_like(params),
+            count=torch.zeros(members),
+            obs_mean=torch.zeros(members, self.obs.size),
+            obs_var=torch.ones(members, self.obs.size),
+            obs_count=torch.full((members,), 1e-4),
+            return_mean=torch.zeros(members, 1),
+            return_var=torch.ones(members, 1),
+            return_count=torch.full((members,), 1e-4),
+            learning_rate=setting(cfg.learning_rate),
+            gamma=setting(cfg.gamma),
+            gae_lambda=setting(cfg.gae_lambda),
+            clip_coef=setting(cfg.clip_coef),
+            ent_coef=setting(cfg.ent_coef),
+            vf_coef=setting(cfg.vf_coef),
+            max_grad_norm=setting(cfg.max_grad_norm),
+        )
+
+    def actor(self, state: State) -> Actor:
+        """A copy of what acting needs."""
+        flat = state.params[:, : self.actor_layout.size].clone()
+        if not self.normalize_obs:
+            return Actor(self.actor_layout.views(flat), None, None)
+        scale = (state.obs_var + 1e-8).rsqrt()[:, None]
+        return Actor(self.actor_layout.views(flat), state.obs_mean[:, None].clone(), scale)
+
+    def noise(self, seeds: list[Seeds], steps: int, batch: int) -> Tensor:
+        """Noise for ``steps`` calls of ``act``: (steps, P, batch, A), a stream a member."""
+        shape = (steps, batch, self.action.size)
+        if self.action.discrete:
+            drawn = [gumbel(torch.rand(shape, generator=s.torch())) for s in seeds]
+        else:
+            drawn = [torch.randn(shape, generator=s.torch()) for s in seeds]
+        return torch.stack(drawn, dim=1)
+
+    def act(
+        self, actor: Actor, obs: Tensor, mask: Tensor | None, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Actions in policy units, and the head they came from.
+
+        Args:
+            obs: (P, B, *obs_shape), raw.
+            mask: (P, B, A) bool or None.
+            noise: (P, B, A), or None to act greedily.
+
+        Returns:
+            Actions (P, B) int64 or (P, B, A) float; head (P, B, A).
+        """
+        head = mlp(actor.views, "actor", self.config.network, self._inputs(obs, actor))
+        if self.action.discrete:
+            head = mask_logits(head, mask)
+            action = head.argmax(-1) if noise is None else categorical_sample(head, noise)
+            return action, head
+        if noise is None:
+            return head, head
+        return torch.addcmul(head, actor.views["actor.log_std"].exp(), noise), head
+
+    def value(self, state: State, obs: Tensor) -> Tensor:
+        """V in reward units; raw observations (P, B, *obs_shape) to (P, B)."""
+        inputs = self._inputs(obs, self.actor(state))
+        return self._value(self.layout.views(state.params), state, inputs)
+
+    def update(
+        self, state: State, rollout: Rollout, progress: float, seeds: list[Seeds]
+    ) -> tuple[State, dict[str, Tensor]]:
+        """Learn from a rollout, in place; returns the state and metrics of shape (P,).
+
+        Args:
+            progress: share of the budget that is spent, for the learning-rate schedule.
+            seeds: one a member, for the order of the minibatches.
+        """
+        cfg, tr = self.config, rollout.transition
+        data, metrics = self._prepare(state, rollout)
+        size = data["advantage"].shape[1]
+        minibatches = max(1, size // cfg.batch_size)
+        leaves = self.layout.leaves(state.params)
+        rate = state.learning_rate
+        if cfg.learning_rate_schedule == "linear":
+            rate = rate * (1.0 - progress)
+        stops = cfg.target_kl is not None and cfg.learning_rate_schedule != "kl"
+        active = torch.ones(len(seeds), dtype=torch.bool) if stops else None
+        sums: dict[str, Tensor] = {}
+        for epoch in range(cfg.update_epochs):
+            order = [torch.randperm(size, generator=(s / epoch).torch()) for s in seeds]
+            shuffled = {k: _take(v, torch.stack(order)) for k, v in data.items()}
+            for part in range(minibatches):
+                cut = slice(part * size // minibatches, (part + 1) * size // minibatches)
+                batch = {k: v[:, cut] for k, v in shuffled.items()}
+                loss, report = self.loss(leaves, state, batch)
+                grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
+                grad = torch.cat([g.flatten(1) for g in grads], dim=1)
+                report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
+                if active is not None:
+                    # As in Stable-Baselines3: a member stops before the step that oversteps.
+                    active = active & (report["kl"] <= 1.5 * cfg.target_kl)  # type: ignore[operator]
+                    if not bool(active.any()):
+                        break
+                adam_(
+                    state.params, grad, state.mu, state.nu, state.count, rate,
+                    eps=cfg.adam_eps, active=active,
+                )  # fmt: skip
+                for k, v in report.items():
+                    sums[k] = sums[k] + v if k in sums else v
+            if active is not None and not bool(active.any()):
+                break
+        steps = max(1, minibatches * cfg.update_epochs)
+        metrics |= {k: v / steps for k, v in sums.items()}
+        if cfg.learning_rate_schedule == "kl":
+            target = torch.full_like(rate, cfg.target_kl or 0.0)
+            state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)
+        metrics["learning_rate"] = rate
+        metrics["samples"] = torch.full_like(rate, float(tr.reward[0].numel()))
+        return state, metrics
+
+    def loss(
+        self, views: Views, state: State, batch: Mapping[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Policy, value and entropy loss of one minibatch, (P,), and detached metrics (P,)."""
+        head = mlp(views, "actor", self.config.network, batch["inputs"])
+        log_prob, entropy = self._stats(head, views.get("actor.log_std"), batch)
+        policy = ppo_policy_loss(log_prob, batch["log_prob"], batch["advantage"], state.clip_coef)
+        raw = mlp(views, "critic", self.critic_net, batch["inputs"]).squeeze(-1)
+        clip = self.config.clip_value
+        bound = None if clip is None else torch.full_like(state.clip_coef, clip)
+        value = value_loss(raw, batch["target"], batch.get("old_value"), bound)
+        bonus = entropy.mean(1)
+        total = policy + state.vf_coef * value - state.ent_coef * bonus
+        with torch.no_grad():
+            kl = approximate_kl(log_prob, batch["log_prob"])
+        report = {"policy_loss": policy, "value_loss": value, "entropy": bonus, "kl": kl}
+        return total, {k: v.detach() for k, v in report.items()}
+
+    @torch.no_grad()
+    def _prepare(
+        self, state: State, rollout: Rollout
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The rollout as flat (P, T·B) tensors: inputs, action, log-prob, advantage, target."""
+        cfg, tr = self.config, rollout.transition
+        members, lead = tr.reward.shape[0], tr.reward.shape
+        batch = {"action": tr.action.flatten(1, 2), "head": rollout.head.flatten(1, 2)}
+        if tr.mask is not None:
+            batch["mask"] = tr.mask.flatten(1, 2)
+        log_std = None if rollout.log_std is None else rollout.log_std.flatten(1, 2)
+        old_log_prob, _ = self._stats(batch.pop("head"), log_std, batch)
+        if self.normalize_obs:
+            encoded = self.obs.encode(tr.obs.flatten(1, 2))
+            moments = state.obs_mean, state.obs_var, state.obs_count
+            state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, encoded)
+        actor, views = self.actor(state), self.layout.views(state.params)
+        inputs = self._inputs(tr.obs.flatten(1, 2), actor)
+        value = self._value(views, state, inputs).view(lead)
+        next_value = self._next_value(views, state, actor, value, tr)
+        advantage = gae(
+            tr.reward, tr.discount, value, next_value, tr.last, state.gae_lambda
+        )
+        returns = (advantage + value).flatten(1)
+        metrics = {"explained_variance": explained_variance(value.flatten(1), returns)}
+        if cfg.normalize_returns:
+            moments = state.return_mean, state.return_var, state.return_count
+            state.return_mean, state.return_var, state.return_count = merge_moments(
+                *moments, returns[..., None]
+            )
+        if cfg.normalize_advantage:
+            advantage = normalise(advantage)
+        batch |= {
+            "inputs": inputs,
+            "log_prob": old_log_prob,
+            "advantage": advantage.reshape(members, -1),
+            "target": (returns - state.return_mean) / self._return_scale(state),
+        }
+        if cfg.clip_value is not None:
+            old = value.flatten(1) - state.return_mean
+            batch["old_value"] = old / self._return_scale(state)
+        return batch, metrics
+
+    def _next_value(
+        self, views: Views, state: State, actor: Actor, value: Tensor, tr: Transition
+    ) -> Tensor:
+        """V(next_obs), (P, T, B): shifted values, computed anew only where trajectories end."""
+        next_value = torch.zeros_like(value)
+        next_value[:, :-1] = value[:, 1:]
+        last = tr.last.flatten(1)
+        widest = int(last.sum(1).max())
+        # Members may have different numbers of ends: the first `widest` of a stable sort holds
+        # them all, and the surplus rows are only computed, then overwritten by their own value.
+        rows = last.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :widest]
+        ends = self._value(views, state, self._inputs(_take(tr.next_obs.flatten(1, 2), rows), actor))
+        flat = next_value.flatten(1)
+        ends = torch.where(last.gather(1, rows), ends, flat.gather(1, rows))
+        return flat.scatter(1, rows, ends).view_as(value)
+
+    def _inputs(self, obs: Tensor, actor: Actor) -> Tensor:
+        x = self.obs.encode(obs)
+        if actor.shift is None or actor.scale is None:
+            return x
+        return ((x - actor.shift) * actor.scale).clamp(-10.0, 10.0)
+
+    def _stats(
+        self, head: Tensor, log_std: Tensor | None, batch: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Log-probability of the batch's actions and entropy, each (P, B)."""
+        if log_std is None:
+            logits = mask_logits(head, batch.get("mask"))
+            return categorical_stats(logits, batch["action"])
+        return normal_stats(head, log_std, batch["action"])
+
+    def _value(self, views: Views, state: State, inputs: Tensor) -> Tensor:
+        raw = mlp(views, "critic", self.critic_net, inputs).squeeze(-1)
+        return raw * self._return_scale(state) + state.return_mean
+
+    def _return_scale(self, state: State) -> Tensor:
+        return (state.return_var + 1e-8).sqrt()
+
+
+def _take(x: Tensor, rows: Tensor) -> Tensor:
+    """Rows of each member: x (P, B, ...), rows (P, K) to (P, K, ...)."""
+    if x.shape[0] == 1:
+        return x[0].index_select(0, rows[0])[None]
+    return x[torch.arange(x.shape[0])[:, None], rows]

@@ -1,0 +1,69 @@
+"""The rollout: T steps of N environments, in the order in which they happened."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.types import Array, Transition, VecStep
+
+
+class RolloutBuffer:
+    """Filled a step at a time, then read once as a ``Transition``.
+
+    N = P·B columns: the environments of member 0 first, then those of member 1, and so on.
+    """
+
+    def __init__(
+        self, n_steps: int, num_envs: int, members: int, observation_space: gym.Space
+    ) -> None:
+        self._members, self._at = members, 0
+        lead, shape = (n_steps, num_envs), observation_space.shape or ()
+        self._obs = np.empty((*lead, *shape), observation_space.dtype)
+        self._next_obs = np.empty((*lead, *shape), observation_space.dtype)
+        self._reward = np.empty(lead, np.float32)
+        self._steps = np.empty(lead, np.float32)
+        self._terminated = np.empty(lead, bool)
+        self._last = np.empty(lead, bool)
+        self._mask: list[Array | None] = [None] * n_steps
+        self._action: list[Tensor] = []
+        self._head: list[Tensor] = []
+
+    def add(
+        self, obs: Array, mask: Array | None, action: Tensor, head: Tensor, step: VecStep
+    ) -> None:
+        """Append one step; action (P, B, ...) and head (P, B, A) in policy units."""
+        t = self._at
+        self._obs[t], self._next_obs[t] = obs, step.next_obs
+        self._reward[t], self._steps[t] = step.reward, step.steps
+        self._terminated[t] = step.terminated
+        np.logical_or(step.terminated, step.truncated, out=self._last[t])
+        self._mask[t] = mask
+        self._action.append(action)
+        self._head.append(head)
+        self._at += 1
+
+    def read(self, gamma: Tensor) -> tuple[Transition, Tensor]:
+        """The transitions, discounted by each member's γ (P,), and the heads (P, T, B, A)."""
+        self._last[self._at - 1] = True  # the end of the rollout cuts every trajectory
+        steps = self._by_member(self._steps)
+        alive = self._by_member(~self._terminated)
+        discount = gamma[:, None, None].pow(steps) * alive
+        masks = [m for m in self._mask if m is not None]
+        transition = Transition(
+            obs=self._by_member(self._obs),
+            action=torch.stack(self._action, dim=1),
+            reward=self._by_member(self._reward),
+            discount=discount,
+            next_obs=self._by_member(self._next_obs),
+            last=self._by_member(self._last),
+            mask=self._by_member(np.stack(masks)) if masks else None,
+        )
+        return transition, torch.stack(self._head, dim=1)
+
+    def _by_member(self, x: Array) -> Tensor:
+        """(T, P·B, ...) to (P, T, B, ...)."""
+        split = x.reshape(x.shape[0], self._members, -1, *x.shape[2:])
+        return torch.from_numpy(split).transpose(0, 1).contiguous()

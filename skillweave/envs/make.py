@@ -1,0 +1,100 @@
+"""Which environment, and by which engine: ``EnvSpec`` and ``make_engine``."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import gymnasium as gym
+
+from skillweave.envs.engine import Engine, EnvPoolEngine, GymnasiumEngine
+from skillweave.types import MissingExtra, SkillweaveError
+
+EngineName = Literal["auto", "envpool", "sync", "async"]
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """An environment to make as often as needed.
+
+    Args:
+        env: a Gymnasium id, or a function that makes one environment.
+        kwargs: passed to ``gymnasium.make``.
+        wrappers: applied to each environment, first one first.
+        engine: envpool; sync (one process); async (a process each, for slow environments);
+            auto takes EnvPool where it has the environment as Gymnasium defines it, else sync.
+    """
+
+    env: str | Callable[[], gym.Env[Any, Any]]
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    wrappers: tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...] = ()
+    engine: EngineName = "auto"
+
+    def make(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
+        """One environment of Gymnasium's.
+
+        Raises:
+            SkillweaveError: no such environment (with close matches), or a missing dependency.
+        """
+        if callable(self.env):
+            try:
+                env = self.env() if render_mode is None else self.env(render_mode=render_mode)  # type: ignore[call-arg]
+            except TypeError as error:
+                if render_mode is None:
+                    raise
+                raise SkillweaveError(
+                    f"{self.name} cannot be rendered: the function that makes it must take "
+                    f"render_mode ({error})"
+                ) from error
+        else:
+            env = self._from_registry(self.env, render_mode)
+        for wrapper in self.wrappers:
+            env = wrapper(env)
+        return env
+
+    def _from_registry(self, env_id: str, render_mode: str | None) -> gym.Env[Any, Any]:
+        try:
+            return gym.make(env_id, render_mode=render_mode, **self.kwargs)
+        except gym.error.DependencyNotInstalled as error:
+            if "box2d" in str(error).lower():
+                raise MissingExtra(f"the environment {env_id}", "box2d") from error
+            raise SkillweaveError(f"the environment {env_id} needs more: {error}") from error
+        except (gym.error.UnregisteredEnv, gym.error.Error) as error:
+            near = difflib.get_close_matches(env_id, list(gym.registry), n=4, cutoff=0.6)
+            hint = f" Close matches: {', '.join(near)}." if near else ""
+            raise SkillweaveError(f"no environment {env_id!r}: {error}.{hint}") from error
+
+    @property
+    def name(self) -> str:
+        """The id, or the name of the function."""
+        if isinstance(self.env, str):
+            return self.env
+        return getattr(self.env, "__name__", type(self.env).__name__)
+
+    @property
+    def is_data(self) -> bool:
+        """Whether an id and plain settings say it all, without any code of the user's."""
+        return isinstance(self.env, str) and ":" not in self.env and not self.wrappers
+
+
+def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None) -> Engine:
+    """The engine for ``num_envs`` environments of this kind; ``threads`` for EnvPool's pool."""
+    cores = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0, 1])
+    if spec.engine in ("auto", "envpool"):
+        reference = spec.make()
+        try:
+            plain = isinstance(spec.env, str) and not spec.kwargs and not spec.wrappers
+            if plain and EnvPoolEngine.supports(str(spec.env), reference):
+                return EnvPoolEngine(str(spec.env), num_envs, cores, reference)
+        finally:
+            reference.close()
+        if spec.engine == "envpool":
+            raise SkillweaveError(
+                f"EnvPool cannot run {spec.name}: it is not installed (extra 'envpool'), or lacks the "
+                "environment with these spaces, settings and wrappers; use engine='auto'"
+            )
+    return GymnasiumEngine(functools.partial(spec.make), num_envs, spec.engine == "async")

@@ -1,0 +1,101 @@
+"""Stacked layers: P members of one architecture as one set of tensors.
+
+All parameters of a network stand in one flat tensor (P, D); ``Layout`` knows which columns are
+which. So cloning, clipping, Adam, saving and selecting members are one operation each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from skillweave.networks.config import MLP, Activation
+
+Views = Mapping[str, Tensor]
+"""Named parameters, each (P, *shape)."""
+
+ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
+    "tanh": torch.tanh,
+    "relu": torch.relu,
+    "elu": F.elu,
+    "silu": F.silu,
+    "gelu": F.gelu,
+}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names and shapes of the parameters in the columns of a flat (P, D) tensor, in order."""
+
+    shapes: dict[str, tuple[int, ...]]
+
+    @property
+    def size(self) -> int:
+        """D, the number of parameters of one member."""
+        return sum(math.prod(s) for s in self.shapes.values())
+
+    def views(self, flat: Tensor) -> dict[str, Tensor]:
+        """Windows into ``flat`` (P, D), each (P, *shape); writing to one writes to ``flat``."""
+        parts = flat.split([math.prod(s) for s in self.shapes.values()], dim=1)
+        named = zip(self.shapes.items(), parts, strict=True)
+        return {name: part.view(-1, *shape) for (name, shape), part in named}
+
+    def leaves(self, flat: Tensor) -> dict[str, Tensor]:
+        """Like ``views``, each a leaf that can be differentiated by."""
+        return {k: v.detach().requires_grad_() for k, v in self.views(flat).items()}
+
+    def flatten(self, named: Mapping[str, Tensor]) -> Tensor:
+        """The inverse of ``views``: (P, D) from tensors (P, *shape), copied."""
+        return torch.cat([named[name].flatten(1) for name in self.shapes], dim=1)
+
+
+def mlp_shapes(prefix: str, inputs: int, net: MLP, outputs: int) -> dict[str, tuple[int, ...]]:
+    """Parameter names and shapes of an MLP; weights are (in, out), biases (1, out)."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    widths = (inputs, *net.hidden, outputs)
+    for i, (n_in, n_out) in enumerate(zip(widths, widths[1:], strict=False)):
+        shapes[f"{prefix}.{i}.weight"] = (n_in, n_out)
+        shapes[f"{prefix}.{i}.bias"] = (1, n_out)
+        if net.layer_norm and i < len(net.hidden):
+            shapes[f"{prefix}.{i}.norm_weight"] = (1, n_out)
+            shapes[f"{prefix}.{i}.norm_bias"] = (1, n_out)
+    return shapes
+
+
+def mlp_init_(
+    views: Views, prefix: str, net: MLP, head_gain: float, generators: list[torch.Generator]
+) -> None:
+    """Orthogonal weights in place, gain √2 (``head_gain`` for the last layer), biases zero.
+
+    One generator a member, so a member's weights do not depend on its neighbours.
+    """
+    for i in range(len(net.hidden) + 1):
+        gain = head_gain if i == len(net.hidden) else math.sqrt(2.0)
+        weight = views[f"{prefix}.{i}.weight"]
+        for member, generator in enumerate(generators):
+            fresh = torch.empty(weight.shape[1:])
+            torch.nn.init.orthogonal_(fresh, gain, generator=generator)
+            weight[member].copy_(fresh)
+        views[f"{prefix}.{i}.bias"].zero_()
+        if net.layer_norm and i < len(net.hidden):
+            views[f"{prefix}.{i}.norm_weight"].fill_(1.0)
+            views[f"{prefix}.{i}.norm_bias"].zero_()
+
+
+def mlp(views: Views, prefix: str, net: MLP, x: Tensor) -> Tensor:
+    """(P, B, in) to (P, B, out)."""
+    activation = ACTIVATIONS[net.activation]
+    for i in range(len(net.hidden)):
+        x = torch.baddbmm(views[f"{prefix}.{i}.bias"], x, views[f"{prefix}.{i}.weight"])
+        if net.layer_norm:
+            x = F.layer_norm(x, x.shape[-1:])
+            norm_bias = views[f"{prefix}.{i}.norm_bias"]
+            x = torch.addcmul(norm_bias, x, views[f"{prefix}.{i}.norm_weight"])
+        x = activation(x)
+    i = len(net.hidden)
+    return torch.baddbmm(views[f"{prefix}.{i}.bias"], x, views[f"{prefix}.{i}.weight"])

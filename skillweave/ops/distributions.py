@@ -1,0 +1,46 @@
+"""Action distributions as functions of their parameters; the last axis is the action's."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+_HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+def mask_logits(logits: Tensor, mask: Tensor | None) -> Tensor:
+    """Logits with forbidden actions at the smallest finite number; both (..., A).
+
+    A finite number keeps entropy and gradients finite (Huang & Ontañón 2022).
+    """
+    if mask is None:
+        return logits
+    return logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
+
+
+def gumbel(uniform: Tensor) -> Tensor:
+    """Gumbel noise ``−log(−log u)`` from uniform noise in [0, 1); any shape."""
+    tiny = torch.finfo(uniform.dtype).tiny
+    return -torch.log(-torch.log(uniform.clamp_min(tiny)).clamp_min(tiny))
+
+
+def categorical_sample(logits: Tensor, noise: Tensor) -> Tensor:
+    """A sample by the Gumbel-max trick; logits and Gumbel noise (..., A) to (...) int64."""
+    return torch.argmax(logits + noise, dim=-1)
+
+
+def categorical_stats(logits: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Log-probability of ``action`` and entropy; (..., A), (...) int64 to (...), (...)."""
+    log_p = torch.log_softmax(logits, dim=-1)
+    chosen = log_p.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+    return chosen, -(log_p.exp() * log_p).sum(-1)
+
+
+def normal_stats(mean: Tensor, log_std: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Log-density and entropy of independent normals; (..., A) to (...), (...)."""
+    z = (action - mean) * torch.exp(-log_std)
+    log_prob = (-0.5 * z.square() - log_std - _HALF_LOG_TWO_PI).sum(-1)
+    entropy = (log_std + 0.5 + _HALF_LOG_TWO_PI).expand_as(mean).sum(-1)
+    return log_prob, entropy

@@ -1,0 +1,86 @@
+"""Optimiser maths on flat parameters: one row of (P, D) a member, settings of shape (P,)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def clip_grad_norm_(grad: Tensor, max_norm: Tensor) -> Tensor:
+    """Scale each member's gradient (P, D) in place to at most ``max_norm`` (P,).
+
+    Returns:
+        The norms before clipping, (P,).
+    """
+    norm = torch.linalg.vector_norm(grad, dim=1)
+    grad.mul_((max_norm / (norm + 1e-6)).clamp_max(1.0)[:, None])
+    return norm
+
+
+def adam_(
+    params: Tensor,
+    grad: Tensor,
+    mu: Tensor,
+    nu: Tensor,
+    count: Tensor,
+    learning_rate: Tensor,
+    *,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    eps: float = 1e-5,
+    active: Tensor | None = None,
+) -> None:
+    """One Adam step in place (Kingma & Ba 2015, algorithm 1, in its efficient form).
+
+    Args:
+        params, grad, mu, nu: (P, D); the moments start at zero.
+        count: (P,) float, steps taken so far.
+        learning_rate: (P,).
+        active: (P,) bool; members at False are left exactly as they are.
+    """
+    if active is not None and not bool(active.all()):
+        rows = active.nonzero().squeeze(1)
+        part = [x[rows] for x in (params, grad, mu, nu, count, learning_rate)]
+        adam_(*part, beta1=beta1, beta2=beta2, eps=eps)
+        for whole, new in zip((params, mu, nu, count), (part[0], *part[2:5]), strict=True):
+            whole[rows] = new
+        return
+    count.add_(1.0)
+    mu.lerp_(grad, 1.0 - beta1)
+    nu.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
+    correction2 = (1.0 - beta2**count).sqrt()
+    step = learning_rate * correction2 / (1.0 - beta1**count)
+    # eps is scaled too, so that this equals the algorithm as published.
+    denominator = nu.sqrt().add_((eps * correction2)[:, None])
+    params.sub_(step[:, None] * mu / denominator)
+
+
+def kl_adapted_rate(
+    learning_rate: Tensor, kl: Tensor, target_kl: Tensor, low: float, high: float
+) -> Tensor:
+    """Learning rate divided by 1.5 where the KL is over 2·target, times 1.5 where under half.
+
+    Schulman et al. 2017, sec. 4 (there for the KL penalty); the factor as in rl_games. All (P,).
+    """
+    rate = torch.where(kl > 2.0 * target_kl, learning_rate / 1.5, learning_rate)
+    rate = torch.where(kl < 0.5 * target_kl, rate * 1.5, rate)
+    return rate.clamp(low, high)
+
+
+def merge_moments(
+    mean: Tensor, var: Tensor, count: Tensor, batch: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Running mean and variance after a batch (Chan, Golub & LeVeque 1979, eq. 2.1).
+
+    Args:
+        mean, var: (P, O); count: (P,); batch: (P, B, O).
+
+    Returns:
+        The new mean, variance and count.
+    """
+    n = float(batch.shape[1])
+    batch_var, batch_mean = torch.var_mean(batch, dim=1, unbiased=False)
+    total = count + n
+    old, new = (count / total)[:, None], n / total[:, None]
+    delta = batch_mean - mean
+    return mean + delta * new, var * old + batch_var * new + delta.square() * old * new, total

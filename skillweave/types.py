@@ -1,0 +1,151 @@
+"""Words that every room shares: transitions, steps, and what acts and what learns.
+
+This module imports nothing of the library and does not import torch at run time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+
+import numpy as np
+from gymnasium import Space
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from skillweave.seeding import Seeds
+
+Array: TypeAlias = NDArray[Any]
+Memory: TypeAlias = dict[str, Array]
+"""What a policy remembers of each environment: arrays whose first axis is the environment."""
+
+
+class SkillweaveError(Exception):
+    """An error made for people: it says what was wrong, where, and what to do about it."""
+
+
+class MissingExtra(SkillweaveError, ImportError):
+    """A feature needs an optional dependency; the message names the extra to install."""
+
+    def __init__(self, feature: str, extra: str) -> None:
+        super().__init__(f"{feature} needs the extra '{extra}': pip install 'skillweave[{extra}]'")
+
+
+@dataclass(slots=True)
+class Step:
+    """One environment transition as a skill's methods see it, batched over N environments.
+
+    ``elapsed`` counts the steps of the current episode or call, this one included (so it is 1
+    on the first). ``timed_out`` says that the skill's own ``max_steps`` ended it here.
+    """
+
+    obs: Array  # (N, *obs_shape)
+    action: Array  # (N,) or (N, *action_shape)
+    next_obs: Array  # (N, *obs_shape), always the true successor
+    reward: Array  # (N,) float32, the environment's own reward
+    terminated: Array  # (N,) bool
+    truncated: Array  # (N,) bool, the environment's time limit
+    timed_out: Array  # (N,) bool, the skill's time limit
+    elapsed: Array  # (N,) int64, steps
+    info: Mapping[str, Any]
+
+
+@dataclass(slots=True)
+class VecStep:
+    """What a vectorised environment answers to one action in each of n environments.
+
+    ``next_obs`` is the true successor, ``obs`` is what to act on next: the same, or the first
+    observation of the new episode where this one ended. ``steps`` is the number of primitive
+    steps that the action lasted (1, or τ for a call).
+    """
+
+    next_obs: Array  # (n, *obs_shape)
+    obs: Array  # (n, *obs_shape)
+    reward: Array  # (n,) float32; for a call the discounted sum
+    terminated: Array  # (n,) bool
+    truncated: Array  # (n,) bool
+    steps: Array  # (n,) int64
+    mask: Array | None  # (n, A) bool, allowed actions in ``obs``; None: all
+    info: dict[str, Any]
+
+    @property
+    def ended(self) -> Array:
+        """(n,) bool: the episode ended here, by termination or truncation."""
+        ended: Array = self.terminated | self.truncated
+        return ended
+
+
+@dataclass(slots=True)
+class Transition:
+    """Trajectories in the form that every algorithm learns from.
+
+    P members, T time steps, B environments per member. ``discount`` is 0 where the episode
+    terminated, else γ^τ; ``last`` says that the trajectory is cut here (terminated, truncated,
+    or end of rollout). ``next_obs`` is the true successor, also where an episode ended.
+    """
+
+    obs: Tensor  # (P, T, B, *obs_shape)
+    action: Tensor  # (P, T, B) int64 or (P, T, B, A) float32
+    reward: Tensor  # (P, T, B)
+    discount: Tensor  # (P, T, B)
+    next_obs: Tensor  # (P, T, B, *obs_shape)
+    last: Tensor  # (P, T, B) bool
+    mask: Tensor | None = None  # (P, T, B, A) bool
+
+
+class VecEnv(Protocol):
+    """A vectorised environment with one auto-reset meaning; see ``envs/``."""
+
+    num_envs: int
+    observation_space: Space[Any]
+    action_space: Space[Any]
+
+    def reset(self, seeds: Seeds) -> Array:
+        """Start every environment anew from a node of the seed tree; (N, *obs_shape)."""
+        ...
+
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed now, or None where all always are."""
+        ...
+
+    def step(self, action: Array) -> VecStep:
+        """Act in every environment; ended episodes start anew within the call."""
+        ...
+
+    def close(self) -> None:
+        """Release processes and memory."""
+        ...
+
+
+class Policy(Protocol):
+    """Acts: observations to actions, batched over n environments, with memory.
+
+    ``observe`` is told every transition, so that a policy may notice that a running skill has
+    terminated. Memory rows belong to environments; a runner gathers and scatters them.
+    """
+
+    observation_space: Space[Any]
+    action_space: Space[Any]
+
+    def start(self, n: int) -> Memory:
+        """Fresh memory for n environments at the start of their episodes."""
+        ...
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Actions (n, ...) for observations (n, ...), and the memory after them."""
+        ...
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """The memory after the environments answered."""
+        ...
