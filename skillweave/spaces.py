@@ -110,3 +110,51 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
     raise SkillweaveError(
         f"action space {space} is not supported; supported are: {ACTIONS} (of floats)."
     )
+
+
+def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
+    """A supported space as plain JSON; infinities become strings."""
+    if isinstance(space, gym.spaces.Box):
+        low, high = ([_number(x) for x in b.reshape(-1)] for b in (space.low, space.high))
+        return {"type": "Box", "shape": space.shape, "dtype": str(space.dtype), "low": low, "high": high}
+    if isinstance(space, gym.spaces.Discrete):
+        return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        start = np.asarray(space.start)
+        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": start.tolist()}
+    if isinstance(space, gym.spaces.MultiBinary):
+        return {"type": "MultiBinary", "n": list(space.shape)}
+    raise SkillweaveError(f"space {space} is not supported; supported are: {OBSERVATIONS}")
+
+
+def space_from_json(data: dict[str, Any]) -> gym.Space[Any]:
+    """The inverse of ``space_to_json``.
+
+    Raises:
+        SkillweaveError: the JSON does not describe a supported space.
+    """
+    try:
+        match data["type"]:
+            case "Box":
+                shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
+                bounds = (np.array(data[k], float).reshape(shape).astype(dtype) for k in ("low", "high"))
+                return gym.spaces.Box(*bounds, shape=shape, dtype=dtype)  # type: ignore[arg-type]
+            case "Discrete":
+                return gym.spaces.Discrete(data["n"], start=data["start"])
+            case "MultiDiscrete":
+                return gym.spaces.MultiDiscrete(data["nvec"], start=data["start"])
+            case "MultiBinary":
+                return gym.spaces.MultiBinary(data["n"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SkillweaveError(f"not a space: {data!r} ({error})") from error
+    raise SkillweaveError(f"space type {data['type']!r} is not supported; supported are: {OBSERVATIONS}")
+
+
+def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
+    """Whether a policy made for one space can act in the other: same kind, shape and choices."""
+    choices = [getattr(s, "nvec", getattr(s, "n", None)) for s in (a, b)]
+    return type(a) is type(b) and a.shape == b.shape and bool(np.all(choices[0] == choices[1]))
+
+
+def _number(x: Any) -> float | str:
+    return float(x) if np.isfinite(x) else str(float(x))

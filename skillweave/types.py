@@ -129,6 +129,8 @@ class Policy(Protocol):
 
     observation_space: Space[Any]
     action_space: Space[Any]
+    labels: tuple[str, ...]
+    """Names of the skills below it, in order; empty for a plain policy."""
 
     def start(self, n: int) -> Memory:
         """Fresh memory for n environments at the start of their episodes."""
@@ -148,4 +150,8 @@ class Policy(Protocol):
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """The memory after the environments answered."""
+        ...
+
+    def acting(self, memory: Memory) -> Array | None:
+        """(n,) int64, the skill that acts in each environment (a row of ``labels``), or None."""
         ...

@@ -6,8 +6,8 @@ does not import torch, so that ``--help`` and argument errors are instant.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
 
 from skillweave.networks.config import MLP
 from skillweave.types import SkillweaveError
@@ -92,3 +92,31 @@ class PPO:
 
 AlgorithmConfig = PPO
 """Any algorithm's settings."""
+
+_KINDS = {"PPO": PPO}
+
+
+def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
+    """Settings as plain JSON, with the algorithm's name under ``algorithm``."""
+    return {"algorithm": type(config).__name__, **asdict(config)}
+
+
+def config_from_json(data: dict[str, Any]) -> AlgorithmConfig:
+    """The inverse of ``config_to_json``.
+
+    Raises:
+        SkillweaveError: an unknown algorithm or field, named, or a value out of range.
+    """
+    values = dict(data)
+    kind = values.pop("algorithm", None)
+    if kind not in _KINDS:
+        raise SkillweaveError(f"unknown algorithm {kind!r}; known are: {', '.join(_KINDS)}")
+    known = {f.name for f in fields(_KINDS[kind])}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise SkillweaveError(f"{kind} has no field {', '.join(unknown)}: made by a newer version?")
+    for name in ("network", "critic"):
+        if values.get(name) is not None:
+            net = dict(values[name])
+            values[name] = MLP(**{**net, "hidden": tuple(net["hidden"])})
+    return _KINDS[kind](**values)

@@ -132,13 +132,34 @@ class PPOAlgorithm:
         scale = (state.obs_var + 1e-8).rsqrt()[:, None]
         return Actor(self.actor_layout.views(flat), state.obs_mean[:, None].clone(), scale)
 
-    def noise(self, seeds: list[Seeds], steps: int, batch: int) -> Tensor:
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of one member's ``weights``."""
+        scaling = {"obs_mean": (self.obs.size,), "obs_var": (self.obs.size,)}
+        return self.layout.shapes | (scaling if self.normalize_obs else {})
+
+    def weights(self, state: State, member: int = 0) -> dict[str, Tensor]:
+        """One member's policy by name: parameters and observation scaling, copied."""
+        named = {k: v[member].clone() for k, v in self.layout.views(state.params).items()}
+        if self.normalize_obs:
+            named |= {"obs_mean": state.obs_mean[member].clone()}
+            named |= {"obs_var": state.obs_var[member].clone()}
+        return named
+
+    def actor_from(self, weights: Mapping[str, Tensor]) -> Actor:
+        """The inverse of ``weights``, for acting only (P = 1)."""
+        views = {k: weights[k][None] for k in self.actor_layout.shapes}
+        if not self.normalize_obs:
+            return Actor(views, None, None)
+        scale = (weights["obs_var"] + 1e-8).rsqrt()
+        return Actor(views, weights["obs_mean"][None, None], scale[None, None])
+
+    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
         """Noise for ``steps`` calls of ``act``: (steps, P, batch, A), a stream a member."""
         shape = (steps, batch, self.action.size)
         if self.action.discrete:
-            drawn = [gumbel(torch.rand(shape, generator=s.torch())) for s in seeds]
+            drawn = [gumbel(torch.rand(shape, generator=g)) for g in generators]
         else:
-            drawn = [torch.randn(shape, generator=s.torch()) for s in seeds]
+            drawn = [torch.randn(shape, generator=g) for g in generators]
         return torch.stack(drawn, dim=1)
 
     def act(

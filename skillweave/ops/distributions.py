@@ -23,7 +23,8 @@ def mask_logits(logits: Tensor, mask: Tensor | None) -> Tensor:
 def gumbel(uniform: Tensor) -> Tensor:
     """Gumbel noise ``−log(−log u)`` from uniform noise in [0, 1); any shape."""
     tiny = torch.finfo(uniform.dtype).tiny
-    return -torch.log(-torch.log(uniform.clamp_min(tiny)).clamp_min(tiny))
+    exponential = (-torch.log(uniform.clamp_min(tiny))).clamp_min(tiny)
+    return -torch.log(exponential)
 
 
 def categorical_sample(logits: Tensor, noise: Tensor) -> Tensor:

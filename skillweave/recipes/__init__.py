@@ -1,0 +1,73 @@
+"""Recipes: Python files that declare a hierarchy and its budgets. Some are shipped here."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from skillweave.types import SkillweaveError
+
+if TYPE_CHECKING:
+    from skillweave.api import Hierarchy
+
+_HERE = Path(__file__).parent
+
+
+def names() -> list[str]:
+    """The shipped recipes."""
+    return sorted(p.stem.replace("_", "-") for p in _HERE.glob("[a-z]*.py"))
+
+
+def load(recipe: str) -> Hierarchy:
+    """The hierarchy of a shipped recipe, or of a Python file that defines one.
+
+    A file's hierarchy is its variable ``hierarchy``, or its only ``Hierarchy``.
+
+    Raises:
+        SkillweaveError: no such recipe (with close matches) or file, or no hierarchy in it.
+    """
+    from skillweave.api import Hierarchy
+
+    path = Path(recipe)
+    if recipe in names():
+        module = importlib.import_module(f"skillweave.recipes.{recipe.replace('-', '_')}")
+    elif path.suffix == ".py" and path.is_file():
+        spec = importlib.util.spec_from_file_location(f"skillweave_recipe_{path.stem}", path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+    else:
+        near = difflib.get_close_matches(recipe, names(), n=3, cutoff=0.4)
+        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        raise SkillweaveError(
+            f"no recipe or Python file {recipe!r}.{hint} Shipped recipes: {', '.join(names())}"
+        )
+    found = {k: v for k, v in vars(module).items() if isinstance(v, Hierarchy)}
+    if "hierarchy" not in found and len(found) != 1:
+        raise SkillweaveError(
+            f"{recipe} defines {len(found) or 'no'} Hierarchy; define one, in the variable 'hierarchy'"
+        )
+    hierarchy = found.get("hierarchy") or next(iter(found.values()))
+    hierarchy.recipe = recipe
+    return hierarchy
+
+
+def weights_path(name: str) -> Path:
+    """The shipped weights of a shipped recipe.
+
+    Raises:
+        SkillweaveError: there are none.
+    """
+    path = _HERE / f"{name.replace('-', '_')}.safetensors"
+    if not path.exists():
+        with_weights = [n for n in names() if (_HERE / f"{n.replace('-', '_')}.safetensors").exists()]
+        raise SkillweaveError(
+            f"no weights are shipped for {name!r}; there are for: {', '.join(with_weights) or 'none'}"
+        )
+    return path

@@ -117,10 +117,12 @@ def train_on_policy(
     actor = algorithm.actor(state)
     loop.restart(update)
 
-    def learn(rollout: Rollout, number: int, spent: int) -> tuple[int, int, dict[str, float]]:
-        progress = min(1.0, spent / budget)
+    def learn(
+        rollout: Rollout, number: int, before: int, after: int
+    ) -> tuple[int, int, dict[str, float]]:
+        progress = min(1.0, before / budget)
         _, metrics = algorithm.update(state, rollout, progress, loop.member_seeds("learn", number))
-        return number, spent, _to_numbers(metrics, number)
+        return number, after, _to_numbers(metrics, number)
 
     def finish(done: Future[tuple[int, int, dict[str, float]]], cut: bool) -> None:
         number, spent, metrics = done.result()
@@ -139,7 +141,7 @@ def train_on_policy(
                 done.result()
                 actor = algorithm.actor(state)
                 finish(done, cut=False)
-            pending = worker.submit(learn, rollout, update, before)
+            pending = worker.submit(learn, rollout, update, before, steps)
             update += 1
             cut = steps // cut_every > before // cut_every or steps >= budget
             if cut or not algorithm.config.overlap:
@@ -180,7 +182,8 @@ class _Loop:
         algorithm, env = self.algorithm, self.env
         t, n, p = algorithm.config.n_steps, env.num_envs, self.members
         buffer = RolloutBuffer(t, n, p, env.observation_space)
-        noises = algorithm.noise(self.member_seeds("act", update), t, n // p)
+        generators = [s.torch() for s in self.member_seeds("act", update)]
+        noises = algorithm.noise(generators, t, n // p)
         mask, spent = env.mask(), 0
         for noise in noises:
             obs = self._obs

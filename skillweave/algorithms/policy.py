@@ -1,0 +1,94 @@
+"""A trained agent as a policy, and as a file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.config import PPO, config_from_json, config_to_json
+from skillweave.algorithms.ppo import Actor, PPOAlgorithm, State
+from skillweave.spaces import space_from_json, space_to_json
+from skillweave.types import Array, Memory, SkillweaveError, Step
+
+
+def make_algorithm(config: PPO, observation_space: Any, action_space: Any) -> PPOAlgorithm:
+    """The algorithm that these settings belong to, on one pair of spaces."""
+    return PPOAlgorithm(config, observation_space, action_space)
+
+
+class AgentPolicy:
+    """One trained agent; a copy of what acting needs, independent of further learning."""
+
+    labels: tuple[str, ...] = ()
+
+    def __init__(self, algorithm: PPOAlgorithm, weights: dict[str, Tensor]) -> None:
+        self._algorithm, self.weights = algorithm, weights
+        self._actor: Actor = algorithm.actor_from(weights)
+        self.observation_space = algorithm.observation_space
+        self.action_space = algorithm.action_space
+
+    @classmethod
+    def of(cls, algorithm: PPOAlgorithm, state: State, member: int = 0) -> AgentPolicy:
+        """The policy of one member of a state."""
+        return cls(algorithm, algorithm.weights(state, member))
+
+    def start(self, n: int) -> Memory:
+        """Nothing to remember."""
+        return {}
+
+    @torch.inference_mode()
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Actions (n, ...) in the environment's units; greedy, or sampled with ``rng``."""
+        noise = None
+        if not deterministic:
+            rng = rng or np.random.default_rng()
+            generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+            noise = self._algorithm.noise([generator], 1, len(obs))[0]
+        allowed = None if mask is None else torch.from_numpy(mask)[None]
+        rows = torch.from_numpy(np.ascontiguousarray(obs))[None]
+        action, _ = self._algorithm.act(self._actor, rows, allowed, noise)
+        return self._algorithm.action.to_env(action[0].numpy()), memory
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """Nothing to notice."""
+        return memory
+
+    def acting(self, memory: Memory) -> Array | None:
+        """No skills below: None."""
+        return None
+
+    def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Tensors and the JSON that ``from_file`` needs."""
+        return self.weights, {
+            "kind": "agent",
+            "algorithm": config_to_json(self._algorithm.config),
+            "observation_space": space_to_json(self.observation_space),
+            "action_space": space_to_json(self.action_space),
+        }
+
+    @classmethod
+    def from_file(cls, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> AgentPolicy:
+        """The inverse of ``to_file``.
+
+        Raises:
+            SkillweaveError: tensors are missing or have other shapes than the header says.
+        """
+        spaces = (space_from_json(header[f"{k}_space"]) for k in ("observation", "action"))
+        algorithm = make_algorithm(config_from_json(header["algorithm"]), *spaces)
+        wanted = algorithm.weight_shapes()
+        for name, shape in wanted.items():
+            if name not in tensors or tuple(tensors[name].shape) != shape:
+                found = tuple(tensors[name].shape) if name in tensors else "nothing"
+                raise SkillweaveError(f"{where}: tensor {name} should be {shape}, found {found}")
+        return cls(algorithm, {name: tensors[name] for name in wanted})

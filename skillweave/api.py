@@ -1,0 +1,197 @@
+"""What users call: declare a ``Hierarchy``, train it, get a ``Run``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skillweave import recipes
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.hierarchy import training
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.weights import read_weights, write_weights
+from skillweave.reporting.progress import Progress
+from skillweave.reporting.video import color_of, render_policy
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import make_trackers
+from skillweave.skills import Skill
+from skillweave.training.evaluation import Evaluation, evaluate
+from skillweave.types import Memory, Policy, SkillweaveError
+
+
+class Hierarchy(Declaration):
+    """Skills, reflexes and a selector on one environment: declared, then trained and watched."""
+
+    recipe: str | None = None
+    """Where it was declared: a shipped recipe's name or a file; written into runs."""
+
+    def train(
+        self,
+        run_dir: str | Path,
+        *,
+        seed: int = 0,
+        flat: bool = False,
+        quiet: bool = False,
+        track: Sequence[str] = (),
+    ) -> Run:
+        """Train every skill, then the selector; everything goes to ``run_dir``.
+
+        Args:
+            run_dir: a new directory; an existing run is never overwritten.
+            seed: the root of every random stream.
+            flat: train one plain agent on the same number of steps instead: the baseline.
+            quiet: no progress.
+            track: "tensorboard", "wandb".
+
+        Raises:
+            SkillweaveError: the declaration does not fit the environment, or training diverged.
+        """
+        self.check_spaces()
+        content = training.manifest(self, seed=seed, flat=flat)
+        track = tuple(track)
+        make_trackers(track, None)  # a missing extra is said before anything is written
+        run = RunDirectory.create(run_dir, content | {"recipe": self.recipe, "track": track})
+        return self._go_on(run, quiet)
+
+    def resume(self, run_dir: str | Path, *, quiet: bool = False) -> Run:
+        """Finish a run that was stopped; the end is the same as if it had not been."""
+        run = RunDirectory.open(run_dir)
+        self._must_fit(run)
+        return self._go_on(run, quiet)
+
+    def load(self, run_dir: str | Path) -> Run:
+        """A finished run of this hierarchy."""
+        run = RunDirectory.open(run_dir)
+        self._must_fit(run)
+        return Run(self, run.path, training.load(self, run))
+
+    def load_weights(self, path: str | Path) -> Run:
+        """This hierarchy with the weights of one file (see ``Run.save_weights``)."""
+        return Run(self, Path(path), read_weights(self, Path(path)))
+
+    @staticmethod
+    def pretrained(name: str) -> Run:
+        """A shipped recipe with its shipped weights."""
+        return recipes.load(name).load_weights(recipes.weights_path(name))
+
+    def _go_on(self, run: RunDirectory, quiet: bool) -> Run:
+        with ExitStack() as stack:
+            stack.callback(run.close)
+            progress = stack.enter_context(Progress(quiet=quiet))
+            trackers = make_trackers(run.manifest.get("track", ()), run)
+            for tracker in trackers:
+                stack.callback(tracker.close)
+            policy = training.train(self, run, (progress, *trackers))
+        return Run(self, run.path, policy)
+
+    def _must_fit(self, run: RunDirectory) -> None:
+        mine = [s.name for s in self.skills]
+        theirs = [s["name"] for s in run.manifest["skills"]]
+        if mine != theirs:
+            raise SkillweaveError(
+                f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy has "
+                f"{', '.join(mine)}"
+            )
+        if run.manifest["env"] != self.spec.name:
+            raise SkillweaveError(
+                f"{run.path} was trained on {run.manifest['env']}, but this hierarchy is on "
+                f"{self.spec.name}"
+            )
+        self.call_steps = run.manifest["call_steps"]
+        self.greedy_skills = run.manifest["greedy_skills"]
+
+
+class Run:
+    """A trained policy with its hierarchy: evaluate it, watch it, save it, use it as a skill."""
+
+    def __init__(self, hierarchy: Hierarchy, path: Path, policy: Policy) -> None:
+        self.hierarchy, self.path, self.policy = hierarchy, path, policy
+
+    def evaluate(
+        self,
+        episodes: int = 100,
+        *,
+        seed: int = 0,
+        deterministic: bool = True,
+        skill: str | None = None,
+    ) -> Evaluation:
+        """Score it on Gymnasium's environment; ``skill`` scores one skill alone."""
+        return evaluate(
+            self._policy(skill),
+            self.hierarchy.spec,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+        )
+
+    def render(
+        self,
+        path: str | Path,
+        *,
+        episodes: int = 1,
+        seed: int = 0,
+        deterministic: bool = True,
+        skill: str | None = None,
+        max_steps: int | None = None,
+    ) -> dict[str, Any]:
+        """Write a captioned GIF or MP4; ``skill`` shows one skill alone."""
+        names = [s.name for s in self.hierarchy.skills]
+        colors = {s.name: color_of(i, s.color) for i, s in enumerate(self.hierarchy.skills)}
+
+        def label(memory: Memory) -> tuple[str, tuple[int, int, int]]:
+            if skill is not None:
+                return skill, colors[skill]
+            acting = policy.acting(memory)
+            if acting is None:
+                return "flat", color_of(len(names), None)
+            name = policy.labels[int(acting[0])]
+            return name, colors[name]
+
+        policy = self._policy(skill)
+        return render_policy(
+            self.hierarchy.spec,
+            policy,
+            path,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+            label=label,
+            max_steps=max_steps,
+            rng=np.random.default_rng(seed),
+        )
+
+    def save_weights(self, path: str | Path) -> Path:
+        """Write every policy into one file for ``Hierarchy.load_weights``."""
+        if not isinstance(self.policy, HierarchyPolicy):
+            raise SkillweaveError("a flat agent's weights are already one file, in policies/")
+        write_weights(Path(path), self.hierarchy, self.policy, self.hierarchy.recipe)
+        return Path(path)
+
+    def as_skill(self, name: str, **attributes: Any) -> Skill:
+        """The whole hierarchy as one skill of another."""
+        kind = type(name, (Skill,), {"name": name, "policy": self.policy, **attributes})
+        skill: Skill = kind()
+        return skill
+
+    def info(self) -> dict[str, Any]:
+        """The manifest of its run."""
+        return RunDirectory.open(self.path).manifest
+
+    def _policy(self, skill: str | None) -> Policy:
+        if skill is None:
+            return self.policy
+        if not isinstance(self.policy, HierarchyPolicy):
+            raise SkillweaveError("this is a flat agent: it has no skills")
+        names = [s.name for s in self.hierarchy.skills]
+        self.hierarchy.skill(skill)
+        return self.policy.skills.policies[names.index(skill)]
+
+
+
+
+__all__ = ["AgentPolicy", "Hierarchy", "Run"]

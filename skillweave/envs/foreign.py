@@ -1,0 +1,65 @@
+"""Any Gymnasium VectorEnv that resets in the same step, as what the loops train on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from skillweave.seeding import Seeds
+from skillweave.types import Array, SkillweaveError, VecStep
+
+
+class FromVectorEnv:
+    """A ``VecEnv`` over a Gymnasium vector with ``AutoresetMode.SAME_STEP``.
+
+    Reads from ``info`` what semi-MDPs need, where it is there: ``steps`` (τ), ``action_mask``,
+    ``next_obs``; else every action is one step, all are allowed, and ``final_obs`` counts.
+
+    Raises:
+        SkillweaveError: the vector resets in another way; the message says how to make it.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        mode = env.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise SkillweaveError(
+                f"{type(env).__name__} has autoreset mode {mode}; make it with "
+                "vector_kwargs={'autoreset_mode': AutoresetMode.SAME_STEP}"
+            )
+        self.env, self.num_envs = env, env.num_envs
+        self.observation_space, self.action_space = (
+            env.single_observation_space,
+            env.single_action_space,
+        )
+        self._ones = np.ones(self.num_envs, np.int64)
+        self._mask: Array | None = None
+
+    def reset(self, seeds: Seeds) -> Array:
+        """Start all anew; observations (N, *obs_shape)."""
+        obs, info = self.env.reset(seed=seeds.integer())
+        self._mask = info.get("action_mask")
+        return np.asarray(obs)
+
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed now, or None."""
+        return self._mask
+
+    def step(self, action: Array) -> VecStep:
+        """One action in each environment."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self._mask = info.get("action_mask")
+        next_obs = info.get("next_obs")
+        if next_obs is None:
+            next_obs = np.array(obs)
+            for i in np.flatnonzero(terminated | truncated):
+                next_obs[i] = info["final_obs"][i]
+        return VecStep(
+            next_obs, np.asarray(obs), np.asarray(reward, np.float32), terminated,
+            truncated & ~terminated, info.get("steps", self._ones), self._mask, info,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Close the vector."""
+        self.env.close()

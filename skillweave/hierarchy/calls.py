@@ -1,0 +1,149 @@
+"""Calls: skills acting under a selector, from the decision that starts one until it stops.
+
+``OptionsEnv`` (training) and ``HierarchyPolicy`` (everything else) both run skills through
+``SkillSet``, so a skill behaves the same wherever it acts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from skillweave.skills import Reflex, Skill, apply_reflexes, checked
+from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+
+
+@dataclass(frozen=True)
+class SkillSet:
+    """Skills with their policies, and how a call runs.
+
+    Memory rows: ``skill`` (the running one), ``elapsed`` (steps of its call), and under
+    ``<index>.<key>`` what each skill's own policy remembers.
+    """
+
+    skills: tuple[Skill, ...]
+    policies: tuple[Policy, ...]
+    reflexes: tuple[Reflex, ...] = ()
+    call_steps: int | None = None
+    """A call lasts at most so long; None: until the skill stops by itself."""
+    greedy: bool = True
+    """Skills act greedily; else they sample."""
+
+    @property
+    def watches(self) -> bool:
+        """Whether any skill needs to see transitions: to terminate, or because it remembers."""
+        stops = any(s.defines("termination") for s in self.skills)
+        return stops or any(p.start(1) for p in self.policies)
+
+    def mask(self, obs: Array) -> Array | None:
+        """Where each skill may start, (n, S) bool; None: everywhere.
+
+        Raises:
+            SkillweaveError: in some observation no skill may start.
+        """
+        if not any(s.defines("initiation") for s in self.skills):
+            return None
+        mask = np.stack(
+            [
+                checked(s.initiation(obs), len(obs), bool, f"skill {s.name!r}", "initiation")
+                if s.defines("initiation")
+                else np.ones(len(obs), bool)
+                for s in self.skills
+            ],
+            axis=1,
+        )
+        if not mask.any(axis=1).all():
+            row = int(np.flatnonzero(~mask.any(axis=1))[0])
+            names = ", ".join(repr(s.name) for s in self.skills)
+            raise SkillweaveError(
+                f"no skill may start in observation {np.array2string(obs[row], precision=3)}: the "
+                f"initiation() of {names} is False there. Let at least one start everywhere"
+            )
+        return mask
+
+    def start(self, n: int) -> Memory:
+        """Memory of n environments in which no call has begun."""
+        memory: Memory = {"skill": np.full(n, -1), "elapsed": np.zeros(n, np.int64)}
+        for i, policy in enumerate(self.policies):
+            memory |= {f"{i}.{k}": v for k, v in policy.start(n).items()}
+        return memory
+
+    def begin(self, memory: Memory, rows: Array, skill: Array) -> None:
+        """Start a call of ``skill`` (k,) in environments ``rows`` (k,), in place."""
+        memory["skill"][rows] = skill
+        memory["elapsed"][rows] = 0
+        for i, policy in enumerate(self.policies):
+            fresh = policy.start(1)
+            for k, v in fresh.items():
+                memory[f"{i}.{k}"][rows[skill == i]] = v[0]
+
+    def act(
+        self, memory: Memory, rows: Array, obs: Array, rng: np.random.Generator | None = None
+    ) -> Array:
+        """Actions of the running skills for ``obs`` (k, ...) of environments ``rows`` (k,)."""
+        running = memory["skill"][rows]
+        actions: Array | None = None
+        for i, policy in enumerate(self.policies):
+            mine = np.flatnonzero(running == i)
+            if not len(mine):
+                continue
+            own = self._own(memory, i, rows[mine])
+            some, after = policy.act(own, obs[mine], deterministic=self.greedy, rng=rng)
+            self._put(memory, i, rows[mine], after)
+            if len(mine) == len(rows):
+                actions = some
+                break
+            if actions is None:
+                actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
+            actions[mine] = some
+        assert actions is not None, "act() before begin()"
+        return apply_reflexes(self.reflexes, obs, actions) if self.reflexes else actions
+
+    def observe(self, memory: Memory, rows: Array, step: Step | None) -> Array:
+        """Count a step of environments ``rows`` (k,); (k,) bool: the call is over.
+
+        ``step`` may be None where nothing ``watches``; its ``elapsed`` and ``timed_out`` are set
+        here, as seen by the running skill.
+        """
+        memory["elapsed"][rows] += 1
+        elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
+        over = np.zeros(len(rows), bool)
+        for i, skill in enumerate(self.skills):
+            limits = [x for x in (self.call_steps, skill.max_steps) if x is not None]
+            if limits:
+                over |= (running == i) & (elapsed >= min(limits))
+        if step is None:
+            return over
+        for i, (skill, policy) in enumerate(zip(self.skills, self.policies, strict=True)):
+            mine = np.flatnonzero(running == i)
+            if not len(mine):
+                continue
+            part = _rows(step, mine, elapsed[mine], skill.max_steps)
+            own = self._own(memory, i, rows[mine])
+            self._put(memory, i, rows[mine], policy.observe(own, part))
+            if skill.defines("termination"):
+                stop = skill.termination(part)
+                over[mine] |= checked(stop, len(mine), bool, f"skill {skill.name!r}", "termination")
+        return over
+
+    def _own(self, memory: Memory, i: int, rows: Array) -> Memory:
+        prefix = f"{i}."
+        return {k[len(prefix) :]: v[rows] for k, v in memory.items() if k.startswith(prefix)}
+
+    def _put(self, memory: Memory, i: int, rows: Array, own: Memory) -> None:
+        for k, v in own.items():
+            memory[f"{i}.{k}"][rows] = v
+
+
+def _rows(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
+    """Some rows of a step, with the time as the running skill counts it."""
+    timed_out = np.zeros(len(rows), bool) if max_steps is None else elapsed >= max_steps
+    info = {
+        k: v[rows] if isinstance(v, np.ndarray) and len(v) == len(step.reward) else v
+        for k, v in step.info.items()
+    }
+    return Step(
+        step.obs[rows], step.action[rows], step.next_obs[rows], step.reward[rows],
+        step.terminated[rows], step.truncated[rows], timed_out, elapsed, info,
+    )  # fmt: skip

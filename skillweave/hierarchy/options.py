@@ -1,0 +1,142 @@
+"""OptionsEnv: an environment whose actions are skills, as an ordinary Gymnasium VectorEnv."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from skillweave.envs.engine import Engine
+from skillweave.hierarchy.calls import SkillSet
+from skillweave.types import Array, SkillweaveError, Step
+
+
+class OptionsEnv(VectorEnv[Any, Any, Any]):
+    """Each action is a call of a skill; within one ``step`` every environment finishes its call.
+
+    A call ends when its skill stops, ``call_steps`` are over, or the episode ends; an environment
+    whose call is over waits without being stepped. The reward is ``Σ γᵏ rₖ`` over the call, to be
+    discounted by γ^τ afterwards (Sutton, Precup & Singh 1999, sec. 3). Environments reset in the
+    same step.
+
+    ``info`` of a step, arrays over N environments: ``steps`` (τ), ``discount`` (γ^τ, or 0 where
+    terminated), ``call_return`` (Σ rₖ), ``next_obs`` (the true successors), ``action_mask``
+    (N, S) where initiation sets exist, and Gymnasium's ``final_obs``.
+
+    Args:
+        engine: the environments; stepped in part where calls differ in length.
+        skills: what the actions mean.
+        gamma: γ of one primitive step; a number, or one for each environment (N,).
+        seed: of the skills' own sampling, where they are not greedy.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self, engine: Engine, skills: SkillSet, gamma: float | Array, seed: int = 0
+    ) -> None:
+        self.engine, self.skills = engine, skills
+        self.num_envs = engine.num_envs
+        self.single_observation_space = engine.observation_space
+        self.single_action_space = gym.spaces.Discrete(len(skills.skills))
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._gamma = np.broadcast_to(np.asarray(gamma, np.float64), (self.num_envs,))
+        self._watches = skills.watches
+        self._seed = seed
+        self._obs: Array = np.empty(0)
+        self._mask: Array | None = None
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start every episode anew; one seed for all."""
+        if isinstance(seed, list):
+            raise SkillweaveError("OptionsEnv.reset takes one seed for all environments")
+        self._seed = self._seed + 1 if seed is None else seed
+        self._rng = np.random.default_rng(self._seed)
+        self._memory = self.skills.start(self.num_envs)
+        self._obs = self.engine.reset(self._seed)
+        return self._obs, self._with_mask({})
+
+    def step(
+        self, actions: Array
+    ) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Run one call in each environment, whichever skills and however long."""
+        n = self.num_envs
+        skill = np.asarray(actions).reshape(n)
+        self._check(skill)
+        self.skills.begin(self._memory, np.arange(n), skill)
+        obs = self._obs
+        next_obs = np.empty_like(obs)
+        reward, plain, discount = np.zeros(n), np.zeros(n), np.ones(n)
+        steps = np.zeros(n, np.int64)
+        terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
+        rows = np.arange(n)
+        while len(rows):
+            here = obs if len(rows) == n else obs[rows]
+            action = self.skills.act(self._memory, rows, here, self._rng)
+            raw = self.engine.step(action, None if len(rows) == n else rows)
+            reward[rows] += discount[rows] * raw.reward
+            plain[rows] += raw.reward
+            discount[rows] *= self._gamma[rows]
+            steps[rows] += 1
+            next_obs[rows] = raw.next_obs
+            seen = None
+            if self._watches:
+                never = np.zeros(len(rows), bool)
+                seen = Step(
+                    here, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+                    never, steps[rows], raw.info,
+                )  # fmt: skip
+            over = self.skills.observe(self._memory, rows, seen)
+            ended = raw.terminated | raw.truncated
+            if len(rows) == n:
+                obs = raw.next_obs.copy()
+            else:
+                obs[rows] = raw.next_obs
+            if ended.any():
+                terminated[rows], truncated[rows] = raw.terminated, raw.truncated
+                obs[rows[ended]] = self.engine.reset_some(rows[ended])
+                over = over | ended
+            if over.any():
+                rows = rows[~over]
+        self._obs = obs
+        info = {
+            "steps": steps,
+            "discount": (discount * ~terminated).astype(np.float32),
+            "call_return": plain,
+            "next_obs": next_obs,
+            "skill": skill,
+        }
+        ended = terminated | truncated
+        if ended.any():
+            final = np.full(n, None, dtype=object)
+            for i in np.flatnonzero(ended):
+                final[i] = next_obs[i]
+            info |= {"final_obs": final, "_final_obs": ended}
+        return obs, reward.astype(np.float32), terminated, truncated, self._with_mask(info)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Release the engine."""
+        self.engine.close()
+
+    def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
+        self._mask = self.skills.mask(self._obs)
+        return info if self._mask is None else info | {"action_mask": self._mask}
+
+    def _check(self, skill: Array) -> None:
+        if skill.min() < 0 or skill.max() >= len(self.skills.skills):
+            raise SkillweaveError(
+                f"action {int(skill.max())} is no skill: there are {len(self.skills.skills)}"
+            )
+        if self._mask is not None and not self._mask[np.arange(self.num_envs), skill].all():
+            row = int(np.flatnonzero(~self._mask[np.arange(self.num_envs), skill])[0])
+            name = self.skills.skills[int(skill[row])].name
+            raise SkillweaveError(
+                f"skill {name!r} may not start in environment {row}: its initiation() is False "
+                "there; choose among info['action_mask']"
+            )

@@ -1,0 +1,63 @@
+"""The selector with its skills: a policy like any other, so it can be a skill again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skillweave.hierarchy.calls import SkillSet
+from skillweave.types import Array, Memory, Policy, Step
+
+_SELECTOR = "selector."
+
+
+class HierarchyPolicy:
+    """Decides where a call is over, lets the skill act elsewhere.
+
+    Memory rows: those of ``SkillSet``, ``over`` (decide before acting), and the selector's own.
+    """
+
+    def __init__(self, selector: Policy, skills: SkillSet) -> None:
+        self.selector, self.skills = selector, skills
+        self.observation_space = selector.observation_space
+        self.action_space = skills.policies[0].action_space
+        self.labels = tuple(s.name for s in skills.skills)
+
+    def start(self, n: int) -> Memory:
+        """Memory of n environments that wait for their first decision."""
+        memory = self.skills.start(n) | {"over": np.ones(n, bool)}
+        return memory | {_SELECTOR + k: v for k, v in self.selector.start(n).items()}
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Actions (n, ...). ``deterministic`` is about the selector; ``SkillSet.greedy`` about skills."""
+        memory = {k: v.copy() for k, v in memory.items()}
+        rows = np.flatnonzero(memory["over"])
+        if len(rows):
+            here = obs[rows]
+            own = {k[len(_SELECTOR) :]: v[rows] for k, v in memory.items() if k.startswith(_SELECTOR)}
+            skill, after = self.selector.act(
+                own, here, self.skills.mask(here), deterministic=deterministic, rng=rng
+            )
+            for k, v in after.items():
+                memory[_SELECTOR + k][rows] = v
+            self.skills.begin(memory, rows, skill)
+            memory["over"][rows] = False
+        return self.skills.act(memory, np.arange(len(obs)), obs, rng), memory
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """Notice where calls are over."""
+        memory = {k: v.copy() for k, v in memory.items()}
+        seen = step if self.skills.watches else None
+        memory["over"] = self.skills.observe(memory, np.arange(len(step.reward)), seen)
+        return memory
+
+    def acting(self, memory: Memory) -> Array | None:
+        """(n,) int64, the running skill."""
+        return memory["skill"]

@@ -1,0 +1,105 @@
+"""Training a hierarchy: every skill, then the selector; or the flat baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.envs.foreign import FromVectorEnv
+from skillweave.envs.make import make_engine
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.runs.directory import RunDirectory
+from skillweave.seeding import Seeds
+from skillweave.skills import Skill
+from skillweave.training.phase import Listener, Phase, train_phase
+from skillweave.types import Policy, VecEnv
+
+
+def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
+    """What a new run's ``run.json`` says."""
+    phases = [flat_phase(declaration)] if flat else phases_of(declaration)
+    return {
+        "kind": "flat" if flat else "hierarchy",
+        "env": declaration.spec.name,
+        "env_kwargs": declaration.spec.kwargs,
+        "seed": seed,
+        "cut_every": declaration.cut_every,
+        "skills": [_skill_entry(s) for s in declaration.skills],
+        "call_steps": declaration.call_steps,
+        "greedy_skills": declaration.greedy_skills,
+        "reflexes": [r.name for r in declaration.reflexes],
+        "needs_recipe": not declaration.is_data,
+        "phases": [p.entry() for p in phases],
+    }
+
+
+def phases_of(declaration: Declaration) -> list[Phase]:
+    """The skills that are to be trained, then the selector (which cannot train before them)."""
+    phases = [
+        Phase(s.name, s.algorithm or declaration.algorithm, declaration.budget(s), _skill_env(declaration, s))
+        for s in declaration.skills
+        if s.policy is None
+    ]
+
+    def too_early(config: AlgorithmConfig) -> VecEnv:
+        raise AssertionError("the selector's environment needs the skills' policies")
+
+    return [
+        *phases,
+        Phase("selector", declaration.selector, declaration.selector_steps, too_early),
+    ]
+
+
+def flat_phase(declaration: Declaration) -> Phase:
+    """One agent on the task itself, on as many steps as the whole hierarchy takes."""
+    config = declaration.flat or declaration.algorithm
+    return Phase("flat", config, declaration.total_steps, _skill_env(declaration, None))
+
+
+def train(
+    declaration: Declaration, run: RunDirectory, listeners: tuple[Listener, ...] = ()
+) -> Policy:
+    """Train, or finish training, what the run says; returns the policy."""
+    seeds, cut_every = Seeds(int(run.manifest["seed"])), int(run.manifest["cut_every"])
+    if run.manifest["kind"] == "flat":
+        return train_phase(flat_phase(declaration), run, seeds / "flat", listeners, cut_every)
+    trained: dict[str, Policy] = {}
+    *skill_phases, selector = phases_of(declaration)
+    for phase in skill_phases:
+        trained[phase.name] = train_phase(phase, run, seeds / phase.name, listeners, cut_every)
+    skills = declaration.skill_set([s.policy or trained[s.name] for s in declaration.skills])
+
+    def make_env(config: AlgorithmConfig) -> VecEnv:
+        engine = make_engine(declaration.spec, config.num_envs)
+        return FromVectorEnv(OptionsEnv(engine, skills, config.gamma))
+
+    phase = Phase("selector", selector.config, selector.budget, make_env)
+    policy = train_phase(phase, run, seeds / "selector", listeners, cut_every)
+    return HierarchyPolicy(policy, skills)
+
+
+def load(declaration: Declaration, run: RunDirectory) -> Policy:
+    """The policy of a finished run."""
+    if run.manifest["kind"] == "flat":
+        return run.load_policy("flat")
+    policies = [s.policy or run.load_policy(s.name) for s in declaration.skills]
+    return HierarchyPolicy(run.load_policy("selector"), declaration.skill_set(policies))
+
+
+def _skill_env(declaration: Declaration, skill: Skill | None) -> Callable[[AlgorithmConfig], VecEnv]:
+    # The flat baseline is the plain task: no reflexes either.
+    with_reflexes = declaration.reflexes_in_training and skill is not None
+    reflexes = tuple(declaration.reflexes) if with_reflexes else ()
+
+    def make_env(config: AlgorithmConfig) -> VecEnv:
+        return SkillEnv(make_engine(declaration.spec, config.num_envs), skill, reflexes)
+
+    return make_env
+
+
+def _skill_entry(skill: Skill) -> dict[str, Any]:
+    return {"name": skill.name, "max_steps": skill.max_steps, "ready": skill.policy is not None}

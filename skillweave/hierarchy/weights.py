@@ -1,0 +1,67 @@
+"""A whole hierarchy's weights as one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.types import Policy, SkillweaveError
+
+
+def write_weights(
+    path: Path, declaration: Declaration, policy: HierarchyPolicy, recipe: str | None
+) -> None:
+    """Write skills and selector; skills whose policies came ready are named, not saved."""
+    tensors: dict[str, Tensor] = {}
+    parts: dict[str, Any] = {}
+    named: list[tuple[str, Policy]] = [("selector", policy.selector)]
+    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
+        if skill.policy is None:
+            named.append((skill.name, own))
+    for name, own in named:
+        assert isinstance(own, AgentPolicy)
+        weights, parts[name] = own.to_file()
+        tensors |= {f"{name}/{k}": v for k, v in weights.items()}
+    header = {
+        "kind": "hierarchy",
+        "recipe": recipe,
+        "env": declaration.spec.name,
+        "skills": [s.name for s in declaration.skills],
+        "call_steps": declaration.call_steps,
+        "greedy_skills": declaration.greedy_skills,
+        "parts": parts,
+    }
+    write_tensors(path, tensors, header)
+
+
+def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy:
+    """The inverse of ``write_weights``; the declaration takes over the file's call length.
+
+    Raises:
+        SkillweaveError: the file is damaged, or belongs to other skills or another environment.
+    """
+    tensors, header = read_tensors(path)
+    names = [s.name for s in declaration.skills]
+    if header.get("kind") != "hierarchy":
+        raise SkillweaveError(f"{path} holds a {header.get('kind')}, not a hierarchy")
+    if header["skills"] != names or header["env"] != declaration.spec.name:
+        raise SkillweaveError(
+            f"{path} is of skills {', '.join(header['skills'])} on {header['env']}, but the "
+            f"hierarchy has {', '.join(names)} on {declaration.spec.name}"
+        )
+    declaration.call_steps, declaration.greedy_skills = header["call_steps"], header["greedy_skills"]
+
+    def part(name: str) -> AgentPolicy:
+        own = {k.split("/", 1)[1]: v for k, v in tensors.items() if k.split("/", 1)[0] == name}
+        if name not in header["parts"]:
+            raise SkillweaveError(f"{path} holds no weights of {name!r}")
+        return AgentPolicy.from_file(own, header["parts"][name], f"{path} ({name})")
+
+    policies = [s.policy or part(s.name) for s in declaration.skills]
+    return HierarchyPolicy(part("selector"), declaration.skill_set(policies))

@@ -1,0 +1,71 @@
+"""The tutorial's hierarchy on LunarLander-v3: stabilize, center, landing, and a selector.
+
+Observations: x, y, vx, vy, angle, angular velocity, left leg, right leg.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skillweave import PPO, Hierarchy, Reflex, Skill
+from skillweave.types import Array, Step
+
+X, Y, ANGLE, LEFT_LEG, RIGHT_LEG = 0, 1, 4, 6, 7
+
+
+def movement(step: Step, *columns: int) -> Array:
+    """``Σ (10·Δ)²`` over the columns; 0 on the first step, which has nothing before it."""
+    moved = step.next_obs[:, columns] - step.obs[:, columns]
+    return np.where(step.elapsed > 1, np.square(10.0 * moved).sum(axis=1), 0.0)
+
+
+class Stabilize(Skill):
+    """Stand still in the air: as little movement as possible."""
+
+    max_steps = 300
+
+    def reward(self, step: Step) -> Array:
+        """1 less the movement in x, y and angle; 10 for lasting, −100 for an episode's end."""
+        reward = 1.0 - movement(step, X, Y, ANGLE)
+        reward = np.where(step.timed_out, 10.0, reward)
+        return np.where(step.terminated | step.truncated, -100.0, reward)
+
+
+class Center(Skill):
+    """Go to the middle, x = 0, and stay there."""
+
+    max_steps = 300
+
+    def reward(self, step: Step) -> Array:
+        """1 less (2x)² and the movement in y and angle; 10 for lasting, −1000 for an end."""
+        reward = 1.0 - np.square(2.0 * step.next_obs[:, X]) - movement(step, Y, ANGLE)
+        reward = np.where(step.timed_out, 10.0, reward)
+        return np.where(step.terminated | step.truncated, -1000.0, reward)
+
+
+class Landing(Skill):
+    """Go down onto the pad at the origin."""
+
+    def reward(self, step: Step) -> Array:
+        """1 less x², y² and the angle; at an episode's end the environment's own reward."""
+        obs = step.next_obs
+        reward = 1.0 - np.square(obs[:, X]) - np.square(obs[:, Y]) - np.abs(obs[:, ANGLE])
+        return np.where(step.terminated | step.truncated, step.reward, reward)
+
+
+def landed(obs: Array) -> Array:
+    """A leg touches the ground."""
+    touching: Array = (obs[:, LEFT_LEG] > 0) | (obs[:, RIGHT_LEG] > 0)
+    return touching
+
+
+hierarchy = Hierarchy(
+    env="LunarLander-v3",
+    skills=[Stabilize(), Center(), Landing()],
+    call_steps=10,
+    reflexes=[Reflex(landed, action=0, name="engines off")],
+    algorithm=PPO(gamma=0.98),
+    selector=PPO(gamma=0.999, gae_lambda=0.98, n_steps=16),
+    skill_steps=600_000,
+    selector_steps=1_000_000,
+)

@@ -1,0 +1,190 @@
+"""Evaluation: whole episodes on Gymnasium's own environment, each from a seed of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from dataclasses import replace as replaced
+from typing import Any
+
+import numpy as np
+
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.spaces import same_space
+from skillweave.types import Array, Policy, SkillweaveError, Step
+
+FIRST_SEED = 1_000_000
+"""Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of whole episodes; ``str()`` is a line for people."""
+
+    returns: tuple[float, ...]
+    lengths: tuple[int, ...]
+    threshold: float | None  # the environment's reward_threshold
+    skill_steps: dict[str, int]  # steps of each skill
+    skill_calls: dict[str, int]  # calls of each skill
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return float(np.mean(self.returns))
+
+    @property
+    def solved_fraction(self) -> float | None:
+        """Share of episodes at the environment's reward threshold or more; None: it has none."""
+        if self.threshold is None:
+            return None
+        return float(np.mean(np.array(self.returns) >= self.threshold))
+
+    def to_json(self) -> dict[str, Any]:
+        """The summary as plain JSON."""
+        returns = np.array(self.returns)
+        n = len(returns)
+        std = float(returns.std(ddof=1)) if n > 1 else 0.0
+        half = 1.96 * std / np.sqrt(n)
+        total = sum(self.skill_steps.values())
+        return {
+            "episodes": n,
+            "mean": self.mean,
+            "std": std,
+            "ci95": [self.mean - half, self.mean + half],
+            "iqm": interquartile_mean(returns),
+            "median": float(np.median(returns)),
+            "min": float(returns.min()),
+            "max": float(returns.max()),
+            "threshold": self.threshold,
+            "solved_fraction": self.solved_fraction,
+            "length_mean": float(np.mean(self.lengths)),
+            "skill_usage": {k: v / total for k, v in self.skill_steps.items()},
+            "call_length_mean": {
+                k: v / self.skill_calls[k] for k, v in self.skill_steps.items() if self.skill_calls[k]
+            },
+        }
+
+    def __str__(self) -> str:
+        j = self.to_json()
+        line = (
+            f"{j['mean']:.1f} ± {j['std']:.1f} over {j['episodes']} episodes "
+            f"(95 % CI {j['ci95'][0]:.1f} to {j['ci95'][1]:.1f}, IQM {j['iqm']:.1f})"
+        )
+        if j["solved_fraction"] is not None:
+            line += f", {j['solved_fraction']:.0%} at {self.threshold:g} or more"
+        line += f", {j['length_mean']:.0f} steps an episode"
+        if self.skill_steps:
+            shares = ", ".join(f"{k} {v:.0%}" for k, v in j["skill_usage"].items())
+            line += f"; skills: {shares}"
+        return line
+
+
+def interquartile_mean(values: Array) -> float:
+    """Mean of the middle half (Agarwal et al. 2021); the ends of the half count in part."""
+    x = np.sort(np.asarray(values, float))
+    n = len(x)
+    cut = n / 4
+    weight = np.clip(np.minimum(np.arange(1, n + 1) - cut, n - cut - np.arange(n)), 0.0, 1.0)
+    return float((weight * x).sum() / weight.sum())
+
+
+def evaluate(
+    policy: Policy,
+    env: EnvSpec,
+    *,
+    episodes: int = 100,
+    seed: int = 0,
+    deterministic: bool = True,
+    num_envs: int = 100,
+) -> Evaluation:
+    """Play ``episodes`` whole episodes and score them by the environment's own reward.
+
+    Args:
+        seed: picks the episodes; the same seed gives the same starts to every policy.
+        deterministic: act greedily, else sample.
+        num_envs: environments side by side; does not change the result of a greedy policy.
+
+    Raises:
+        SkillweaveError: the policy was made for other spaces.
+    """
+    if episodes < 1:
+        raise SkillweaveError(f"episodes is {episodes}; it must be at least 1")
+    n = min(num_envs, episodes)
+    engine = make_engine(replaced(env, engine="sync"), n)
+    try:
+        _check_spaces(policy, engine.observation_space, engine.action_space, env.name)
+        return _play(policy, engine, env, episodes, seed, deterministic)
+    finally:
+        engine.close()
+
+
+def _play(
+    policy: Policy, engine: Any, env: EnvSpec, episodes: int, seed: int, deterministic: bool
+) -> Evaluation:
+    n = engine.num_envs
+    rng = np.random.default_rng([seed, 1])
+    seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+    episode = np.arange(n)  # which episode each environment plays
+    upcoming = n
+    engine.reset(0)
+    obs = np.array(engine.reset_some(episode, seeds[:n]))
+    memory, rows = policy.start(n), np.arange(n)
+    elapsed = np.zeros(n, np.int64)
+    returns, lengths = np.zeros(episodes), np.zeros(episodes, np.int64)
+    used = np.zeros(len(policy.labels), np.int64)
+    calls = np.zeros(len(policy.labels), np.int64)
+    never = np.zeros(n, bool)
+    while len(rows):
+        own = {k: v[rows] for k, v in memory.items()}
+        here = obs[rows]
+        action, own = policy.act(own, here, deterministic=deterministic, rng=rng)
+        raw = engine.step(action, rows)
+        elapsed[rows] += 1
+        acting = policy.acting(own)
+        if acting is not None:
+            used += np.bincount(acting, minlength=len(used))
+            begun = own["elapsed"] == 0 if "elapsed" in own else np.zeros(len(rows), bool)
+            calls += np.bincount(acting[begun], minlength=len(calls))
+        step = Step(
+            here, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            never[rows], elapsed[rows], raw.info,
+        )  # fmt: skip
+        own = policy.observe(own, step)
+        for k, v in own.items():
+            memory[k][rows] = v
+        obs[rows] = raw.next_obs
+        returns[episode[rows]] += raw.reward
+        lengths[episode[rows]] += 1
+        ended = rows[raw.terminated | raw.truncated]
+        if len(ended):
+            fresh = ended[: max(0, episodes - upcoming)]
+            given = seeds[upcoming : upcoming + len(fresh)] + [0] * (len(ended) - len(fresh))
+            obs[ended] = engine.reset_some(ended, given)
+            episode[fresh] = np.arange(upcoming, upcoming + len(fresh))
+            upcoming += len(fresh)
+            elapsed[ended] = 0
+            for k, v in policy.start(n).items():
+                memory[k][ended] = v[ended]
+            rows = np.setdiff1d(rows, ended[len(fresh) :])
+    threshold = None
+    if isinstance(env.env, str):
+        reference = env.make()
+        threshold = reference.spec.reward_threshold if reference.spec else None
+        reference.close()
+    return Evaluation(
+        tuple(returns.tolist()),
+        tuple(lengths.tolist()),
+        threshold,
+        dict(zip(policy.labels, used.tolist(), strict=True)),
+        dict(zip(policy.labels, calls.tolist(), strict=True)),
+    )
+
+
+def _check_spaces(policy: Policy, observation: Any, action: Any, name: str) -> None:
+    for kind, mine, theirs in (
+        ("observation", policy.observation_space, observation),
+        ("action", policy.action_space, action),
+    ):
+        if not same_space(mine, theirs):
+            raise SkillweaveError(
+                f"the policy was made for the {kind} space {mine}, but {name} has {theirs}"
+            )

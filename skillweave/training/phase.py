@@ -1,0 +1,108 @@
+"""A phase: one agent trained from its start, or from its latest clean cut, to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.ppo import State
+from skillweave.runs.directory import RunDirectory
+from skillweave.seeding import Seeds
+from skillweave.training.on_policy import Tick, train_on_policy
+from skillweave.types import VecEnv
+
+
+class Listener(Protocol):
+    """Is told how training goes: a progress bar, TensorBoard, Weights & Biases."""
+
+    def phase(self, name: str, budget: int) -> None:
+        """A phase begins, or goes on."""
+        ...
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """An update was made."""
+        ...
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """A phase is over."""
+        ...
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What to train: a name, settings, a budget in environment steps, and an environment."""
+
+    name: str
+    config: AlgorithmConfig
+    budget: int
+    make_env: Callable[[AlgorithmConfig], VecEnv]
+
+    def entry(self, **more: Any) -> dict[str, Any]:
+        """The manifest's entry before training."""
+        return {
+            "name": self.name,
+            "budget": self.budget,
+            "algorithm": config_to_json(self.config),
+            "status": "waiting",
+            **more,
+        }
+
+
+def train_phase(
+    phase: Phase, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...], cut_every: int
+) -> AgentPolicy:
+    """Train a phase to its end, or return its policy where it is done already.
+
+    The settings in the run count, not those of ``phase``: a resumed run goes on as it began.
+    """
+    entry = run.phase(phase.name)
+    if entry["status"] == "done":
+        return run.load_policy(phase.name)
+    config, budget = config_from_json(entry["algorithm"]), int(entry["budget"])
+    env = phase.make_env(config)
+    try:
+        algorithm = make_algorithm(config, env.observation_space, env.action_space)
+        found = run.load_checkpoint(State, phase.name)
+        state = algorithm.init([seeds / "member" / 0]) if found is None else found[0]
+        at = {"update": 0, "steps": 0, "seconds": 0.0}
+        if found is not None:
+            at = {k: found[1][k] for k in at}
+            run.rewind_metrics(found[1]["metrics_bytes"])
+        elif "metrics_bytes" in entry:
+            run.rewind_metrics(entry["metrics_bytes"])
+        else:
+            entry["metrics_bytes"] = run.metrics_size()
+        entry["status"] = "training"
+        run.save()
+        for listener in listeners:
+            listener.phase(phase.name, budget)
+        latest: dict[str, Any] = {"steps": at["steps"], "seconds": at["seconds"], "metrics": {}}
+
+        def on_tick(tick: Tick) -> None:
+            latest.update(steps=tick.steps, seconds=tick.seconds, metrics=tick.metrics)
+            record = {"phase": phase.name, "update": tick.update, "steps": tick.steps}
+            run.log(record | {"seconds": round(tick.seconds, 4)} | tick.metrics)
+            for listener in listeners:
+                listener.tick(phase.name, tick.steps, tick.seconds, tick.metrics)
+            if tick.cut:
+                header = {"phase": phase.name, "update": tick.update, "steps": tick.steps}
+                run.save_checkpoint(tick.state, header | {"seconds": tick.seconds})
+
+        train_on_policy(
+            algorithm, env, state, seeds, budget, cut_every=cut_every, on_tick=on_tick, **at
+        )
+    finally:
+        env.close()
+    policy = AgentPolicy.of(algorithm, state)
+    run.save_policy(phase.name, policy)
+    seconds = latest["seconds"]
+    entry.update(status="done", steps=latest["steps"], seconds=round(seconds, 3))
+    entry.update(steps_per_second=round(latest["steps"] / max(seconds, 1e-9), 1))
+    entry["final"] = latest["metrics"]
+    run.save()
+    for listener in listeners:
+        listener.done(phase.name, latest["steps"], seconds, latest["metrics"])
+    return policy

@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate, merge_moments
+
+
+def adam_state(members: int, size: int, dtype: torch.dtype = torch.float32):
+    zeros = torch.zeros(members, size, dtype=dtype)
+    return zeros, zeros.clone(), torch.zeros(members, dtype=dtype)
+
+
+def test_adam_equals_torchs_for_each_members_learning_rate():
+    generator = torch.Generator().manual_seed(0)
+    params = torch.randn(3, 5, generator=generator).double()
+    rates, scale = torch.tensor([[1e-3, 1e-2, 0.1], [1.0, 1e-4, 1e-6]]).double()
+    reference = [p.clone().requires_grad_() for p in params]
+    optimisers = [
+        torch.optim.Adam([p], lr=float(lr), eps=1e-5)
+        for p, lr in zip(reference, rates, strict=True)
+    ]
+    mu, nu, count = adam_state(3, 5, torch.float64)
+    for _ in range(20):
+        # tiny gradients too, where the place of eps in the formula shows
+        grad = torch.randn(3, 5, generator=generator).double() * scale[:, None]
+        for p, g, optimiser in zip(reference, grad, optimisers, strict=True):
+            p.grad = g.clone()
+            optimiser.step()
+        adam_(params, grad, mu, nu, count, rates)
+        torch.testing.assert_close(params, torch.stack(reference).detach())
+    assert count.tolist() == [20.0] * 3
+
+
+def test_adam_leaves_inactive_members_exactly_as_they_are():
+    generator = torch.Generator().manual_seed(0)
+    params, grad = torch.randn(2, 3, 4, generator=generator)
+    everyone = [params, *adam_state(3, 4)]
+    adam_(params, grad, *everyone[1:], torch.full((3,), 0.1))  # so that no state is zero
+    before, alone = [x.clone() for x in everyone], [x.clone() for x in everyone]
+    adam_(alone[0], grad, *alone[1:], torch.full((3,), 0.1))
+    active = torch.tensor([True, False, True])
+    adam_(params, grad, *everyone[1:], torch.full((3,), 0.1), active=active)
+    for now, old, full in zip(everyone, before, alone, strict=True):
+        assert torch.equal(now[1], old[1])
+        torch.testing.assert_close(now[active], full[active])
+        assert not torch.equal(now[active], old[active])
+
+
+def test_gradients_are_clipped_for_each_member_by_itself():
+    grad = torch.tensor([[3.0, 4.0], [0.3, 0.4], [30.0, 40.0]])
+    norm = clip_grad_norm_(grad, torch.tensor([1.0, 1.0, 5.0]))
+    torch.testing.assert_close(norm, torch.tensor([5.0, 0.5, 50.0]))
+    expected = torch.tensor([[0.6, 0.8], [0.3, 0.4], [3.0, 4.0]])
+    torch.testing.assert_close(grad, expected, rtol=1e-5, atol=0)
+
+
+def test_a_zero_gradient_survives_clipping():
+    grad = torch.zeros(1, 3)
+    assert clip_grad_norm_(grad, torch.ones(1)).tolist() == [0.0]
+    assert grad.tolist() == [[0.0] * 3]
+
+
+def test_the_rate_follows_the_kl_and_stays_in_its_range():
+    kl = torch.tensor([0.021, 0.019, 0.0051, 0.0049, 1.0, 0.0])
+    rate = torch.tensor([3e-3, 3e-3, 3e-3, 3e-3, 1.1e-5, 9e-3])
+    got = kl_adapted_rate(rate, kl, torch.full((6,), 0.01), 1e-5, 1e-2)
+    assert got.tolist() == pytest.approx([2e-3, 3e-3, 3e-3, 4.5e-3, 1e-5, 1e-2])
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=5), st.integers(0, 2**32 - 1))
+def test_merged_moments_are_those_of_all_data_together(sizes, seed):
+    rng = np.random.default_rng(seed)
+    scale, shift = rng.uniform(0.1, 10, (2, 2, 1, 3))
+    batches = [rng.normal(size=(2, n, 3)) * scale + shift for n in sizes]
+    mean, var, count = torch.zeros(2, 3).double(), torch.ones(2, 3).double(), torch.zeros(2).double()
+    for batch in batches:
+        mean, var, count = merge_moments(mean, var, count, torch.from_numpy(batch))
+    together = np.concatenate(batches, axis=1)
+    np.testing.assert_allclose(mean, together.mean(1), rtol=1e-9)
+    np.testing.assert_allclose(var, together.var(1), rtol=1e-9, atol=1e-12)
+    assert count.tolist() == [sum(sizes)] * 2

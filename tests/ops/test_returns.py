@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skillweave.ops.returns import explained_variance, gae, normalise
+
+
+def one(*numbers: float) -> torch.Tensor:
+    """One member, T steps, one environment: (1, T, 1)."""
+    return torch.tensor(numbers).reshape(1, -1, 1)
+
+
+def advantages(reward, discount, value, next_value, last, lam=0.5):
+    a = gae(one(*reward), one(*discount), one(*value), one(*next_value), one(*last), torch.tensor([lam]))
+    assert a.shape == (1, len(reward), 1)
+    return a.flatten().tolist()
+
+
+def test_gae_sums_discounted_deltas_up_to_a_termination():
+    # δ₁ = 2 − 5 = −3; δ₀ = 1 + 0.9·5 − 4 = 1.5; A₀ = 1.5 + 0.9·0.5·(−3) = 0.15
+    got = advantages([1.0, 2.0], [0.9, 0.0], [4.0, 5.0], [5.0, 99.0], [False, True])
+    assert got == pytest.approx([0.15, -3.0], abs=1e-6)
+
+
+def test_gae_bootstraps_a_truncation_and_cuts_the_trace_there():
+    # δ₀ = 1 + 0.9·10 − 4 = 6, and nothing of step 1, which belongs to another episode
+    got = advantages([1.0, 2.0], [0.9, 0.9], [4.0, 5.0], [10.0, 20.0], [True, True])
+    assert got == pytest.approx([6.0, 15.0])
+
+
+def test_gae_uses_the_discount_of_each_call():
+    # A call of τ = 3 steps: 0.9³ = 0.729. δ₁ = 0 + 0.9·10 − 2 = 7; δ₀ = 1 + 0.729·2 − 0 = 2.458
+    got = advantages([1.0, 0.0], [0.729, 0.9], [0.0, 2.0], [2.0, 10.0], [False, True])
+    assert got == pytest.approx([2.458 + 0.729 * 0.5 * 7.0, 7.0])
+
+
+def test_gae_without_lambda_is_the_one_step_error_and_with_lambda_one_the_whole_return():
+    args = [1.0, 1.0, 1.0], [0.5, 0.5, 0.5], [3.0, 2.0, 1.0], [2.0, 1.0, 8.0], [False, False, True]
+    assert advantages(*args, lam=0.0) == pytest.approx([-1.0, -0.5, 4.0])
+    assert advantages(*args, lam=1.0)[0] == pytest.approx(1 + 0.5 + 0.25 + 0.125 * 8 - 3)
+
+
+def test_gae_ignores_the_next_value_where_the_discount_is_zero_even_if_it_is_not_a_number():
+    # A physics engine may well terminate *because* its last observation is not finite.
+    got = advantages([1.0, 2.0], [0.9, 0.0], [4.0, 5.0], [5.0, float("nan")], [False, True])
+    assert got == pytest.approx([0.15, -3.0], abs=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_gae_equals_the_scalar_recursion_for_every_member_and_environment(seed):
+    rng = np.random.default_rng(seed)
+    p, t, b = rng.integers(1, 5, 3)
+    reward, value, next_value = rng.normal(size=(3, p, t, b))
+    discount, last = rng.uniform(size=(p, t, b)), rng.uniform(size=(p, t, b)) < 0.3
+    lam, expected = rng.uniform(size=p), np.zeros((p, t, b))
+    for i, k in np.ndindex(p, b):
+        tail = 0.0
+        for j in reversed(range(t)):
+            delta = reward[i, j, k] + discount[i, j, k] * next_value[i, j, k] - value[i, j, k]
+            tail = delta + (0.0 if last[i, j, k] else discount[i, j, k] * lam[i] * tail)
+            expected[i, j, k] = tail
+    tensors = [torch.from_numpy(x) for x in (reward, discount, value, next_value, last, lam)]
+    np.testing.assert_allclose(gae(*tensors).numpy(), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_normalise_works_on_each_member_by_itself():
+    x = torch.stack([torch.arange(6.0), 100.0 * torch.arange(6.0) + 7.0]).reshape(2, 3, 2)
+    y = normalise(x)
+    torch.testing.assert_close(y.flatten(1).mean(1), torch.zeros(2), atol=1e-6, rtol=0)
+    torch.testing.assert_close(y.flatten(1).std(1, unbiased=False), torch.ones(2))
+    torch.testing.assert_close(y[0], y[1], atol=1e-5, rtol=0)
+
+
+def test_normalise_of_equal_numbers_is_zero():
+    assert normalise(torch.full((1, 4), 3.0)).tolist() == [[0.0] * 4]
+
+
+def test_explained_variance_is_one_for_the_target_and_zero_for_a_constant():
+    target = torch.tensor([[1.0, 2.0, 3.0, 4.0]]).expand(3, 4)
+    value = torch.stack([target[0], torch.full((4,), 9.0), torch.tensor([4.0, 3.0, 2.0, 1.0])])
+    # the third: residuals −3, −1, 1, 3 with variance 5, over 1.25
+    torch.testing.assert_close(explained_variance(value, target), torch.tensor([1.0, 0.0, -3.0]))
+
+
+def test_explained_variance_of_a_constant_target_is_finite():
+    assert torch.isfinite(explained_variance(torch.zeros(1, 4), torch.ones(1, 4))).all()

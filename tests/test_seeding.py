@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from skillweave.seeding import Seeds
+
+paths = st.lists(st.one_of(st.text(max_size=8), st.integers(0, 2**20)), max_size=4)
+
+
+def at(root, path) -> Seeds:
+    node = Seeds(root)
+    for name in path:
+        node = node / name
+    return node
+
+
+def draws(node: Seeds):
+    uniform = torch.rand(4, generator=node.torch())
+    return [*node.numpy().random(4), *uniform.tolist(), node.integer(), *node.integers(3)]
+
+
+@given(st.integers(0, 2**64), paths)
+def test_the_same_path_gives_the_same_streams(root, path):
+    assert draws(at(root, path)) == draws(at(root, path))
+
+
+@given(st.integers(0, 2**64), paths, paths)
+def test_different_paths_give_different_streams(root, one, other):
+    assume(one != other)
+    first, second = at(root, one), at(root, other)
+    assert not np.array_equal(first.numpy().random(4), second.numpy().random(4))
+    assert not torch.equal(
+        torch.rand(4, generator=first.torch()), torch.rand(4, generator=second.torch())
+    )
+
+
+def test_different_roots_give_different_streams():
+    assert draws(Seeds(1) / "landing") != draws(Seeds(2) / "landing")
+
+
+def test_a_number_is_not_the_text_that_spells_it():
+    assert draws(Seeds(7) / 5) != draws(Seeds(7) / "5")
+
+
+def test_the_order_of_names_matters():
+    assert draws(Seeds(7) / "a" / "b") != draws(Seeds(7) / "b" / "a")
+
+
+@given(st.integers(0, 2**64), paths)
+def test_integers_fit_in_31_bits(root, path):
+    node = at(root, path)
+    assert all(0 <= s < 2**31 for s in [node.integer(), *node.integers(5)])
+
+
+def test_integers_differ_from_each_other():
+    assert len(set(Seeds(0).integers(1000))) == 1000
+
+
+def test_no_global_generator_is_touched():
+    np_state, torch_state = np.random.get_state()[1].copy(), torch.random.get_rng_state()  # noqa: NPY002
+    draws(Seeds(3) / "x")
+    assert np.array_equal(np.random.get_state()[1], np_state)  # noqa: NPY002
+    assert torch.equal(torch.random.get_rng_state(), torch_state)
+
+
+def test_streams_are_the_same_in_every_version():
+    """A saved run resumes only if these never change; so they are written down."""
+    node = Seeds(7) / "landing" / 17
+    assert node.integer() == 2105931619
+    assert node.numpy().integers(2**31, size=2).tolist() == [1592081194, 723317168]
+
+
+@pytest.mark.parametrize("name", ["", "ü", "a/b"])
+def test_any_text_is_a_name(name):
+    assert 0 <= (Seeds(0) / name).integer()

@@ -1,0 +1,244 @@
+"""Environments small enough to know every number of by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.seeding import Seeds
+from skillweave.types import Array, VecStep
+
+
+class Ledger(gym.Env):
+    """Its observation is (tag, episode, step, last action): a phantom step would be seen.
+
+    Episode e lasts 2 + e % 3 steps; it terminates if e is even, else it is truncated. The tag is
+    drawn at each reset; the reward is 10·step + action.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self) -> None:
+        self.episode = -1
+
+    def _obs(self, action: int) -> Array:
+        return np.array([self.tag, self.episode, self.t, action], np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.episode, self.t = self.episode + 1, 0
+        self.tag = float(self.np_random.integers(1 << 20))
+        return self._obs(-1), {}
+
+    def step(self, action: int) -> Any:
+        assert self.action_space.contains(action)
+        assert self.t < self.length, "stepped after the end"
+        self.t += 1
+        ended, even = self.t == self.length, self.episode % 2 == 0
+        info = {"t": self.t, "nested": {"t": self.t}}
+        return self._obs(action), 10.0 * self.t + action, ended and even, ended and not even, info
+
+    @property
+    def length(self) -> int:
+        return 2 + self.episode % 3
+
+
+class Rememberer(gym.Env):
+    """Keeps the array it was given as an action; the reward is how much the action changed."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.previous = np.zeros(1, np.float32)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Array) -> Any:
+        change = float(np.abs(action - self.previous).sum())
+        self.previous = action
+        return np.zeros(1, np.float32), change, False, False, {}
+
+
+class Toy:
+    """A VecEnv whose N environments are written as one; subclasses say ``first`` and ``play``."""
+
+    observation_space: gym.Space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space: gym.Space = gym.spaces.Discrete(2)
+
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs = num_envs
+        self.obs: Array = np.empty(0)
+
+    def first(self, rows: Array) -> Array:
+        """First observations of the environments ``rows``."""
+        return np.zeros((len(rows), 1), np.float32)
+
+    def play(self, action: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """next_obs, reward, terminated, truncated, steps."""
+        raise NotImplementedError
+
+    def mask(self) -> Array | None:
+        return None
+
+    def reset(self, seeds: Seeds) -> Array:
+        self.rng = seeds.numpy()
+        self.t = np.zeros(self.num_envs, np.int64)
+        self.obs = self.first(np.arange(self.num_envs))
+        return self.obs
+
+    def step(self, action: Array) -> VecStep:
+        self.t += 1
+        next_obs, reward, terminated, truncated, steps = self.play(action)
+        self.obs = next_obs.copy()
+        if (rows := np.flatnonzero(terminated | truncated)).size:
+            self.obs[rows] = self.first(rows)
+            self.t[rows] = 0
+        reward = reward.astype(np.float32)
+        return VecStep(next_obs, self.obs, reward, terminated, truncated, steps, self.mask(), {})
+
+    def close(self) -> None:
+        pass
+
+    @property
+    def ones(self) -> Array:
+        return np.ones(self.num_envs, np.int64)
+
+    @property
+    def never(self) -> Array:
+        return np.zeros(self.num_envs, bool)
+
+
+class Identity(Toy):
+    """The reward is 1 where the action equals the observation, else 0; episodes of 4 steps."""
+
+    observation_space = gym.spaces.Discrete(4)
+    action_space = gym.spaces.Discrete(4)
+
+    def first(self, rows: Array) -> Array:
+        return self.rng.integers(4, size=len(rows))
+
+    def play(self, action: Array) -> Any:
+        reward = action == self.obs
+        return self.first(self.ones), reward, self.t == 4, self.never, self.ones
+
+
+class BoxIdentity(Toy):
+    """The reward is −(action − observation)²; actions span [−2, 2]."""
+
+    action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+    def first(self, rows: Array) -> Array:
+        return self.rng.uniform(-1.0, 1.0, (len(rows), 1)).astype(np.float32)
+
+    def play(self, action: Array) -> Any:
+        reward = -np.square(action - self.obs)[:, 0]
+        return self.first(self.ones), reward, self.t == 4, self.never, self.ones
+
+
+class Masked(Toy):
+    """Action a pays a, so the forbidden one is often the best; records what was forbidden."""
+
+    observation_space = gym.spaces.Discrete(3)
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self.taken_though_forbidden = 0
+
+    def first(self, rows: Array) -> Array:
+        return self.rng.integers(3, size=len(rows))
+
+    def mask(self) -> Array:
+        """The action that equals the observation is forbidden."""
+        return np.arange(3)[None] != self.obs[:, None]
+
+    def play(self, action: Array) -> Any:
+        self.taken_though_forbidden += int((action == self.obs).sum())
+        return self.first(self.ones), action, self.t == 1, self.never, self.ones
+
+
+class Allowance(Toy):
+    """Reward 1 a step, cut by a time limit of 5 steps; nothing tells the steps apart."""
+
+    def play(self, action: Array) -> Any:
+        return np.zeros((self.num_envs, 1), np.float32), self.ones, self.never, self.t == 5, self.ones
+
+
+class Countdown(Toy):
+    """Reward 1 a step, terminated after 5; the observation is the step."""
+
+    observation_space = gym.spaces.Discrete(6)
+
+    def first(self, rows: Array) -> Array:
+        return np.zeros(len(rows), np.int64)
+
+    def play(self, action: Array) -> Any:
+        return self.t.copy(), self.ones, self.t == 5, self.never, self.ones
+
+
+class Calls(Toy):
+    """A semi-MDP: action 0 lasts 1 step and pays 1, action 1 lasts 10 steps and pays 3."""
+
+    def __init__(self, num_envs: int, allowed: tuple[bool, bool] = (True, True)) -> None:
+        super().__init__(num_envs)
+        self.allowed = allowed
+
+    def mask(self) -> Array:
+        return np.tile(self.allowed, (self.num_envs, 1))
+
+    def play(self, action: Array) -> Any:
+        still = np.zeros((self.num_envs, 1), np.float32)
+        return still, 1 + 2 * action, self.never, self.never, 1 + 9 * action
+
+
+class Clockwork(Toy):
+    """Deterministic, each column by itself: obs' = 2·obs + action + column (mod 5)."""
+
+    observation_space = gym.spaces.Discrete(5)
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self, columns: range) -> None:
+        super().__init__(len(columns))
+        self.columns = np.array(columns)
+
+    def first(self, rows: Array) -> Array:
+        return self.columns[rows] % 5
+
+    def play(self, action: Array) -> Any:
+        next_obs = (2 * self.obs + action + self.columns) % 5
+        reward, truncated = (action == self.obs % 3) * 1.0, self.t == 3 + self.columns % 4
+        return next_obs, reward, (next_obs == 4) & ~truncated, truncated, self.ones
+
+
+class Broken(Identity):
+    """Pays NaN."""
+
+    def play(self, action: Array) -> Any:
+        next_obs, reward, *rest = super().play(action)
+        return next_obs, reward * np.nan, *rest
+
+
+@dataclass(frozen=True)
+class SeedsOfMember:
+    """A seed tree in which the only member, 0, has the streams of member ``member``."""
+
+    seeds: Seeds
+    member: int
+
+    def __truediv__(self, name: str) -> Any:
+        node = self.seeds / name
+        return _Renumbered(node, self.member) if name in ("act", "learn") else node
+
+
+@dataclass(frozen=True)
+class _Renumbered:
+    node: Seeds
+    member: int
+
+    def __truediv__(self, member: int) -> Seeds:
+        assert member == 0
+        return self.node / self.member
