@@ -11,6 +11,7 @@ import numpy as np
 
 from skillweave import recipes
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -78,6 +79,18 @@ class Hierarchy(Declaration):
     def pretrained(name: str) -> Run:
         """A shipped recipe with its shipped weights."""
         return recipes.load(name).load_weights(recipes.weights_path(name))
+
+    @classmethod
+    def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
+        """The hierarchy of a run that needs none of the user's code (plain data says it all)."""
+        spec = EnvSpec(manifest["env"], kwargs=manifest["env_kwargs"])
+        if not spec.is_data:
+            raise SkillweaveError(f"the environment {spec.name!r} names code; give the recipe")
+        skills = [
+            type(s["name"], (Skill,), {"name": s["name"], "max_steps": s["max_steps"]})()
+            for s in manifest["skills"]
+        ]
+        return cls(spec, skills, call_steps=manifest["call_steps"])
 
     def _go_on(self, run: RunDirectory, quiet: bool) -> Run:
         with ExitStack() as stack:

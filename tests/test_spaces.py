@@ -1,3 +1,5 @@
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -6,7 +8,13 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Te
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skillweave.spaces import action_codec, obs_codec
+from skillweave.spaces import (
+    action_codec,
+    obs_codec,
+    same_space,
+    space_from_json,
+    space_to_json,
+)
 from skillweave.types import SkillweaveError
 
 
@@ -61,11 +69,15 @@ def test_only_real_numbers_are_to_be_normalised():
 
 @pytest.mark.parametrize("space", [Dict({"a": Discrete(2)}), Text(3)], ids=str)
 def test_an_unsupported_observation_space_says_which_are_supported(space):
-    with pytest.raises(SkillweaveError, match=r"observation .* Box, Discrete, MultiDiscrete, MultiB"):
+    with pytest.raises(
+        SkillweaveError, match=r"observation .* Box, Discrete, MultiDiscrete, MultiB"
+    ):
         obs_codec(space)
 
 
-@pytest.mark.parametrize("space", [MultiDiscrete([2, 2]), MultiBinary(2), Box(0, 9, (1,), np.int64)], ids=str)
+@pytest.mark.parametrize(
+    "space", [MultiDiscrete([2, 2]), MultiBinary(2), Box(0, 9, (1,), np.int64)], ids=str
+)
 def test_an_unsupported_action_space_says_which_are_supported(space):
     with pytest.raises(SkillweaveError, match=r"action space .* supported are: Discrete, Box"):
         action_codec(space)
@@ -111,3 +123,50 @@ def test_every_action_lies_within_a_bounded_space(a, b, actions):
 def test_every_action_lies_within_a_space_bounded_on_one_side(bound, actions, below):
     low, high = (bound, np.inf) if below else (-np.inf, bound)
     assert_within(Box(low, high, (1,), np.float32), actions)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Box(np.float32([-np.inf, 0.1]), np.float32([np.inf, 1 / 3])),
+        Box(0, 255, (2, 2, 3), np.uint8),
+        Discrete(4, start=-2),
+        MultiDiscrete([[2, 3], [4, 5]], start=[[0, 1], [2, 3]]),
+        MultiBinary(3),
+        MultiBinary([2, 3]),
+    ],
+    ids=str,
+)
+def test_a_space_survives_json(space):
+    back = space_from_json(json.loads(json.dumps(space_to_json(space))))
+    assert same_space(space, back)
+    assert back == space
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {},
+        {"type": "Text"},
+        {"type": "Discrete"},
+        {"type": "Discrete", "n": 0, "start": 0},
+        {"type": "Discrete", "n": "three", "start": 0},
+        {"type": "Box", "shape": [2], "dtype": "float32", "low": [0], "high": [1, 2, 3]},
+        {"type": "Box", "shape": [1], "dtype": "wide", "low": [0], "high": [1]},
+        {"type": "MultiDiscrete", "nvec": [0], "start": [0]},
+    ],
+    ids=str,
+)
+def test_json_that_is_no_space_is_an_error_for_people(data):
+    with pytest.raises(SkillweaveError, match="space"):
+        space_from_json(data)
+
+
+def test_spaces_are_the_same_if_a_policy_of_one_can_act_in_the_other():
+    assert same_space(Box(-1, 1, (2,)), Box(-9, 9, (2,)))
+    assert not same_space(Box(-1, 1, (2,)), Box(-1, 1, (3,)))
+    assert same_space(Discrete(3), Discrete(3))
+    assert not same_space(Discrete(3), Discrete(4))
+    assert not same_space(Discrete(3), MultiBinary(3))
+    assert not same_space(MultiDiscrete([2, 3]), MultiDiscrete([3, 2]))
+    assert not same_space(Discrete(3), Discrete(3, start=1))  # another action altogether

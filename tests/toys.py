@@ -12,6 +12,19 @@ from skillweave.seeding import Seeds
 from skillweave.types import Array, VecStep
 
 
+def cartpole(obs: Array, action: int) -> Array:
+    """CartPole's true successor of an observation."""
+    env = gym.make("CartPole-v1").unwrapped
+    env.reset()
+    env.state = obs.astype(np.float64)
+    return env.step(int(action))[0]
+
+
+def actions(n: int, t: int) -> Array:
+    """Left and right by turns."""
+    return (np.arange(n) + t) % 2
+
+
 class Ledger(gym.Env):
     """Its observation is (tag, episode, step, last action): a phantom step would be seen.
 
@@ -165,7 +178,13 @@ class Allowance(Toy):
     """Reward 1 a step, cut by a time limit of 5 steps; nothing tells the steps apart."""
 
     def play(self, action: Array) -> Any:
-        return np.zeros((self.num_envs, 1), np.float32), self.ones, self.never, self.t == 5, self.ones
+        return (
+            np.zeros((self.num_envs, 1), np.float32),
+            self.ones,
+            self.never,
+            self.t == 5,
+            self.ones,
+        )
 
 
 class Countdown(Toy):

@@ -112,6 +112,16 @@ class Declaration:
         """All training steps of skills and selector: the flat baseline's budget."""
         return sum(self.budget(s) for s in self.skills) + self.selector_steps
 
+    def scale(self, factor: float) -> None:
+        """Multiply every training budget, in place."""
+        if not 0.0 < factor < float("inf"):
+            raise SkillweaveError(f"scale is {factor}; it must be positive and finite")
+        for skill in self.skills:
+            if skill.steps is not None:
+                skill.steps = max(1, round(skill.steps * factor))
+        self.skill_steps = max(1, round(self.skill_steps * factor))
+        self.selector_steps = max(1, round(self.selector_steps * factor))
+
     def skill_set(self, policies: Sequence[Policy]) -> SkillSet:
         """The skills with their policies, ready to be called."""
         return SkillSet(

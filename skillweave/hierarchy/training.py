@@ -32,7 +32,7 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "call_steps": declaration.call_steps,
         "greedy_skills": declaration.greedy_skills,
         "reflexes": [r.name for r in declaration.reflexes],
-        "needs_recipe": not declaration.is_data,
+        "needs_recipe": not (declaration.spec.is_data if flat else declaration.is_data),
         "phases": [p.entry() for p in phases],
     }
 

@@ -22,6 +22,11 @@ def names() -> list[str]:
     return sorted(p.stem.replace("_", "-") for p in _HERE.glob("[a-z]*.py"))
 
 
+def source(name: str) -> Path:
+    """The file of a shipped recipe."""
+    return _HERE / f"{name.replace('-', '_')}.py"
+
+
 def load(recipe: str) -> Hierarchy:
     """The hierarchy of a shipped recipe, or of a Python file that defines one.
 
@@ -64,9 +69,9 @@ def weights_path(name: str) -> Path:
     Raises:
         SkillweaveError: there are none.
     """
-    path = _HERE / f"{name.replace('-', '_')}.safetensors"
+    path = source(name).with_suffix(".safetensors")
     if not path.exists():
-        with_weights = [n for n in names() if (_HERE / f"{n.replace('-', '_')}.safetensors").exists()]
+        with_weights = [n for n in names() if source(n).with_suffix(".safetensors").exists()]
         raise SkillweaveError(
             f"no weights are shipped for {name!r}; there are for: {', '.join(with_weights) or 'none'}"
         )

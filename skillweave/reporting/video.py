@@ -6,11 +6,12 @@ import functools
 import importlib
 import os
 import struct
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
+from subprocess import PIPE
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
 import gymnasium as gym
@@ -23,30 +24,17 @@ if TYPE_CHECKING:
     from skillweave.envs.make import EnvSpec
 
 RGB: TypeAlias = tuple[int, int, int]
-Label: TypeAlias = Callable[[Memory], tuple[str, RGB]]
 
 # From Okabe & Ito (2008), without the yellow that is lost on white, and four more, chosen to be
 # far from these and from each other as people with a protan, deutan or tritan deficiency see them
 # (Machado et al. 2009). Each has a contrast of at least 3 to black and 1.9 to white.
 PALETTE: tuple[RGB, ...] = (
-    (230, 159, 0),
-    (0, 114, 178),
-    (210, 0, 60),
-    (142, 202, 112),
-    (120, 0, 255),
-    (86, 180, 233),
-    (0, 158, 115),
-    (213, 94, 0),
-    (204, 121, 167),
-    (135, 105, 255),
-)
-WHITE: RGB = (255, 255, 255)
-BLACK: RGB = (0, 0, 0)
-BAND: RGB = (28, 28, 32)  # the ground of the caption
-LINE: RGB = (110, 110, 118)  # parts it from a frame as dark as itself
-
-MIN_WIDTH = 240  # pixels; narrower frames are enlarged, or no caption would fit
-MAX_WIDTH = 960  # pixels; wider frames are reduced, for small files
+    (230, 159, 0), (0, 114, 178), (210, 0, 60), (142, 202, 112), (120, 0, 255),
+    (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (135, 105, 255),
+)  # fmt: skip
+WHITE, BLACK = (255, 255, 255), (0, 0, 0)
+BAND, LINE = (28, 28, 32), (110, 110, 118)  # a caption's ground, and what parts it from the frame
+MIN_WIDTH, MAX_WIDTH = 240, 960  # pixels; smaller frames are enlarged, larger ones reduced
 UNLIMITED = 10_000  # steps after which an episode is cut that nothing else would end
 HOLD = 1.0  # seconds that the last frame of an episode stands
 
@@ -113,14 +101,13 @@ def _chip(text: str, color: RGB, size: int, width: int) -> Array:
     """A name on its colour, at most ``width`` pixels wide."""
     # Black and white contrast equally with a relative luminance of 0.18 (WCAG 2).
     luminance = (np.asarray(color) / 255) ** 2.2 @ (0.2126, 0.7152, 0.0722)
-    short, room = text, width - 2 * (size // 2)
-    while text and _font(size).getlength(short) > room:
+    short, pad = text, size // 2
+    while text and _font(size).getlength(short) > width - 2 * pad:
         text = text[:-1]
-        short = f"{text}..."
-    name = _text(short if text else "", size, BLACK if luminance > 0.18 else WHITE, color)
-    chip = np.empty((name.shape[0] + 2, name.shape[1] + 2 * (size // 2), 3), np.uint8)
-    chip[:] = color
-    _paste(chip, name, size // 2)
+        short = f"{text}..." if text else ""
+    name = _text(short, size, BLACK if luminance > 0.18 else WHITE, color)
+    chip = np.full((name.shape[0] + 2, name.shape[1] + 2 * pad, 3), color, np.uint8)
+    _paste(chip, name, pad)
     return chip
 
 
@@ -128,8 +115,8 @@ class VideoWriter:
     """Writes a video frame by frame; the file appears only when all of it is there.
 
     Args:
-        path: ends in .gif (needs Pillow) or .mp4 (needs imageio-ffmpeg). An existing file is
-            replaced at the end, and stays as it is if the writing fails or is interrupted.
+        path: ends in .gif or .mp4. An existing file is replaced at the end, and stays as it is
+            if the writing fails or is interrupted.
         fps: frames per second.
 
     Raises:
@@ -139,11 +126,10 @@ class VideoWriter:
 
     def __init__(self, path: str | Path, fps: float) -> None:
         self.path, self.frames = Path(path), 0
-        kind = _SINKS.get(self.path.suffix.lower())
+        kinds: dict[str, type[_Gif] | type[_Mp4]] = {".gif": _Gif, ".mp4": _Mp4}
+        kind = kinds.get(self.path.suffix.lower())
         if kind is None:
-            raise SkillweaveError(
-                f"cannot write a video to {str(path)!r}: the name must end in {' or '.join(_SINKS)}"
-            )
+            raise SkillweaveError(f"cannot write a video to {path}: it must end in .gif or .mp4")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder, since renaming works only within a file system, and with the suffix
         # last, since ffmpeg goes by it.
@@ -164,14 +150,9 @@ class VideoWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
-            self._sink.close()
+            self._sink.close(complete=kind is None)
             if kind is None and not self.frames:
                 raise SkillweaveError(f"no frames were given for {self.path}")
             if kind is None:
@@ -184,33 +165,34 @@ class _Mp4:
     """H.264 as every browser plays it, through a pipe to ffmpeg."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        self._ffmpeg: Any = _extra("imageio_ffmpeg")
-        self._path, self._fps, self._pipe = path, fps, None
+        self._ffmpeg = _extra("imageio_ffmpeg").get_ffmpeg_exe()
+        self._path, self._fps = path, fps
+        self._process: Any = None
 
     def add(self, frame: Array, seconds: float | None) -> None:
         # The colours have half the resolution, so both sides must be even.
-        odd = [(0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)]
-        frame = np.ascontiguousarray(np.pad(frame, odd, mode="edge"))
-        if self._pipe is None:
-            self._pipe = self._ffmpeg.write_frames(
-                str(self._path), (frame.shape[1], frame.shape[0]), fps=self._fps, quality=8,
-                macro_block_size=2, ffmpeg_log_level="error",
-                output_params=["-movflags", "+faststart"],
-            )  # fmt: skip
-            self._pipe.send(None)
-        for _ in range(1 if seconds is None else max(1, round(seconds * self._fps))):
-            self._pipe.send(frame)
+        frame = np.pad(frame, [(0, n % 2) for n in frame.shape[:2]] + [(0, 0)], mode="edge")
+        if self._process is None:
+            size = f"{frame.shape[1]}x{frame.shape[0]}"
+            raw = f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {size} -r {self._fps} -i -"
+            coded = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
+            command = [self._ffmpeg, *raw.split(), *coded.split(), str(self._path)]
+            self._process = subprocess.Popen(command, stdin=PIPE, stderr=PIPE)
+        try:
+            for _ in range(1 if seconds is None else max(1, round(seconds * self._fps))):
+                self._process.stdin.write(frame.tobytes())
+        except BrokenPipeError:
+            self.close(complete=True)
 
-    def close(self) -> None:
-        if self._pipe is not None:
-            self._pipe.close()
+    def close(self, complete: bool) -> None:
+        process, self._process = self._process, None
+        complaint = process.communicate()[1] if process else b""
+        if complete and process and process.returncode:
+            raise SkillweaveError(f"ffmpeg could not write {self._path}: {complaint.decode()}")
 
 
 class _Gif:
-    """An endless GIF; each frame holds only what has changed since the one before.
-
-    Pillow's own writer keeps all frames in memory until the end.
-    """
+    """An endless GIF, streamed; each frame holds only what has changed since the one before."""
 
     CLEAR = 255  # the index that leaves a pixel as it is
 
@@ -229,8 +211,8 @@ class _Gif:
         index[index == self.CLEAR] = 0
         changed = index != self._shown
         self._shown = index
-        box = (_extent(changed.any(1)), _extent(changed.any(0)))
-        patch = self._image.fromarray(np.where(changed, index, np.uint8(self.CLEAR))[box])
+        rows, columns = _extent(changed.any(1)), _extent(changed.any(0))
+        patch = self._image.fromarray(np.where(changed, index, np.uint8(self.CLEAR))[rows, columns])
         patch.putpalette(self._table.getpalette())
         # What rounding to hundredths takes from one frame goes to the next. Browsers slow down
         # frames of less than two.
@@ -238,8 +220,7 @@ class _Gif:
         time = max(2, round(self._due) - self._written)
         self._written += time
         settings = {"duration": 10 * time, "disposal": 1, "transparency": self.CLEAR}
-        for block in self._codec.getdata(patch, (box[1].start, box[0].start), **settings):
-            self._file.write(block)
+        self._file.writelines(self._codec.getdata(patch, (columns.start, rows.start), **settings))
 
     def _start(self, first: Any) -> None:
         """One palette for all, or colours would flicker.
@@ -247,33 +228,27 @@ class _Gif:
         The captions' own colours, so that text stays crisp, a cube for whatever is to come, and
         the best for the first frame. ``CLEAR`` repeats the first, and so shows nothing of its own.
         """
-        levels = np.linspace(0, 255, 5)
-        cube = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(-1, 3)
-        best = first.quantize(self.CLEAR - 4 - len(PALETTE) - len(cube)).getpalette()
-        colors = np.tile(BAND, (256, 1)).astype(np.uint8)
-        wanted = np.concatenate(
-            [(BAND, LINE, WHITE, BLACK, *PALETTE), cube, np.reshape(best, (-1, 3))]
-        )
+        own, cube = (BAND, LINE, WHITE, BLACK, *PALETTE), np.indices((5, 5, 5)).reshape(3, -1).T
+        best = first.quantize(self.CLEAR - len(own) - len(cube)).getpalette()
+        wanted = np.concatenate([own, cube * 255 // 4, np.reshape(best, (-1, 3))])
+        colors = np.full((256, 3), BAND, np.uint8)
         colors[: len(wanted)] = wanted
         self._table = self._image.new("P", (1, 1))
         self._table.putpalette(colors.tobytes())
         self._shown = np.full(first.size[::-1], self.CLEAR, np.uint8)
-        size = struct.pack("<HHBBB", *first.size, 0xF7, 0, 0)
-        loop = b"!\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"  # for ever
-        self._file.write(b"GIF89a" + size + colors.tobytes() + loop)
+        screen = struct.pack("<HHBBB", *first.size, 0xF7, 0, 0)
+        endless = b"!\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
+        self._file.write(b"GIF89a" + screen + colors.tobytes() + endless)
 
-    def close(self) -> None:
+    def close(self, complete: bool) -> None:
         self._file.write(b";")
         self._file.close()
 
 
 def _extent(changed: Array) -> slice:
-    """From the first to the last true entry; GIF has no empty frames, so one at least."""
+    """From the first to the last true entry; one at least, as GIF has no empty frames."""
     at = np.flatnonzero(changed)
     return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1)
-
-
-_SINKS: dict[str, type[_Mp4] | type[_Gif]] = {".gif": _Gif, ".mp4": _Mp4}
 
 
 def _extra(module: str) -> Any:
@@ -292,7 +267,7 @@ def render_policy(
     seed: int = 0,
     deterministic: bool = True,
     max_steps: int | None = None,
-    label: Label | None = None,
+    label: Callable[[Memory], tuple[str, RGB]] | None = None,
     fps: float | None = None,
     every: int = 2,
     rng: np.random.Generator | None = None,
@@ -315,15 +290,16 @@ def render_policy(
         SkillweaveError: the environment gives no frames; see VideoWriter for more.
         MissingExtra: the extra 'video' is not installed.
     """
+    if episodes < 1 or every < 1:
+        raise SkillweaveError(f"episodes={episodes} and every={every} must be at least 1")
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen
-    rng = rng or (Seeds(seed) / "render").numpy()
-    act = functools.partial(policy.act, deterministic=deterministic, rng=rng)
-    env = env_spec.make(render_mode="rgb_array")
-    told = []
+    act = functools.partial(
+        policy.act, deterministic=deterministic, rng=rng or (Seeds(seed) / "render").numpy()
+    )
+    env, told = env_spec.make(render_mode="rgb_array"), []
     try:
-        rate = (fps or env.metadata.get("render_fps") or 30) / every
-        with VideoWriter(path, rate) as video:
+        with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
             for i in range(episodes):
                 who, color, skills = "", BLACK, Counter[str]()
                 for now in _play(env, policy, act, seed + i, max_steps or UNLIMITED):
@@ -353,22 +329,20 @@ def _play(
 ) -> Iterator[_Moment]:
     """An episode: a moment before each step, when the action is chosen, and one at the end."""
     obs, _ = env.reset(seed=seed)
-    memory, total, over = policy.start(1), 0.0, False
-    for elapsed in range(1, limit + 1):
+    memory, total, elapsed, over = policy.start(1), 0.0, 0, False
+    while not over and elapsed < limit:
         before = np.asarray(obs)[None]
         action, memory = act(memory, before)
-        yield _Moment(memory, elapsed - 1, total, False)
+        yield _Moment(memory, elapsed, total, False)
         first = int(action[0]) if isinstance(env.action_space, gym.spaces.Discrete) else action[0]
         obs, reward, terminated, truncated, info = env.step(first)
-        total, over = total + float(reward), terminated or truncated
+        elapsed, total, over = elapsed + 1, total + float(reward), terminated or truncated
         step = Step(
             before, action, np.asarray(obs)[None], np.array([reward], np.float32),
             np.array([terminated]), np.array([truncated]), np.zeros(1, bool),
             np.array([elapsed]), {key: _batch_of_one(value) for key, value in info.items()},
         )  # fmt: skip
         memory = policy.observe(memory, step)
-        if over:
-            break
     yield _Moment(memory, elapsed, total, True)
 
 

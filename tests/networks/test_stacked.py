@@ -64,7 +64,9 @@ def test_one_backward_pass_gives_each_member_its_own_gradient():
     def gradient(rows: slice, scale: torch.Tensor) -> torch.Tensor:
         leaves = layout.leaves(flat[rows])
         loss = (scale * mlp(leaves, "net", net, x[rows]).square().mean((1, 2))).sum()
-        return layout.flatten(dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True)))
+        return layout.flatten(
+            dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+        )
 
     scale = torch.tensor([1.0, 100.0])
     together = gradient(slice(None), scale)

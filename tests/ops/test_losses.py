@@ -29,7 +29,10 @@ def test_ppo_clips_only_where_the_policy_would_gain(ratio, advantage, objective,
 def test_ppo_loss_has_one_number_and_one_clip_range_a_member():
     log_prob = torch.log(torch.tensor([[1.5, 1.5], [1.5, 1.5]]))
     loss = ppo_policy_loss(
-        log_prob, torch.zeros(2, 2), torch.tensor([[1.0, 3.0], [1.0, 3.0]]), torch.tensor([0.2, 0.4])
+        log_prob,
+        torch.zeros(2, 2),
+        torch.tensor([[1.0, 3.0], [1.0, 3.0]]),
+        torch.tensor([0.2, 0.4]),
     )
     assert loss.tolist() == pytest.approx([-2.4, -2.8])
 

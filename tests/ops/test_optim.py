@@ -74,7 +74,11 @@ def test_merged_moments_are_those_of_all_data_together(sizes, seed):
     rng = np.random.default_rng(seed)
     scale, shift = rng.uniform(0.1, 10, (2, 2, 1, 3))
     batches = [rng.normal(size=(2, n, 3)) * scale + shift for n in sizes]
-    mean, var, count = torch.zeros(2, 3).double(), torch.ones(2, 3).double(), torch.zeros(2).double()
+    mean, var, count = (
+        torch.zeros(2, 3).double(),
+        torch.ones(2, 3).double(),
+        torch.zeros(2).double(),
+    )
     for batch in batches:
         mean, var, count = merge_moments(mean, var, count, torch.from_numpy(batch))
     together = np.concatenate(batches, axis=1)

@@ -13,7 +13,9 @@ def one(*numbers: float) -> torch.Tensor:
 
 
 def advantages(reward, discount, value, next_value, last, lam=0.5):
-    a = gae(one(*reward), one(*discount), one(*value), one(*next_value), one(*last), torch.tensor([lam]))
+    a = gae(
+        one(*reward), one(*discount), one(*value), one(*next_value), one(*last), torch.tensor([lam])
+    )
     assert a.shape == (1, len(reward), 1)
     return a.flatten().tolist()
 

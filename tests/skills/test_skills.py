@@ -21,7 +21,11 @@ def test_a_skill_is_named_after_its_class_unless_it_says_otherwise():
     class Named(Skill):
         name = "touch-down"
 
-    assert (LandSafely.name, Hover2Land.name, Named.name) == ("land_safely", "hover2_land", "touch-down")
+    assert (LandSafely.name, Hover2Land.name, Named.name) == (
+        "land_safely",
+        "hover2_land",
+        "touch-down",
+    )
 
 
 def test_by_default_a_skill_is_the_task_itself():
@@ -91,13 +95,17 @@ def test_a_reflex_is_named_after_its_condition():
 
     assert Reflex(leg_touches, 0).name == "leg_touches"
     assert Reflex(leg_touches, 0, name="off").name == "off"
-    with pytest.raises(SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"):
+    with pytest.raises(
+        SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"
+    ):
         Reflex(lambda obs: np.zeros(2, bool), 0, name="leg_touches").apply(OBS, np.zeros(3))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_number_that_is_not_finite_names_who_what_when_and_where(bad):
-    with pytest.raises(SkillweaveError, match=rf"skill x: reward\(\).*{bad} at step 7.*environment 1"):
+    with pytest.raises(
+        SkillweaveError, match=rf"skill x: reward\(\).*{bad} at step 7.*environment 1"
+    ):
         checked([0.0, bad], 2, np.float32, "skill x", "reward", 7)
 
 

@@ -1,0 +1,50 @@
+# make demo   train, score and film the lunar-lander recipe
+# make test   the tests            make check   ruff, mypy, import order, tests
+# make bench  the benchmarks       make weights the shipped weights, made anew
+PYTHON ?= python3
+# One torch for everything, installed first: a plain `torch` may pull gigabytes of CUDA.
+TORCH ?= torch==2.13.0
+BIN := .venv/bin
+SEED ?= 0
+
+.PHONY: demo test check bench figures weights smoke clean
+
+.venv/demo: pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("Skillweave needs Python 3.11 or newer, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[demo]"
+	touch $@
+
+.venv/dev: .venv/demo
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	touch $@
+
+demo: .venv/demo
+	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render
+
+smoke: .venv/demo
+	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --scale 0.02 --evaluate 5
+
+test: .venv/dev
+	$(BIN)/python -m pytest
+
+check: .venv/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+bench: .venv/dev
+	$(BIN)/python -m benchmarks
+
+figures: .venv/dev
+	$(BIN)/python -m benchmarks.figures
+
+weights: .venv/demo
+	$(foreach r,lunar-lander lunar-lander-tuned,rm -rf runs/weights-$(r) && \
+	$(BIN)/skillweave train $(r) --seed 0 --out runs/weights-$(r) && \
+	$(BIN)/skillweave weights runs/weights-$(r) --out skillweave/recipes/$(subst -,_,$(r)).safetensors &&) true
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

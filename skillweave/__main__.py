@@ -1,0 +1,7 @@
+"""``python -m skillweave``."""
+
+import sys
+
+from skillweave.cli import main
+
+sys.exit(main())

@@ -1,0 +1,222 @@
+"""What each command does."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+from typing import Any
+
+from skillweave import recipes
+from skillweave.api import Hierarchy, Run
+from skillweave.cli import commands
+from skillweave.hierarchy.settings import apply_settings, list_settings
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_tensors
+from skillweave.types import SkillweaveError
+
+
+def run(command: commands.Command) -> int:
+    """Carry a command out and print its result."""
+    match command:
+        case commands.Train():
+            _train(command)
+        case commands.Resume():
+            _resume(command)
+        case commands.Evaluate():
+            _evaluate(command)
+        case commands.Render():
+            _render(command)
+        case commands.List():
+            _list(command)
+        case commands.Info():
+            _info(command)
+        case commands.Weights():
+            _weights(command)
+    return 0
+
+
+def _train(command: commands.Train) -> None:
+    hierarchy = recipes.load(command.recipe)
+    apply_settings(hierarchy, command.set)
+    hierarchy.scale(command.scale)
+    name = Path(command.recipe).stem + ("-flat" if command.flat else "")
+    path = command.out or _free(Path("runs") / f"{name}-s{command.seed}")
+    try:
+        trained = hierarchy.train(
+            path, seed=command.seed, flat=command.flat, quiet=command.quiet, track=command.track
+        )
+    except KeyboardInterrupt:
+        raise _interrupted(path) from None
+    _tell_trained(command, trained, command.evaluate, command.render)
+
+
+def _resume(command: commands.Resume) -> None:
+    hierarchy = _hierarchy_of_run(command.run, command.recipe)
+    try:
+        trained = hierarchy.resume(command.run, quiet=command.quiet)
+    except KeyboardInterrupt:
+        raise _interrupted(command.run) from None
+    _tell_trained(command, trained, command.evaluate)
+
+
+def _evaluate(command: commands.Evaluate) -> None:
+    target = _target(command)
+    score = target.evaluate(
+        command.episodes,
+        seed=command.seed,
+        deterministic=command.deterministic,
+        skill=command.skill,
+    )
+    result = {"target": command.target, "env": target.hierarchy.spec.name, "seed": command.seed}
+    result |= {"deterministic": command.deterministic, "skill": command.skill}
+    _tell(command, result | score.to_json(), str(score))
+
+
+def _render(command: commands.Render) -> None:
+    target = _target(command)
+    path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
+    result = target.render(
+        path,
+        episodes=command.episodes,
+        seed=command.seed,
+        deterministic=command.deterministic,
+        skill=command.skill,
+    )
+    returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])
+    _tell(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
+
+
+def _list(command: commands.List) -> None:
+    shipped = []
+    for name in recipes.names():
+        weights = (recipes.source(name).with_suffix(".safetensors")).exists()
+        doc = ast.get_docstring(ast.parse(recipes.source(name).read_text())) or ""
+        shipped.append({"name": name, "about": doc.splitlines()[0], "pretrained": weights})
+    runs = [_run_line(p.parent) for p in sorted(Path("runs").glob("*/run.json"))]
+    lines = ["recipes:"]
+    for r in shipped:
+        lines.append(f"  {r['name']:<22} {r['about']}{' [weights]' if r['pretrained'] else ''}")
+    if runs:
+        lines.append("runs:")
+        lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in runs]
+    _tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
+
+
+def _info(command: commands.Info) -> None:
+    if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
+        settings = list_settings(recipes.load(command.target))
+        text = "\n".join(f"{k}={v}" for k, v in settings.items())
+        _tell(command, {"recipe": command.target, "settings": _plain(settings)}, text)
+        return
+    found = RunDirectory.open(command.target)
+    m = found.manifest
+    lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
+    lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}, call_steps {m['call_steps']}"]
+    lines += [f"  {'phase':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"]
+    for p in m["phases"]:
+        final = p.get("final", {}).get("return")
+        lines.append(
+            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} {p.get('seconds', 0):>8.1f} "
+            f"{p.get('steps_per_second', 0):>8,.0f} {final if final is None else round(final, 1)!s:>8}"
+        )
+    lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
+    _tell(command, m, "\n".join(lines))
+
+
+def _weights(command: commands.Weights) -> None:
+    trained = _hierarchy_of_run(command.run, command.recipe).load(command.run)
+    path = trained.save_weights(command.out)
+    _tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
+
+
+def _target(command: commands.Watched) -> Run:
+    """The trained policy that a command names."""
+    path = Path(command.target)
+    if command.pretrained:
+        return Hierarchy.pretrained(command.target)
+    if path.is_dir():
+        return _hierarchy_of_run(path, command.recipe).load(path)
+    if path.suffix == ".safetensors":
+        recipe = command.recipe or read_tensors(path)[1].get("recipe")
+        return _declared(recipe, command.recipe, path).load_weights(path)
+    hint = " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
+    raise SkillweaveError(f"{command.target} is neither a run nor a weights file{hint}")
+
+
+def _hierarchy_of_run(path: Path, recipe: str | None) -> Hierarchy:
+    """The hierarchy that a run was trained from; code never comes from inside the run."""
+    manifest = RunDirectory.open(path).manifest
+    if recipe is None and not manifest["needs_recipe"]:
+        return Hierarchy.from_manifest(manifest)
+    return _declared(recipe or manifest.get("recipe"), recipe, path)
+
+
+def _declared(recipe: str | None, given: str | None, path: Path) -> Hierarchy:
+    if recipe is not None and (given is not None or recipe in recipes.names()):
+        return recipes.load(recipe)
+    made = f"in {recipe}" if recipe else "in Python"
+    raise SkillweaveError(
+        f"{path} was declared {made}, and needs that code. Point to the file that defines it, if you "
+        "trust it: --recipe FILE.py"
+    )
+
+
+def _tell_trained(
+    command: commands.Train | commands.Resume, trained: Run, episodes: int, render: bool = False
+) -> None:
+    manifest = trained.info()
+    result: dict[str, Any] = {"run": str(trained.path), "phases": manifest["phases"]}
+    seconds = sum(p["seconds"] for p in manifest["phases"])
+    steps = sum(p["steps"] for p in manifest["phases"])
+    lines = [f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"]
+    if episodes:
+        score = trained.evaluate(episodes)
+        result["evaluation"] = score.to_json()
+        lines.append(f"score   {score}")
+    if render:
+        film = trained.render(trained.path / f"{manifest['kind']}.gif")
+        result["film"] = film
+        lines.append(f"film    {film['path']}")
+    lines.append(f"run     {trained.path}  (skillweave info|evaluate|render {trained.path})")
+    _tell(command, result, "\n".join(lines))
+
+
+def _tell(command: commands.Output, data: dict[str, Any], text: str) -> None:
+    print(json.dumps(data, default=str) if command.json else text)
+
+
+def _interrupted(path: Path) -> KeyboardInterrupt:
+    """The same interrupt, with what is saved and how to go on."""
+    if not (path / "run.json").exists():
+        return KeyboardInterrupt("nothing was trained yet")
+    try:
+        at = read_tensors(path / "checkpoint.safetensors")[1]
+        saved = f"saved at {at['steps']:,} steps of {at['phase']}"
+    except SkillweaveError:
+        saved = "saved at the start"
+    return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}")
+
+
+def _run_line(path: Path) -> dict[str, Any]:
+    try:
+        found = RunDirectory.open(path)
+    except SkillweaveError as error:
+        return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
+    status = "finished" if found.finished else "unfinished"
+    return {"path": str(path), "status": status} | {k: found.manifest[k] for k in ("kind", "env", "seed")}
+
+
+def _free(path: Path) -> Path:
+    """``path``, or the first of path-2, path-3, … that does not exist."""
+    number, candidate = 1, path
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}-{number}")
+    return candidate
+
+
+def _plain(settings: dict[str, Any]) -> dict[str, Any]:
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
+
+

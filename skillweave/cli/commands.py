@@ -1,0 +1,124 @@
+"""What can be asked on the command line, as dataclasses: the parser is generated from these.
+
+Nothing here imports torch or gymnasium, so that help and argument errors are instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, UseAppendAction, arg
+
+
+@dataclass(frozen=True)
+class Output:
+    """How results are told."""
+
+    quiet: bool = False
+    """No progress."""
+    json: bool = False
+    """Print one JSON object on standard output, and nothing else there."""
+
+
+@dataclass(frozen=True)
+class Train(Output):
+    """Train a recipe: every skill, then the selector."""
+
+    recipe: Positional[str] = tyro.MISSING
+    """A shipped recipe (skillweave list), or a Python file that defines a Hierarchy."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """A new directory for the run; default: runs/NAME-sSEED, numbered if taken."""
+    seed: int = 0
+    """The root of every random stream."""
+    flat: bool = False
+    """Train one plain agent on the same number of steps instead: the baseline."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
+    track: UseAppendAction[tuple[Literal["tensorboard", "wandb"], ...]] = ()
+    """Send metrics to a tracker as well."""
+    scale: float = 1.0
+    """Multiply every training budget: 0.1 for a quick look."""
+    evaluate: int = 100
+    """Episodes of the final evaluation; 0: none."""
+    render: bool = False
+    """Write a captioned GIF into the run as well."""
+
+
+@dataclass(frozen=True)
+class Resume(Output):
+    """Finish a run that was stopped; the end is the same as if it had not been."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+    evaluate: int = 100
+    """Episodes of the final evaluation; 0: none."""
+
+
+@dataclass(frozen=True)
+class Watched(Output):
+    """What to load, and how it acts."""
+
+    target: Positional[str] = tyro.MISSING
+    """A run's directory, a weights file, or with --pretrained a recipe's name."""
+    pretrained: bool = False
+    """Take the shipped weights of a shipped recipe."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+    skill: str | None = None
+    """One skill alone."""
+    seed: int = 0
+    """Picks the episodes."""
+    deterministic: bool = True
+    """Act greedily, or (--no-deterministic, --stochastic) sample."""
+
+
+@dataclass(frozen=True)
+class Evaluate(Watched):
+    """Score a policy on Gymnasium's environment."""
+
+    episodes: int = 100
+    """Whole episodes."""
+
+
+@dataclass(frozen=True)
+class Render(Watched):
+    """Write a captioned GIF or MP4."""
+
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """A .gif or .mp4 file; default: NAME.gif here."""
+    episodes: int = 1
+    """Whole episodes."""
+
+
+@dataclass(frozen=True)
+class List(Output):
+    """List the shipped recipes, and the runs under ./runs."""
+
+
+@dataclass(frozen=True)
+class Info(Output):
+    """Show what a run holds, or a recipe's settings."""
+
+    target: Positional[str] = tyro.MISSING
+    """A run's directory, or a recipe."""
+
+
+@dataclass(frozen=True)
+class Weights(Output):
+    """Write a run's policies into one weights file."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+    out: Annotated[Path, arg(aliases=["-o"])] = Path("weights.safetensors")
+    """The file to write."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+
+
+COMMANDS = (Train, Resume, Evaluate, Render, List, Info, Weights)
+Command = Train | Resume | Evaluate | Render | List | Info | Weights

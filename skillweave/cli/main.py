@@ -1,0 +1,44 @@
+"""Entry point: parse, call ``actions``, print, and turn errors into exit codes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; 0 on success, 1 on an error, 2 on wrong arguments, 130 on Ctrl-C."""
+    import tyro
+
+    from skillweave.cli import commands
+
+    given = ["--no-deterministic" if a == "--stochastic" else a for a in arguments or sys.argv[1:]]
+    parser = {c.__name__.lower(): c for c in commands.COMMANDS}
+    command: Any = tyro.extras.subcommand_cli_from_dict(
+        parser,
+        prog="skillweave",
+        description="Teach agents skills and weave them into one policy.",
+        args=given,
+    )
+    from skillweave.types import SkillweaveError
+
+    try:
+        from skillweave.cli import actions
+
+        return actions.run(command)
+    except SkillweaveError as error:
+        return _fail(command, str(error), 1)
+    except KeyboardInterrupt as error:
+        return _fail(command, str(error) or "interrupted", 130)
+    except BrokenPipeError:
+        return 1
+
+
+def _fail(command: Any, message: str, code: int) -> int:
+    if command.json:
+        print(json.dumps({"error": message}))
+    kind = "stopped" if code == 130 else "error"
+    print(f"{kind}: {message}", file=sys.stderr)
+    return code

@@ -1,0 +1,361 @@
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete
+from torch import nn
+
+from skillweave.algorithms.config import PPO, config_from_json, config_to_json
+from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
+from skillweave.networks.config import MLP
+from skillweave.ops.returns import gae, normalise
+from skillweave.seeding import Seeds
+from skillweave.types import SkillweaveError, Transition
+
+T, B = 8, 6
+OBS = Box(-np.inf, np.inf, (3,), np.float32)
+CONFIG = PPO(
+    num_envs=B, n_steps=T, batch_size=16, update_epochs=3, network=MLP((16,)),
+    learning_rate_schedule="constant",
+)  # fmt: skip
+
+
+def make(action=None, members=1, **settings) -> tuple[PPOAlgorithm, State]:
+    algorithm = PPOAlgorithm(replace(CONFIG, **settings), OBS, action or Discrete(4))
+    return algorithm, algorithm.init([Seeds(m) for m in range(members)])
+
+
+def members_of(x, rows: slice):
+    """The members ``rows`` of a State, Rollout or Transition, as a copy."""
+    values = {f.name: getattr(x, f.name) for f in fields(x)}
+    values["transition"] = members_of(x.transition, rows) if "transition" in values else None
+    if not isinstance(x, Rollout):
+        del values["transition"]
+    copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
+    return type(x)(**{**values, **copied})
+
+
+def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool = False) -> Rollout:
+    """Random trajectories that hang together, acted on by the state's policy."""
+    g, p = torch.Generator().manual_seed(seed), len(state.params)
+    last = torch.rand(p, T, B, generator=g) < 0.2
+    terminated = last & (torch.rand(p, T, B, generator=g) < 0.5)
+    last[:, -1] = True
+    obs = 2.0 + torch.randn(p, T, B, 3, generator=g)
+    next_obs = torch.randn(p, T, B, 3, generator=g)
+    next_obs[:, :-1] = torch.where(last[:, :-1, :, None], next_obs[:, :-1], obs[:, 1:])
+    mask = None
+    if masked:
+        mask = torch.rand(p, T, B, 4, generator=g) < 0.5
+        mask[..., 2] = True
+    actor = algorithm.actor(state)
+    noise = algorithm.noise([torch.Generator().manual_seed(m) for m in range(p)], T * B, 1)
+    flat_mask = None if mask is None else mask.flatten(1, 2)
+    action, head = algorithm.act(
+        actor, obs.flatten(1, 2), flat_mask, noise[:, :, 0].transpose(0, 1)
+    )
+    transition = Transition(
+        obs, action.unflatten(1, (T, B)), torch.randn(p, T, B, generator=g),
+        0.9 * (~terminated), next_obs, last, mask,
+    )  # fmt: skip
+    log_std = actor.views.get("actor.log_std")
+    return Rollout(
+        transition, head.unflatten(1, (T, B)), None if log_std is None else log_std[:, None]
+    )
+
+
+def learn(
+    algorithm: PPOAlgorithm, state: State, updates: int = 3, members=range(1), **kwargs
+) -> State:
+    """Several updates on data that depends on the member's number alone."""
+    for u in range(updates):
+        whole = rollout(algorithm, algorithm.init([Seeds(m) for m in range(3)]), seed=u, **kwargs)
+        mine = members_of(whole, slice(members.start, members.stop))
+        state, _ = algorithm.update(state, mine, u / updates, [Seeds(9) / m / u for m in members])
+    return state
+
+
+VARIANTS = {
+    "plain": {},
+    "continuous": {"action": Box(-1, 1, (2,))},
+    "value clipping": {"clip_value": 0.2},
+    "normalised observations": {"normalize_obs": True},
+    "early stop": {"target_kl": 0.003, "learning_rate": 1e-2},
+    "rate by kl": {"target_kl": 0.01, "learning_rate_schedule": "kl"},
+    "linear rate": {"learning_rate_schedule": "linear"},
+    "raw": {"normalize_returns": False, "normalize_advantage": False},
+    "critic of its own": {"critic": MLP((8, 8), "relu", layer_norm=True)},
+    "minibatches of unequal size": {"batch_size": 13},
+}
+
+
+@pytest.mark.parametrize("variant", [*VARIANTS, "masked"])
+def test_a_stack_of_three_learns_what_three_single_members_learn(variant):
+    masked, settings = variant == "masked", VARIANTS.get(variant, {})
+
+    def with_own_settings(state: State) -> State:
+        state.learning_rate *= torch.tensor([1.0, 0.5, 2.0])
+        state.clip_coef *= torch.tensor([1.0, 0.5, 2.0])
+        state.ent_coef *= torch.tensor([1.0, 10.0, 0.0])
+        state.vf_coef *= torch.tensor([1.0, 0.2, 2.0])
+        state.gae_lambda *= torch.tensor([1.0, 0.5, 0.0])
+        state.max_grad_norm *= torch.tensor([1.0, 0.1, 10.0])
+        return state
+
+    algorithm, state = make(members=3, **settings)
+    start = with_own_settings(state)
+    singles = [members_of(start, slice(m, m + 1)) for m in range(3)]
+    stack = learn(algorithm, start, members=range(3), masked=masked)
+    for m, single in enumerate(singles):
+        single = learn(algorithm, single, members=range(m, m + 1), masked=masked)
+        for f in fields(State):
+            whole, one = getattr(stack, f.name)[m], getattr(single, f.name)[0]
+            torch.testing.assert_close(
+                whole, one, rtol=1e-3, atol=1e-5, msg=lambda x, f=f: f"{f.name}: {x}"
+            )
+    assert not torch.allclose(stack.params[0], stack.params[1], atol=1e-2)
+
+
+def test_init_does_not_depend_on_the_neighbours():
+    algorithm, three = make(members=3)
+    for m in range(3):
+        assert torch.equal(algorithm.init([Seeds(m)]).params[0], three.params[m])
+    assert not torch.equal(three.params[0], three.params[1])
+
+
+def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not():
+    def weights(seed: int) -> torch.Tensor:
+        algorithm, state = make()
+        data = rollout(algorithm, state)
+        return algorithm.update(state, data, 0.0, [Seeds(seed)])[0].params
+
+    assert torch.equal(weights(1), weights(1))
+    assert not torch.equal(weights(1), weights(2))  # the order of the minibatches
+
+
+def plain_network(algorithm: PPOAlgorithm, state: State, prefix: str) -> nn.Sequential:
+    views = algorithm.layout.views(state.params)
+    layers: list[nn.Module] = []
+    for i in range(2):
+        weight = views[f"{prefix}.{i}.weight"][0]
+        layers += [nn.Linear(*weight.shape), nn.Tanh()]
+        layers[-2].weight.data = weight.T.clone()
+        layers[-2].bias.data = views[f"{prefix}.{i}.bias"][0, 0].clone()
+    return nn.Sequential(*layers[:-1])
+
+
+@pytest.mark.parametrize("space", [Discrete(4), Box(-1, 1, (2,))], ids=str)
+def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(space):
+    cfg = replace(CONFIG, batch_size=T * B, normalize_returns=False, ent_coef=0.1, clip_coef=0.01)
+    algorithm, state = make(
+        space, batch_size=T * B, normalize_returns=False, ent_coef=0.1, clip_coef=0.01
+    )
+    data = rollout(algorithm, state)
+    tr = data.transition
+    actor, critic = (plain_network(algorithm, state, k) for k in ("actor", "critic"))
+    log_std = nn.Parameter(torch.full((2,), cfg.action_std_init).log())
+    parameters = [*actor.parameters(), *critic.parameters()]
+    parameters += [] if algorithm.action.discrete else [log_std]
+    adam = torch.optim.Adam(parameters, cfg.learning_rate, eps=cfg.adam_eps)
+
+    def policy() -> torch.distributions.Distribution:
+        head = actor(tr.obs)
+        if algorithm.action.discrete:
+            return torch.distributions.Categorical(logits=head)
+        return torch.distributions.Independent(torch.distributions.Normal(head, log_std.exp()), 1)
+
+    with torch.no_grad():
+        old, value = policy().log_prob(tr.action), critic(tr.obs)[..., 0]
+        raw = gae(
+            tr.reward, tr.discount, value, critic(tr.next_obs)[..., 0], tr.last, state.gae_lambda
+        )
+        target, advantage = raw + value, normalise(raw)
+    for _ in range(cfg.update_epochs):
+        ratio = (policy().log_prob(tr.action) - old).exp()
+        gain = torch.min(
+            ratio * advantage, ratio.clamp(1 - cfg.clip_coef, 1 + cfg.clip_coef) * advantage
+        )
+        error = 0.5 * (critic(tr.obs)[..., 0] - target).square()
+        loss = (-gain + cfg.vf_coef * error - cfg.ent_coef * policy().entropy()).mean()
+        adam.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
+        adam.step()
+    state, metrics = algorithm.update(state, data, 0.0, [Seeds(0)])
+    for prefix, network in (("actor", actor), ("critic", critic)):
+        stacked = plain_network(algorithm, state, prefix)
+        for a, b in zip(stacked.parameters(), network.parameters(), strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
+    if not algorithm.action.discrete:
+        got = algorithm.layout.views(state.params)["actor.log_std"][0, 0]
+        torch.testing.assert_close(got, log_std.data, rtol=1e-4, atol=1e-6)
+    assert metrics["samples"].tolist() == [T * B]
+
+
+def test_greedy_is_the_most_probable_action_and_the_mean():
+    obs = torch.randn(2, 7, 3, generator=torch.Generator().manual_seed(0))
+    for space, greedy in (
+        (Discrete(4), lambda head: head.argmax(-1)),
+        (Box(-1, 1, (2,)), lambda h: h),
+    ):
+        algorithm, state = make(space, members=2)
+        action, head = algorithm.act(algorithm.actor(state), obs, None, None)
+        assert torch.equal(action, greedy(head))
+
+
+def test_sampling_follows_the_heads_distribution():
+    algorithm, state = make()
+    algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([0.0, 1.0, 2.0, 3.0])
+    noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
+    action, head = algorithm.act(algorithm.actor(state), torch.zeros(1, 50_000, 3), None, noise)
+    frequency = action.flatten().bincount(minlength=4) / 50_000
+    torch.testing.assert_close(frequency, head[0, 0].softmax(-1), atol=0.008, rtol=0)
+
+
+def test_continuous_sampling_has_the_initial_deviation():
+    algorithm, state = make(Box(-1, 1, (2,)), action_std_init=0.3)
+    noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
+    action, head = algorithm.act(algorithm.actor(state), torch.ones(1, 50_000, 3), None, noise)
+    torch.testing.assert_close(action[0].std(0), torch.full((2,), 0.3), rtol=0.02, atol=0)
+    torch.testing.assert_close(action[0].mean(0), head[0, 0], rtol=0, atol=0.01)
+
+
+def test_a_masked_action_is_never_taken_and_has_no_probability():
+    algorithm, state = make()
+    algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([9.0, 0.0, 0.0, 9.0])
+    mask = torch.tensor([False, True, True, False]).expand(1, 20_000, 4)
+    actor, obs = algorithm.actor(state), torch.zeros(1, 20_000, 3)
+    for noise in (algorithm.noise([Seeds(0).torch()], 1, 20_000)[0], None):
+        action, head = algorithm.act(actor, obs, mask, noise)
+        assert mask.gather(-1, action[..., None]).all()
+        assert (head.softmax(-1)[~mask] == 0).all()
+
+
+def test_each_member_has_its_own_noise():
+    algorithm, _ = make()
+    seeds = [Seeds(0) / m for m in range(3)]
+    three = algorithm.noise([s.torch() for s in seeds], 5, 2)
+    assert three.shape == (5, 3, 2, 4)
+    for m, s in enumerate(seeds):
+        assert torch.equal(algorithm.noise([s.torch()], 5, 2)[:, 0], three[:, m])
+    assert not torch.equal(three[:, 0], three[:, 1])
+
+
+@pytest.mark.parametrize("normalize_obs", [False, True])
+def test_an_actor_is_a_copy_that_learning_does_not_change(normalize_obs):
+    algorithm, state = make(normalize_obs=normalize_obs)
+    actor, obs = algorithm.actor(state), torch.randn(1, 5, 3)
+    before = algorithm.act(actor, obs, None, None)[1].clone()
+    algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0)])
+    assert torch.equal(algorithm.act(actor, obs, None, None)[1], before)
+    assert not torch.equal(algorithm.act(algorithm.actor(state), obs, None, None)[1], before)
+
+
+def test_observations_are_normalised_by_all_that_were_seen():
+    algorithm, state = make(normalize_obs=True)
+    data = [rollout(algorithm, state, seed=s) for s in range(2)]
+    for d in data:
+        algorithm.update(state, d, 0.0, [Seeds(0)])
+    seen = torch.cat([d.transition.obs.flatten(0, 2) for d in data])
+    torch.testing.assert_close(state.obs_mean[0], seen.mean(0), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(state.obs_var[0], seen.var(0, unbiased=False), rtol=1e-4, atol=1e-4)
+
+
+def test_a_member_that_oversteps_the_kl_stops_and_the_others_go_on():
+    algorithm, state = make(members=2, target_kl=0.01, update_epochs=10)
+    state.learning_rate = torch.tensor([0.05, 1e-5])
+    algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0), Seeds(1)])
+    assert 0 < state.count[0] < 30
+    assert state.count[1] == 30
+
+
+def test_metrics_of_an_update_that_stops_early_are_means_over_the_steps_it_took():
+    algorithm, state = make(target_kl=1e-4, update_epochs=10, learning_rate=1e-2)
+    _, metrics = algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0)])
+    assert 0 < state.count.item() < 30
+    assert metrics["entropy"].item() == pytest.approx(np.log(4), rel=0.05)  # still almost uniform
+
+
+def test_an_update_that_stops_at_once_reports_the_same_metrics():
+    algorithm, state = make(target_kl=1e-9)
+    fresh = rollout(algorithm, state)
+    _, usual = algorithm.update(state, fresh, 0.0, [Seeds(0)])
+    count = state.count.clone()
+    _, stopped = algorithm.update(state, fresh, 0.0, [Seeds(0)])  # by now the policy is another
+    assert torch.equal(state.count, count)
+    assert stopped.keys() == usual.keys()
+
+
+def test_the_linear_schedule_falls_to_nothing():
+    algorithm, state = make(learning_rate_schedule="linear")
+    data, before = rollout(algorithm, state), state.params.clone()
+    _, metrics = algorithm.update(state, data, 1.0, [Seeds(0)])
+    assert torch.equal(state.params, before)
+    _, metrics = algorithm.update(state, data, 0.75, [Seeds(0)])
+    assert metrics["learning_rate"].item() == pytest.approx(0.25 * CONFIG.learning_rate)
+    assert not torch.equal(state.params, before)
+
+
+def test_the_kl_schedule_speeds_a_timid_member_up_and_slows_a_bold_one_down():
+    algorithm, state = make(members=2, learning_rate_schedule="kl", target_kl=1e-3)
+    state.learning_rate = torch.tensor([2e-5, 9e-3])
+    algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0), Seeds(1)])
+    torch.testing.assert_close(state.learning_rate, torch.tensor([3e-5, 6e-3]))
+
+
+def test_a_terminal_observation_that_is_not_finite_does_no_harm():
+    algorithm, state = make()
+    data = rollout(algorithm, state)
+    ends = data.transition.discount == 0
+    assert ends.any()
+    data.transition.next_obs[ends] = float("nan")
+    algorithm.update(state, data, 0.0, [Seeds(0)])
+    assert torch.isfinite(state.params).all()
+
+
+OUT_OF_RANGE = [
+    ("num_envs", 0), ("n_steps", 0), ("batch_size", 0), ("batch_size", 64 * 64 + 1),
+    ("update_epochs", 0), ("threads", 0), ("gamma", 1.01), ("gamma", -0.1), ("gamma", float("nan")),
+    ("gae_lambda", 2.0), ("learning_rate", 0.0), ("learning_rate", float("inf")),
+    ("learning_rate", float("nan")), ("learning_rate_schedule", "cosine"), ("clip_coef", 0.0),
+    ("max_grad_norm", -1.0), ("action_std_init", 0.0), ("adam_eps", 0.0), ("ent_coef", -0.01),
+    ("vf_coef", float("inf")), ("target_kl", 0.0), ("clip_value", -1.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), OUT_OF_RANGE)
+def test_a_setting_out_of_range_is_named_with_its_value(name, value):
+    with pytest.raises(SkillweaveError, match=rf"PPO\.{name} is {value!r}; it must be "):
+        PPO(**{name: value})
+
+
+def test_the_kl_schedule_asks_for_its_target():
+    with pytest.raises(SkillweaveError, match=r"PPO\.target_kl is None; .* 'kl'"):
+        PPO(learning_rate_schedule="kl")
+
+
+@pytest.mark.parametrize(("name", "value"), [("hidden", (64, 0)), ("activation", "sine")])
+def test_a_network_that_cannot_be_is_named(name, value):
+    with pytest.raises(SkillweaveError, match=name):
+        make(network=MLP(**{name: value}))
+
+
+def test_settings_survive_json():
+    config = replace(CONFIG, critic=MLP((8,), "relu", True), target_kl=0.1)
+    assert config_from_json(config_to_json(config)) == config
+    assert config_from_json(config_to_json(PPO())) == PPO()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"algorithm": "SARSA"}, "'SARSA'.*PPO"),
+        ({"momentum": 1}, "no field momentum"),
+        ({"gamma": 2.0}, r"PPO\.gamma"),
+        ({"network": {"hidden": [8], "depth": 3}}, "depth"),
+    ],
+)
+def test_unknown_settings_in_json_are_named(change, says):
+    with pytest.raises(SkillweaveError, match=says):
+        config_from_json({**config_to_json(PPO()), **change})

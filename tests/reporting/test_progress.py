@@ -1,0 +1,176 @@
+"""What people see of training, on a terminal and without one."""
+
+from __future__ import annotations
+
+import io
+import re
+import subprocess
+import sys
+from contextlib import redirect_stderr
+from pathlib import Path
+
+import pytest
+
+from skillweave.reporting import progress as module
+from skillweave.reporting.progress import Progress
+
+
+class Clock:
+    """Stands in for ``time``: goes on only when told."""
+
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+class Terminal(io.StringIO):
+    """A text stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    terminal = Terminal()
+    for name in ("NO_COLOR", "CI", "FORCE_COLOR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "100")
+    return terminal
+
+
+def train(progress: Progress, clock: Clock, name: str = "landing", every: float = 0.5) -> None:
+    """20 s of training at 1,000 steps/s, an update each half second."""
+    progress.phase(name, 20_000)
+    for i in range(1, int(20 / every) + 1):
+        clock.now += every
+        spent = every * i
+        progress.tick(name, int(1000 * spent), spent, {"return": 10 * spent, "loss": 3.0})
+    progress.done(name, 20_000, 20.0, {"return": 200.0})
+
+
+def test_plain_lines(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress() as progress:
+        progress.message("run: runs/[7]")
+        train(progress, clock)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == [
+        "run: runs/[7]",
+        "landing: training for 20,000 steps",
+        "landing: 5,000 of 20,000 steps (25%), return 50.0, 1,000 steps/s, 0:15 left",
+        "landing: 10,000 of 20,000 steps (50%), return 100.0, 1,000 steps/s, 0:10 left",
+        "landing: 15,000 of 20,000 steps (75%), return 150.0, 1,000 steps/s, 0:05 left",
+        "landing: 20,000 of 20,000 steps (100%), return 200.0, 1,000 steps/s, 0:00 left",
+        "landing: 20,000 of 20,000 steps (100%), return 200.0, 1,000 steps/s, done in 0:20",
+    ]
+
+
+def test_speed_is_the_recent_one(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress() as progress:
+        progress.phase("landing", 100_000)
+        progress.tick("landing", 50_000, 500.0, {})  # resumed; it was slow before
+        clock.now += 6
+        progress.tick("landing", 62_000, 506.0, {})
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "landing: 62,000 of 100,000 steps (62%), 2,000 steps/s, 0:19 left"
+
+
+def test_a_phase_done_without_a_start(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress() as progress:
+        progress.done("landing", 5_000, 7322.0, {"return": -1.25})
+    assert "return -1.2, 1 steps/s, done in 2:02:02" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("on_terminal", [False, True])
+def test_quiet(
+    clock: Clock,
+    terminal: Terminal,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    on_terminal: bool,
+) -> None:
+    monkeypatch.setattr(terminal, "isatty", lambda: on_terminal)
+    with redirect_stderr(terminal), Progress(quiet=True) as progress:
+        progress.message("hello")
+        train(progress, clock)
+        progress.done("selector", 5, 1.0, {})
+    assert terminal.getvalue() == ""
+    assert capsys.readouterr().out == ""
+
+
+def screen(terminal: Terminal) -> list[str]:
+    """The lines written, in order, without the codes for colours and the cursor."""
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    return [line.rstrip() for line in re.split(r"[\r\n]+", text) if line.strip()]
+
+
+def test_bars_keep_finished_phases(
+    clock: Clock, terminal: Terminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with redirect_stderr(terminal), Progress() as progress:
+        progress.message("run: runs/[7]")
+        train(progress, clock)
+        progress.phase("selector", 2_000_000)
+        clock.now += 1
+        progress.tick("selector", 500_000, 50.0, {"return": 12.0})
+    lines = screen(terminal)
+    assert lines[0] == "run: runs/[7]"
+    assert re.fullmatch(r"landing +━+ +20k/20k return 200.0 +1,000 steps/s done in 0:20", lines[-2])
+    assert re.fullmatch(
+        r"selector ━+[╸╺]?━+ 500k/2M +return 12.0 10,000 steps/s +2:30 left", lines[-1]
+    )
+    assert capsys.readouterr().out == ""
+
+
+def test_bars_are_drawn_a_few_times_a_second(clock: Clock, terminal: Terminal) -> None:
+    with redirect_stderr(terminal), Progress() as progress:
+        train(progress, clock, every=0.01)  # 2,000 updates in 20 s
+    assert 40 <= sum(line.startswith("landing") for line in screen(terminal)) <= 110
+
+
+@pytest.mark.parametrize(("name", "value"), [("NO_COLOR", "1"), ("CI", "true"), ("TERM", "dumb")])
+def test_no_bars_where_they_are_unwanted(
+    clock: Clock, terminal: Terminal, monkeypatch: pytest.MonkeyPatch, name: str, value: str
+) -> None:
+    monkeypatch.setenv(name, value)
+    with redirect_stderr(terminal), Progress() as progress:
+        train(progress, clock)
+    assert "\x1b" not in terminal.getvalue()
+    assert len(terminal.getvalue().splitlines()) == 6
+
+
+def test_the_display_ends_with_an_error(clock: Clock, terminal: Terminal) -> None:
+    progress = Progress()
+
+    def interrupted() -> None:
+        with progress:
+            progress.phase("landing", 10)
+            raise KeyboardInterrupt
+
+    with redirect_stderr(terminal):
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+        assert terminal.getvalue().endswith("\x1b[?25h")  # the cursor is visible again
+        progress.message("stopped")
+    assert terminal.getvalue().endswith("stopped\n")
+
+
+def test_rich_is_imported_only_to_draw() -> None:
+    code = (
+        "import runpy, sys; m = runpy.run_path(sys.argv[1])\n"
+        "with m['Progress']() as p: p.message('hello')\n"
+        "assert 'rich' not in sys.modules"
+    )
+    command = [sys.executable, "-c", code, str(Path(str(module.__file__)))]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "hello\n")

@@ -1,0 +1,377 @@
+"""Captions, video files, and a policy filmed."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from skillweave.envs.make import EnvSpec
+from skillweave.reporting.video import PALETTE, VideoWriter, caption, color_of, render_policy
+from skillweave.types import Array, Memory, MissingExtra, SkillweaveError, Step
+
+Image = pytest.importorskip("PIL.Image")
+
+SIZE = (48, 60)  # of Corridor's frames: height, width
+
+
+class Corridor(gym.Env[Array, int]):
+    """Walk right for seven steps; each step pays one, and the ground turns from black to white."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    observation_space: gym.Space[Any] = gym.spaces.Box(0, 10, (1,), np.float32)
+    action_space: gym.Space[Any] = gym.spaces.Discrete(2)
+
+    def __init__(self, render_mode: str | None = None, length: int = 7) -> None:
+        self.render_mode, self.length, self.at = render_mode, length, 0
+        self.seeds: list[int | None] = []
+        self.actions: list[Any] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.seeds.append(seed)
+        self.at = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: int) -> Any:
+        self.actions.append(action)
+        self.at += 1
+        return np.full(1, self.at, np.float32), 1.0, self.at == self.length, False, {"at": self.at}
+
+    def render(self) -> Any:
+        return np.full((*SIZE, 3), 255 * self.at // self.length, np.uint8)
+
+
+class Walker:
+    """Remembers how often it acted and all that it was told."""
+
+    observation_space: gym.Space[Any] = Corridor.observation_space
+    action_space: gym.Space[Any] = Corridor.action_space
+    labels: tuple[str, ...] = ()
+
+    def __init__(self) -> None:
+        self.told: list[Step] = []
+        self.asked: list[tuple[bool, Any]] = []
+
+    def start(self, n: int) -> Memory:
+        return {"acted": np.zeros(n, np.int64)}
+
+    def act(
+        self, memory: Memory, obs: Array, mask: Array | None = None, *,
+        deterministic: bool = True, rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:  # fmt: skip
+        assert obs.shape == (1, 1)
+        self.asked.append((deterministic, rng))
+        return np.array([1]), {"acted": memory["acted"] + 1}
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        self.told.append(step)
+        return memory
+
+    def acting(self, memory: Memory) -> Array | None:
+        return None
+
+
+def label(memory: Memory) -> tuple[str, tuple[int, int, int]]:
+    """The first three steps are one skill's, the rest another's."""
+    second = int(memory["acted"][0]) > 3
+    return ("walk", "run")[second], color_of(second)
+
+
+def decode(path: Path) -> tuple[list[Array], list[int]]:
+    """A GIF's frames, (H, W, 3) each, and how long each stands in milliseconds."""
+    frames, durations = [], []
+    with Image.open(path) as gif:
+        assert gif.info["loop"] == 0
+        for i in range(gif.n_frames):
+            gif.seek(i)
+            frames.append(np.asarray(gif.convert("RGB")))
+            durations.append(gif.info["duration"])
+    return frames, durations
+
+
+def has(region: Array, color: tuple[int, int, int]) -> bool:
+    return bool((np.abs(region.astype(int) - color).max(-1) <= 4).sum() > 20)
+
+
+def luminance(color: tuple[int, int, int]) -> float:
+    share = np.array(color) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def test_palette_is_distinct_and_readable_on_black_and_on_white() -> None:
+    for a, b in itertools.combinations(PALETTE, 2):
+        assert np.abs(np.subtract(a, b)).max() > 40, (a, b)
+    for color in PALETTE:
+        assert (luminance(color) + 0.05) / 0.05 >= 3
+        assert 1.05 / (luminance(color) + 0.05) >= 1.9
+
+
+def test_colors_repeat_and_a_wish_wins() -> None:
+    assert color_of(0) != color_of(1)
+    assert color_of(len(PALETTE) + 1) == PALETTE[1]
+    assert color_of(3, (0, 0, 0)) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("shape", [(400, 600), (64, 64), (84, 84), (210, 160), (721, 1281)])
+@pytest.mark.parametrize("ground", [0, 255])
+def test_caption_leaves_the_frame_and_shows_the_color(shape: tuple[int, int], ground: int) -> None:
+    frame = np.full((*shape, 3), ground, np.uint8)
+    frame[::7] = 99
+    out = caption(frame, "landing", PALETTE[0], "step 132   return +87.4")
+    k = out.shape[1] // shape[1]
+    assert out.shape[1] == k * shape[1] >= 240
+    assert out.shape[0] % 2 == 0
+    assert (out[: k * shape[0]] == frame.repeat(k, 0).repeat(k, 1)).all()
+    band = out[k * shape[0] :]
+    assert 0.04 < band.shape[0] / out.shape[0] < 0.16
+    assert has(band[:, : out.shape[1] // 2], PALETTE[0])
+    assert has(band[:, out.shape[1] // 2 :], (255, 255, 255))
+
+
+def test_caption_tells_skills_steps_and_returns_apart() -> None:
+    frame = np.zeros((400, 600, 3), np.uint8)
+    first = caption(frame, "landing", PALETTE[0], "step 1   return +0.5")
+    assert (first != caption(frame, "hovering", PALETTE[0], "step 1   return +0.5")).any()
+    assert (first != caption(frame, "landing", PALETTE[0], "step 2   return +0.5")).any()
+    assert (first != caption(frame, "landing", PALETTE[0], "step 1   return -0.5")).any()
+    other = caption(frame, "landing", PALETTE[1], "step 1   return +0.5")
+    assert has(other, PALETTE[1])
+    assert not has(other, PALETTE[0])
+    assert not has(caption(frame, "", PALETTE[0], "step 1"), PALETTE[0])
+
+
+@pytest.mark.parametrize("width", [60, 84, 240, 600])
+def test_a_long_name_never_reaches_the_text_on_the_right(width: int) -> None:
+    frame, text = np.zeros((width, width, 3), np.uint8), "step 1032   return -187.4"
+    bare = caption(frame, "", PALETTE[1], text)
+    named = caption(frame, "x" * 64, PALETTE[1], text)
+    changed = np.flatnonzero((bare != named).any((0, 2)))
+    white = np.flatnonzero((bare > 200).all(-1).any(0))
+    assert changed.size
+    assert changed.max() < white.min()
+
+
+def test_captions_on_dark_chips_are_white_and_on_light_ones_black() -> None:
+    frame = np.zeros((400, 600, 3), np.uint8)
+    for color, ink in (((0, 0, 120), (255, 255, 255)), ((250, 240, 200), (0, 0, 0))):
+        assert has(caption(frame, "landing", color, "")[402:-2, 10:100], ink)
+
+
+def test_gif_holds_every_frame(tmp_path: Path) -> None:
+    rng, path, written = np.random.default_rng(0), tmp_path / "a.gif", []
+    frame = np.zeros((50, 70, 3), np.uint8)
+    with VideoWriter(path, fps=30) as video:
+        for i in range(12):
+            y, x = rng.integers(40, size=2)
+            frame[y : y + 8, x : x + 8] = PALETTE[i % len(PALETTE)]
+            written.append(frame.copy())
+            video.add(frame)
+        video.add(frame)  # unchanged
+        video.add(frame, seconds=1.5)
+    frames, durations = decode(path)
+    assert len(frames) == video.frames == 14
+    for got, wanted in zip(frames, [*written, frame, frame], strict=True):
+        assert np.abs(got.astype(int) - wanted).max() <= 4
+    assert durations[-1] == 1500
+    assert abs(sum(durations[:-1]) - 13 * 1000 / 30) <= 10
+
+
+def test_gif_shows_colors_that_its_first_frame_lacked(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.gif", fps=10) as video:
+        video.add(np.zeros((20, 20, 3), np.uint8))
+        video.add(np.full((20, 20, 3), (200, 40, 90), np.uint8))
+    frames, _ = decode(tmp_path / "a.gif")
+    assert np.abs(frames[1].astype(int) - (200, 40, 90)).max() <= 32
+
+
+def test_gif_stores_only_what_changes(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (100, 100, 3)).astype(np.uint8)
+    sizes = []
+    for n in (1, 50):
+        with VideoWriter(tmp_path / "a.gif", fps=10) as video:
+            for _ in range(n):
+                video.add(noise)
+        sizes.append((tmp_path / "a.gif").stat().st_size)
+    assert sizes[1] < 1.5 * sizes[0]
+
+
+def test_mp4_holds_every_frame_and_repeats_a_held_one(tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / "deep" / "a.mp4"
+    with VideoWriter(path, fps=10) as video:
+        for i in range(5):
+            video.add(np.full((65, 81, 3), 40 * i, np.uint8))
+        video.add(np.full((65, 81, 3), 255, np.uint8), seconds=1.0)
+    # Not with `ffmpeg.read_frames`, which leaves its pipes open where ffmpeg is quick to end.
+    command = [ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    assert b"82x66" in done.stderr
+    assert b"10 fps" in done.stderr
+    frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, 66, 82, 3)
+    assert [round(float(f.mean()) / 40) for f in frames] == [0, 1, 2, 3, 4, *[6] * 10]
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, suffix: str, error: type[BaseException]
+) -> None:
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"precious")
+
+    def interrupted() -> None:
+        with VideoWriter(path, fps=10) as video:
+            for _ in range(3):
+                video.add(np.zeros((64, 64, 3), np.uint8))
+            raise error
+
+    with pytest.raises(error):
+        interrupted()
+    assert path.read_bytes() == b"precious"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell script stands in for ffmpeg")
+@pytest.mark.parametrize("reads", ["cat > /dev/null;", ""])
+def test_when_ffmpeg_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: str) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    fake, path = tmp_path / "ffmpeg", tmp_path / "a.mp4"
+    fake.write_text(f"#!/bin/sh\n{reads} echo disk full >&2; exit 1\n")
+    fake.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake))
+    path.write_bytes(b"precious")
+
+    def write() -> None:
+        with VideoWriter(path, fps=10) as video:
+            for _ in range(3):
+                video.add(np.zeros((600, 600, 3), np.uint8))
+
+    with pytest.raises(SkillweaveError, match="disk full"):
+        write()
+    assert path.read_bytes() == b"precious"
+    assert {p.name for p in tmp_path.iterdir()} == {"a.mp4", "ffmpeg"}
+
+
+def test_bad_videos_are_named(tmp_path: Path) -> None:
+    with pytest.raises(SkillweaveError, match=r"a\.avi.*\.gif or \.mp4"):
+        VideoWriter(tmp_path / "a.avi", fps=10)
+    with pytest.raises(SkillweaveError, match="no frames"), VideoWriter(tmp_path / "a.gif", 10):
+        pass
+    frame = np.zeros((8, 8, 3), np.uint8)
+    with VideoWriter(tmp_path / "a.gif", fps=10) as video:
+        video.add(frame)
+        with pytest.raises(SkillweaveError, match="size changed"):
+            video.add(frame[:4])
+        with pytest.raises(SkillweaveError, match="uint8"):
+            video.add(frame / 255)
+
+
+@pytest.mark.parametrize(("suffix", "module"), [("gif", "PIL.Image"), ("mp4", "imageio_ffmpeg")])
+def test_a_missing_library_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, module: str
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtra, match=r"skillweave\[video\]"):
+        VideoWriter(tmp_path / f"a.{suffix}", fps=10)
+    assert not list(tmp_path.iterdir())
+
+
+def test_render_policy(tmp_path: Path) -> None:
+    made, policy = [], Walker()
+
+    def corridor(render_mode: str | None = None) -> Corridor:
+        made.append(Corridor(render_mode))
+        return made[0]
+
+    path = tmp_path / "a.gif"
+    result = render_policy(EnvSpec(corridor), policy, path, episodes=2, seed=5, label=label)
+    episode = {"return": 7.0, "length": 7, "skills": {"walk": 3, "run": 4}}
+    assert result == {"path": str(path), "frames": 10, "episodes": [episode, episode]}
+    assert made[0].seeds == [5, 6]
+    assert made[0].actions == [1] * 14
+    frames, durations = decode(path)
+    # Steps 0, 2, 4, 6 and the end; 20 steps a second, every other one shown.
+    assert durations == [100, 100, 100, 100, 1000] * 2
+    for i, (skill, other) in enumerate([(0, 1), (0, 1), (1, 0), (1, 0), (1, 0)] * 2):
+        band = frames[i][4 * SIZE[0] :]
+        assert has(band, PALETTE[skill]), i
+        assert not has(band, PALETTE[other]), i
+    for i, at in enumerate([0, 2, 4, 6, 7]):
+        assert abs(int(frames[i][10, 10, 0]) - 255 * at // 7) <= 16
+
+
+def test_the_policy_is_told_every_step(tmp_path: Path) -> None:
+    policy = Walker()
+    render_policy(EnvSpec(Corridor), policy, tmp_path / "a.gif", deterministic=False)
+    assert [int(s.elapsed[0]) for s in policy.told] == list(range(1, 8))
+    assert [float(s.obs[0, 0]) for s in policy.told] == list(range(7))
+    assert [float(s.next_obs[0, 0]) for s in policy.told] == list(range(1, 8))
+    assert [bool(s.terminated[0]) for s in policy.told] == [False] * 6 + [True]
+    last = policy.told[-1]
+    for array in (last.reward, last.action, last.truncated, last.timed_out, last.info["at"]):
+        assert array.shape == (1,)
+    assert last.reward.dtype == np.float32
+    assert not any(deterministic for deterministic, _ in policy.asked)
+    assert isinstance(policy.asked[0][1], np.random.Generator)
+
+
+def test_max_steps_fps_and_every(tmp_path: Path) -> None:
+    path = tmp_path / "a.gif"
+    result = render_policy(EnvSpec(Corridor), Walker(), path, max_steps=4, fps=10, every=3)
+    assert result["episodes"] == [{"return": 4.0, "length": 4, "skills": {}}]
+    assert decode(path)[1] == [300, 300, 1000]
+    with pytest.raises(SkillweaveError, match="at least 1"):
+        render_policy(EnvSpec(Corridor), Walker(), path, every=0)
+
+
+def test_wide_frames_are_reduced(tmp_path: Path) -> None:
+    class Wide(Corridor):
+        def render(self) -> Any:
+            return np.zeros((500, 2000, 3), np.uint8)
+
+    render_policy(EnvSpec(Wide), Walker(), tmp_path / "a.gif", max_steps=1)
+    assert decode(tmp_path / "a.gif")[0][0].shape[1] == 667
+
+
+def test_an_environment_without_frames(tmp_path: Path) -> None:
+    class Blind(Corridor):
+        def render(self) -> Any:
+            return None
+
+    with pytest.raises(SkillweaveError, match="render"):
+        render_policy(EnvSpec(Blind), Walker(), tmp_path / "a.gif")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_real_environment_without_a_display(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pygame")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.setenv(name, "")  # so that monkeypatch restores it
+        monkeypatch.delenv(name)
+
+    class Left(Walker):
+        def act(self, memory: Memory, obs: Array, mask: Any = None, **_: Any) -> Any:
+            return np.zeros(1, np.int64), memory
+
+    result = render_policy(EnvSpec("CartPole-v1"), Left(), tmp_path / "a.gif", seed=1)
+    if sys.platform == "linux":
+        assert os.environ["SDL_VIDEODRIVER"] == "dummy"
+    (episode,) = result["episodes"]
+    frames, durations = decode(tmp_path / "a.gif")
+    assert episode["length"] == episode["return"] < 30
+    assert len(frames) == -(-episode["length"] // 2) + 1
+    assert frames[0].shape == (432, 600, 3)
+    assert durations[0] == 40
+    assert (frames[0][:400] != frames[-1][:400]).any()
