@@ -107,8 +107,8 @@ class Hierarchy(Declaration):
         theirs = [s["name"] for s in run.manifest["skills"]]
         if mine != theirs:
             raise SkillweaveError(
-                f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy has "
-                f"{', '.join(mine)}"
+                f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
+                f"has {', '.join(mine)}"
             )
         if run.manifest["env"] != self.spec.name:
             raise SkillweaveError(
@@ -203,8 +203,6 @@ class Run:
         names = [s.name for s in self.hierarchy.skills]
         self.hierarchy.skill(skill)
         return self.policy.skills.policies[names.index(skill)]
-
-
 
 
 __all__ = ["AgentPolicy", "Hierarchy", "Run"]

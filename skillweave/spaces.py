@@ -116,7 +116,13 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
     """A supported space as plain JSON; infinities become strings."""
     if isinstance(space, gym.spaces.Box):
         low, high = ([_number(x) for x in b.reshape(-1)] for b in (space.low, space.high))
-        return {"type": "Box", "shape": space.shape, "dtype": str(space.dtype), "low": low, "high": high}
+        return {
+            "type": "Box",
+            "shape": space.shape,
+            "dtype": str(space.dtype),
+            "low": low,
+            "high": high,
+        }
     if isinstance(space, gym.spaces.Discrete):
         return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
     if isinstance(space, gym.spaces.MultiDiscrete):
@@ -137,8 +143,11 @@ def space_from_json(data: dict[str, Any]) -> gym.Space[Any]:
         match data["type"]:
             case "Box":
                 shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
-                bounds = (np.array(data[k], float).reshape(shape).astype(dtype) for k in ("low", "high"))
-                return gym.spaces.Box(*bounds, shape=shape, dtype=dtype)  # type: ignore[arg-type]
+                bounds = (
+                    np.array(data[k], float).reshape(shape).astype(dtype) for k in ("low", "high")
+                )
+                box: gym.Space[Any] = gym.spaces.Box(next(bounds), next(bounds), shape, dtype)  # type: ignore[arg-type]
+                return box
             case "Discrete":
                 return gym.spaces.Discrete(data["n"], start=data["start"])
             case "MultiDiscrete":
@@ -147,7 +156,9 @@ def space_from_json(data: dict[str, Any]) -> gym.Space[Any]:
                 return gym.spaces.MultiBinary(data["n"])
     except (KeyError, TypeError, ValueError) as error:
         raise SkillweaveError(f"not a space: {data!r} ({error})") from error
-    raise SkillweaveError(f"space type {data['type']!r} is not supported; supported are: {OBSERVATIONS}")
+    raise SkillweaveError(
+        f"space type {data['type']!r} is not supported; supported are: {OBSERVATIONS}"
+    )
 
 
 def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:

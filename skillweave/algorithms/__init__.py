@@ -1,0 +1,1 @@
+"""Algorithms: one algorithm, one file; settings in ``config``."""

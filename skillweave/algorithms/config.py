@@ -16,7 +16,9 @@ from skillweave.types import SkillweaveError
 def _check(config: object, field_name: str, ok: bool, asked: str) -> None:
     if not ok:
         value = getattr(config, field_name)
-        raise SkillweaveError(f"{type(config).__name__}.{field_name} is {value!r}; it must be {asked}")
+        raise SkillweaveError(
+            f"{type(config).__name__}.{field_name} is {value!r}; it must be {asked}"
+        )
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class PPO:
     """How far a value may move per update, in units of normalised returns; None: freely."""
     ent_coef: float = 0.01
     """Weight of the entropy bonus."""
+    ent_coef_final: float | None = None
+    """Weight of the entropy bonus at the end of the budget, reached linearly; None: constant."""
     vf_coef: float = 0.5
     """Weight of the value loss."""
     max_grad_norm: float = 0.5
@@ -79,6 +83,8 @@ class PPO:
             _check(self, name, 0.0 < getattr(self, name) < float("inf"), "positive and finite")
         for name in ("ent_coef", "vf_coef"):
             _check(self, name, 0.0 <= getattr(self, name) < float("inf"), "at least 0 and finite")
+        final = self.ent_coef_final
+        _check(self, "ent_coef_final", final is None or 0.0 <= final < float("inf"), "at least 0")
         for name in ("target_kl", "clip_value"):
             _check(self, name, getattr(self, name) is None or getattr(self, name) > 0, "positive")
         if self.learning_rate_schedule == "kl":
@@ -87,7 +93,9 @@ class PPO:
         ok = self.learning_rate_schedule in schedules
         _check(self, "learning_rate_schedule", ok, f"one of {', '.join(schedules)}")
         rollout = self.num_envs * self.n_steps
-        _check(self, "batch_size", self.batch_size <= rollout, f"at most num_envs·n_steps ({rollout})")
+        _check(
+            self, "batch_size", self.batch_size <= rollout, f"at most num_envs·n_steps ({rollout})"
+        )
 
 
 AlgorithmConfig = PPO

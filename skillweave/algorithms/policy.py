@@ -78,7 +78,9 @@ class AgentPolicy:
         }
 
     @classmethod
-    def from_file(cls, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> AgentPolicy:
+    def from_file(
+        cls, tensors: dict[str, Tensor], header: dict[str, Any], where: str
+    ) -> AgentPolicy:
         """The inverse of ``to_file``.
 
         Raises:

@@ -206,6 +206,9 @@ class PPOAlgorithm:
         rate = state.learning_rate
         if cfg.learning_rate_schedule == "linear":
             rate = rate * (1.0 - progress)
+        ent_coef = state.ent_coef
+        if cfg.ent_coef_final is not None:
+            ent_coef = torch.lerp(ent_coef, torch.full_like(rate, cfg.ent_coef_final), progress)
         stops = cfg.target_kl is not None and cfg.learning_rate_schedule != "kl"
         active = torch.ones(len(seeds), dtype=torch.bool) if stops else None
         sums: dict[str, Tensor] = {}
@@ -215,7 +218,7 @@ class PPOAlgorithm:
             for part in range(minibatches):
                 cut = slice(part * size // minibatches, (part + 1) * size // minibatches)
                 batch = {k: v[:, cut] for k, v in shuffled.items()}
-                loss, report = self.loss(leaves, state, batch)
+                loss, report = self.loss(leaves, state, batch, ent_coef)
                 grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
                 grad = torch.cat([g.flatten(1) for g in grads], dim=1)
                 report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
@@ -242,7 +245,7 @@ class PPOAlgorithm:
         return state, metrics
 
     def loss(
-        self, views: Views, state: State, batch: Mapping[str, Tensor]
+        self, views: Views, state: State, batch: Mapping[str, Tensor], ent_coef: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Policy, value and entropy loss of one minibatch, (P,), and detached metrics (P,)."""
         head = mlp(views, "actor", self.config.network, batch["inputs"])
@@ -253,7 +256,7 @@ class PPOAlgorithm:
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
         value = value_loss(raw, batch["target"], batch.get("old_value"), bound)
         bonus = entropy.mean(1)
-        total = policy + state.vf_coef * value - state.ent_coef * bonus
+        total = policy + state.vf_coef * value - ent_coef * bonus
         with torch.no_grad():
             kl = approximate_kl(log_prob, batch["log_prob"])
         report = {"policy_loss": policy, "value_loss": value, "entropy": bonus, "kl": kl}
@@ -279,9 +282,7 @@ class PPOAlgorithm:
         inputs = self._inputs(tr.obs.flatten(1, 2), actor)
         value = self._value(views, state, inputs).view(lead)
         next_value = self._next_value(views, state, actor, value, tr)
-        advantage = gae(
-            tr.reward, tr.discount, value, next_value, tr.last, state.gae_lambda
-        )
+        advantage = gae(tr.reward, tr.discount, value, next_value, tr.last, state.gae_lambda)
         returns = (advantage + value).flatten(1)
         metrics = {"explained_variance": explained_variance(value.flatten(1), returns)}
         if cfg.normalize_returns:
@@ -313,7 +314,9 @@ class PPOAlgorithm:
         # Members may have different numbers of ends: the first `widest` of a stable sort holds
         # them all, and the surplus rows are only computed, then overwritten by their own value.
         rows = last.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :widest]
-        ends = self._value(views, state, self._inputs(_take(tr.next_obs.flatten(1, 2), rows), actor))
+        ends = self._value(
+            views, state, self._inputs(_take(tr.next_obs.flatten(1, 2), rows), actor)
+        )
         flat = next_value.flatten(1)
         ends = torch.where(last.gather(1, rows), ends, flat.gather(1, rows))
         return flat.scatter(1, rows, ends).view_as(value)

@@ -1,0 +1,1 @@
+"""Buffers: what was collected, in the form that algorithms learn from."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import torch
@@ -17,7 +19,7 @@ class RolloutBuffer:
     """
 
     def __init__(
-        self, n_steps: int, num_envs: int, members: int, observation_space: gym.Space
+        self, n_steps: int, num_envs: int, members: int, observation_space: gym.Space[Any]
     ) -> None:
         self._members, self._at = members, 0
         lead, shape = (n_steps, num_envs), observation_space.shape or ()

@@ -112,13 +112,18 @@ def _info(command: commands.Info) -> None:
     found = RunDirectory.open(command.target)
     m = found.manifest
     lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
-    lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}, call_steps {m['call_steps']}"]
-    lines += [f"  {'phase':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"]
+    lines += [
+        f"  recipe: {m.get('recipe') or '(declared in Python)'}, call_steps {m['call_steps']}"
+    ]
+    lines += [
+        f"  {'phase':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
+    ]
     for p in m["phases"]:
         final = p.get("final", {}).get("return")
         lines.append(
-            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} {p.get('seconds', 0):>8.1f} "
-            f"{p.get('steps_per_second', 0):>8,.0f} {final if final is None else round(final, 1)!s:>8}"
+            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
+            f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
+            f"{'' if final is None else f'{final:.1f}':>8}"
         )
     lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
     _tell(command, m, "\n".join(lines))
@@ -140,7 +145,9 @@ def _target(command: commands.Watched) -> Run:
     if path.suffix == ".safetensors":
         recipe = command.recipe or read_tensors(path)[1].get("recipe")
         return _declared(recipe, command.recipe, path).load_weights(path)
-    hint = " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
+    hint = (
+        " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
+    )
     raise SkillweaveError(f"{command.target} is neither a run nor a weights file{hint}")
 
 
@@ -157,8 +164,8 @@ def _declared(recipe: str | None, given: str | None, path: Path) -> Hierarchy:
         return recipes.load(recipe)
     made = f"in {recipe}" if recipe else "in Python"
     raise SkillweaveError(
-        f"{path} was declared {made}, and needs that code. Point to the file that defines it, if you "
-        "trust it: --recipe FILE.py"
+        f"{path} was declared {made}, and needs that code. Point to the file that "
+        "defines it, if you trust it: --recipe FILE.py"
     )
 
 
@@ -169,7 +176,9 @@ def _tell_trained(
     result: dict[str, Any] = {"run": str(trained.path), "phases": manifest["phases"]}
     seconds = sum(p["seconds"] for p in manifest["phases"])
     steps = sum(p["steps"] for p in manifest["phases"])
-    lines = [f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"]
+    lines = [
+        f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"
+    ]
     if episodes:
         score = trained.evaluate(episodes)
         result["evaluation"] = score.to_json()
@@ -204,7 +213,9 @@ def _run_line(path: Path) -> dict[str, Any]:
     except SkillweaveError as error:
         return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
     status = "finished" if found.finished else "unfinished"
-    return {"path": str(path), "status": status} | {k: found.manifest[k] for k in ("kind", "env", "seed")}
+    return {"path": str(path), "status": status} | {
+        k: found.manifest[k] for k in ("kind", "env", "seed")
+    }
 
 
 def _free(path: Path) -> Path:
@@ -218,5 +229,3 @@ def _free(path: Path) -> Path:
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
-
-

@@ -15,7 +15,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from skillweave.cli import commands
 
     given = ["--no-deterministic" if a == "--stochastic" else a for a in arguments or sys.argv[1:]]
-    parser = {c.__name__.lower(): c for c in commands.COMMANDS}
+    parser: dict[str, Any] = {c.__name__.lower(): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         parser,
         prog="skillweave",

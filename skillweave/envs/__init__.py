@@ -1,0 +1,1 @@
+"""Environments: engines with one auto-reset meaning, and a skill's view of them."""

@@ -92,7 +92,9 @@ class GymnasiumEngine:
         self.observation_space = self._vector.single_observation_space
         self.action_space = self._vector.single_action_space[1]
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
-        self._actions = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
+        self._actions: Any = gym.vector.utils.create_empty_array(
+            self.action_space, num_envs, np.zeros
+        )
 
     def reset(self, seed: int) -> Array:
         seeds = np.random.SeedSequence(seed).generate_state(self.num_envs, np.uint32) >> 1
@@ -154,7 +156,9 @@ class EnvPoolEngine:
         theirs = (spec.gymnasium_observation_space, spec.gymnasium_action_space)
         ours = (reference.observation_space, reference.action_space)
         same = all(
-            isinstance(a, type(b)) and a.shape == b.shape and getattr(a, "n", 0) == getattr(b, "n", 0)
+            isinstance(a, type(b))
+            and a.shape == b.shape
+            and getattr(a, "n", 0) == getattr(b, "n", 0)
             for a, b in zip(ours, theirs, strict=True)
         )
         dtype = isinstance(theirs[1], gym.spaces.Discrete) or theirs[1].dtype == ours[1].dtype

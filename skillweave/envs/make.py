@@ -94,7 +94,7 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None) -> Eng
             reference.close()
         if spec.engine == "envpool":
             raise SkillweaveError(
-                f"EnvPool cannot run {spec.name}: it is not installed (extra 'envpool'), or lacks the "
-                "environment with these spaces, settings and wrappers; use engine='auto'"
+                f"EnvPool cannot run {spec.name}: it is not installed (extra 'envpool'), or "
+                "lacks the environment with these spaces, settings and wrappers; use engine='auto'"
             )
     return GymnasiumEngine(functools.partial(spec.make), num_envs, spec.engine == "async")

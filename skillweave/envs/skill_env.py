@@ -100,7 +100,7 @@ class SkillEnv:
         return reward, terminated, truncated, info
 
     def _startable(self, obs: Array, ids: Array) -> Array:
-        """First observations (n, *obs_shape) of environments ``ids`` in which the skill may start."""
+        """First observations (n, ...) of environments ``ids`` in which the skill may start."""
         if self.skill is None or not self.skill.defines("initiation"):
             return obs
         who = f"skill {self.skill.name!r}"

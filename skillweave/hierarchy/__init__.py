@@ -1,0 +1,1 @@
+"""Skills under a selector: calls, ``OptionsEnv``, the policy, training."""

@@ -72,13 +72,15 @@ class Declaration:
         if self.call_steps is not None and (
             not isinstance(self.call_steps, int) or self.call_steps < 1
         ):
-            raise SkillweaveError(f"call_steps is {self.call_steps!r}; it must be at least 1, or None")
+            raise SkillweaveError(
+                f"call_steps is {self.call_steps!r}; it must be at least 1, or None"
+            )
         if self.call_steps is None:
             for skill in self.skills:
                 if skill.max_steps is None and not skill.defines("termination"):
                     raise SkillweaveError(
-                        f"call_steps is None, but skill {skill.name!r} never stops by itself: give it "
-                        "max_steps or termination()"
+                        f"call_steps is None, but skill {skill.name!r} never stops by itself: give "
+                        "it max_steps or termination()"
                     )
         for field_name in ("skill_steps", "selector_steps", "cut_every"):
             if getattr(self, field_name) < 1:
@@ -101,7 +103,9 @@ class Declaration:
         for skill in self.skills:
             if skill.name == name:
                 return skill
-        raise SkillweaveError(f"no skill {name!r}; there are: {', '.join(s.name for s in self.skills)}")
+        raise SkillweaveError(
+            f"no skill {name!r}; there are: {', '.join(s.name for s in self.skills)}"
+        )
 
     def budget(self, skill: Skill) -> int:
         """A skill's training steps; 0 where its policy is ready."""
@@ -125,7 +129,11 @@ class Declaration:
     def skill_set(self, policies: Sequence[Policy]) -> SkillSet:
         """The skills with their policies, ready to be called."""
         return SkillSet(
-            tuple(self.skills), tuple(policies), tuple(self.reflexes), self.call_steps, self.greedy_skills
+            tuple(self.skills),
+            tuple(policies),
+            tuple(self.reflexes),
+            self.call_steps,
+            self.greedy_skills,
         )
 
     def check_spaces(self) -> None:
@@ -141,8 +149,8 @@ class Declaration:
                     mine, theirs = getattr(skill.policy, kind), getattr(env, kind)
                     if not same_space(mine, theirs):
                         raise SkillweaveError(
-                            f"skill {skill.name!r}: its policy has {kind} {mine}, but the environment "
-                            f"{self.spec.name} has {theirs}"
+                            f"skill {skill.name!r}: its policy has {kind} {mine}, but the "
+                            f"environment {self.spec.name} has {theirs}"
                         )
         finally:
             env.close()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -33,7 +33,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         seed: of the skills' own sampling, where they are not greedy.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
         self, engine: Engine, skills: SkillSet, gamma: float | Array, seed: int = 0
@@ -62,9 +62,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._obs = self.engine.reset(self._seed)
         return self._obs, self._with_mask({})
 
-    def step(
-        self, actions: Array
-    ) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Run one call in each environment, whichever skills and however long."""
         n = self.num_envs
         skill = np.asarray(actions).reshape(n)

@@ -36,12 +36,14 @@ class HierarchyPolicy:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions (n, ...). ``deterministic`` is about the selector; ``SkillSet.greedy`` about skills."""
+        """Actions (n, ...); ``deterministic`` is about the selector, ``SkillSet.greedy`` skills."""
         memory = {k: v.copy() for k, v in memory.items()}
         rows = np.flatnonzero(memory["over"])
         if len(rows):
             here = obs[rows]
-            own = {k[len(_SELECTOR) :]: v[rows] for k, v in memory.items() if k.startswith(_SELECTOR)}
+            own = {
+                k[len(_SELECTOR) :]: v[rows] for k, v in memory.items() if k.startswith(_SELECTOR)
+            }
             skill, after = self.selector.act(
                 own, here, self.skills.mask(here), deterministic=deterministic, rng=rng
             )

@@ -1,4 +1,4 @@
-"""Settings of a declaration by dotted name: ``selector.gamma=0.99``, ``skills.center.steps=1e6``."""
+"""Settings by dotted name: ``selector.gamma=0.99``, ``skills.center.steps=1e6``."""
 
 from __future__ import annotations
 
@@ -116,7 +116,11 @@ def _flatten(prefix: str, config: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for f in fields(config):
         value = getattr(config, f.name)
-        found |= _flatten(f"{prefix}{f.name}.", value) if is_dataclass(value) else {prefix + f.name: value}
+        found |= (
+            _flatten(f"{prefix}{f.name}.", value)
+            if is_dataclass(value)
+            else {prefix + f.name: value}
+        )
     return found
 
 

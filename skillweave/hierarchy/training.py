@@ -40,7 +40,12 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
 def phases_of(declaration: Declaration) -> list[Phase]:
     """The skills that are to be trained, then the selector (which cannot train before them)."""
     phases = [
-        Phase(s.name, s.algorithm or declaration.algorithm, declaration.budget(s), _skill_env(declaration, s))
+        Phase(
+            s.name,
+            s.algorithm or declaration.algorithm,
+            declaration.budget(s),
+            _skill_env(declaration, s),
+        )
         for s in declaration.skills
         if s.policy is None
     ]
@@ -90,7 +95,9 @@ def load(declaration: Declaration, run: RunDirectory) -> Policy:
     return HierarchyPolicy(run.load_policy("selector"), declaration.skill_set(policies))
 
 
-def _skill_env(declaration: Declaration, skill: Skill | None) -> Callable[[AlgorithmConfig], VecEnv]:
+def _skill_env(
+    declaration: Declaration, skill: Skill | None
+) -> Callable[[AlgorithmConfig], VecEnv]:
     # The flat baseline is the plain task: no reflexes either.
     with_reflexes = declaration.reflexes_in_training and skill is not None
     reflexes = tuple(declaration.reflexes) if with_reflexes else ()

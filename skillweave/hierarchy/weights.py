@@ -55,7 +55,10 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy:
             f"{path} is of skills {', '.join(header['skills'])} on {header['env']}, but the "
             f"hierarchy has {', '.join(names)} on {declaration.spec.name}"
         )
-    declaration.call_steps, declaration.greedy_skills = header["call_steps"], header["greedy_skills"]
+    declaration.call_steps, declaration.greedy_skills = (
+        header["call_steps"],
+        header["greedy_skills"],
+    )
 
     def part(name: str) -> AgentPolicy:
         own = {k.split("/", 1)[1]: v for k, v in tensors.items() if k.split("/", 1)[0] == name}

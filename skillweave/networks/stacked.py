@@ -6,6 +6,7 @@ which. So cloning, clipping, Adam, saving and selecting members are one operatio
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -58,7 +59,7 @@ def mlp_shapes(prefix: str, inputs: int, net: MLP, outputs: int) -> dict[str, tu
     """Parameter names and shapes of an MLP; weights are (in, out), biases (1, out)."""
     shapes: dict[str, tuple[int, ...]] = {}
     widths = (inputs, *net.hidden, outputs)
-    for i, (n_in, n_out) in enumerate(zip(widths, widths[1:], strict=False)):
+    for i, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
         shapes[f"{prefix}.{i}.weight"] = (n_in, n_out)
         shapes[f"{prefix}.{i}.bias"] = (1, n_out)
         if net.layer_norm and i < len(net.hidden):

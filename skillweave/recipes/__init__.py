@@ -56,7 +56,8 @@ def load(recipe: str) -> Hierarchy:
     found = {k: v for k, v in vars(module).items() if isinstance(v, Hierarchy)}
     if "hierarchy" not in found and len(found) != 1:
         raise SkillweaveError(
-            f"{recipe} defines {len(found) or 'no'} Hierarchy; define one, in the variable 'hierarchy'"
+            f"{recipe} defines {len(found) or 'no'} Hierarchy; define one, as the variable "
+            "'hierarchy'"
         )
     hierarchy = found.get("hierarchy") or next(iter(found.values()))
     hierarchy.recipe = recipe
@@ -73,6 +74,7 @@ def weights_path(name: str) -> Path:
     if not path.exists():
         with_weights = [n for n in names() if source(n).with_suffix(".safetensors").exists()]
         raise SkillweaveError(
-            f"no weights are shipped for {name!r}; there are for: {', '.join(with_weights) or 'none'}"
+            f"no weights are shipped for {name!r}; there are for: "
+            f"{', '.join(with_weights) or 'none'}"
         )
     return path

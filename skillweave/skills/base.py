@@ -14,7 +14,9 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 
 
 class Skill:
-    """An option (Sutton, Precup & Singh 1999): where it may start, what it maximises, when it stops.
+    """An option: where it may start, what it maximises, when it stops.
+
+    Sutton, Precup & Singh 1999, "Between MDPs and semi-MDPs".
 
     Subclass it and define ``reward``; all else is optional. Every method is batched: arrays
     over N environments in, one array (N,) out, so the same class runs on one environment and on
@@ -77,7 +79,9 @@ class Skill:
         for field in ("max_steps", "steps"):
             value = getattr(self, field)
             if value is not None and (not isinstance(value, int) or value < 1):
-                raise SkillweaveError(f"{where}: {field} is {value!r}; it must be at least 1, or None")
+                raise SkillweaveError(
+                    f"{where}: {field} is {value!r}; it must be at least 1, or None"
+                )
 
 
 class Reflex:
@@ -115,7 +119,9 @@ def apply_reflexes(reflexes: tuple[Reflex, ...], obs: Array, action: Array) -> A
     return action
 
 
-def checked(value: Any, n: int, dtype: type, who: str, method: str, step: int | None = None) -> Array:
+def checked(
+    value: Any, n: int, dtype: type, who: str, method: str, step: int | None = None
+) -> Array:
     """``value`` as an array (n,) of ``dtype``.
 
     Raises:

@@ -1,0 +1,1 @@
+"""The loops, phases, and evaluation."""

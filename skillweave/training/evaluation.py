@@ -59,7 +59,9 @@ class Evaluation:
             "length_mean": float(np.mean(self.lengths)),
             "skill_usage": {k: v / total for k, v in self.skill_steps.items()},
             "call_length_mean": {
-                k: v / self.skill_calls[k] for k, v in self.skill_steps.items() if self.skill_calls[k]
+                k: v / self.skill_calls[k]
+                for k, v in self.skill_steps.items()
+                if self.skill_calls[k]
             },
         }
 

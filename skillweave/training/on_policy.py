@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -62,7 +61,7 @@ class Episodes:
 
     def summary(self) -> dict[str, float]:
         """Means over the window; empty before the first episode ended."""
-        named = {
+        named: dict[str, deque[Any]] = {
             "return": self.returns,
             "task_return": self.task_returns,
             "length": self.lengths,
@@ -112,7 +111,9 @@ def train_on_policy(
     started = time.perf_counter() - seconds
     previous = torch.get_num_threads()
     torch.set_num_threads(1)
-    worker = ThreadPoolExecutor(1, initializer=_learner_thread, initargs=(algorithm.config.threads,))
+    worker = ThreadPoolExecutor(
+        1, initializer=_learner_thread, initargs=(algorithm.config.threads,)
+    )
     pending: Future[tuple[int, int, dict[str, float]]] | None = None
     actor = algorithm.actor(state)
     loop.restart(update)
@@ -160,9 +161,7 @@ def train_on_policy(
 class _Loop:
     """One environment and the policy that acts in it, a rollout at a time."""
 
-    def __init__(
-        self, algorithm: PPOAlgorithm, env: VecEnv, seeds: Seeds, members: int
-    ) -> None:
+    def __init__(self, algorithm: PPOAlgorithm, env: VecEnv, seeds: Seeds, members: int) -> None:
         self.algorithm, self.env, self.seeds, self.members = algorithm, env, seeds, members
         self.episodes = Episodes()
         self._obs: Array = np.empty(0)

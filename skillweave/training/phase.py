@@ -67,7 +67,7 @@ def train_phase(
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
         found = run.load_checkpoint(State, phase.name)
         state = algorithm.init([seeds / "member" / 0]) if found is None else found[0]
-        at = {"update": 0, "steps": 0, "seconds": 0.0}
+        at: dict[str, Any] = {"update": 0, "steps": 0, "seconds": 0.0}
         if found is not None:
             at = {k: found[1][k] for k in at}
             run.rewind_metrics(found[1]["metrics_bytes"])

@@ -145,13 +145,14 @@ def plain_network(algorithm: PPOAlgorithm, state: State, prefix: str) -> nn.Sequ
     return nn.Sequential(*layers[:-1])
 
 
-@pytest.mark.parametrize("space", [Discrete(4), Box(-1, 1, (2,))], ids=str)
-def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(space):
-    cfg = replace(CONFIG, batch_size=T * B, normalize_returns=False, ent_coef=0.1, clip_coef=0.01)
-    algorithm, state = make(
-        space, batch_size=T * B, normalize_returns=False, ent_coef=0.1, clip_coef=0.01
-    )
-    data = rollout(algorithm, state)
+@pytest.mark.parametrize(
+    ("space", "masked"), [(Discrete(4), False), (Discrete(4), True), (Box(-1, 1, (2,)), False)]
+)
+def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(space, masked):
+    settings = {"batch_size": T * B, "normalize_returns": False, "ent_coef": 0.1, "clip_coef": 0.01}
+    algorithm, state = make(space, **settings)
+    cfg = algorithm.config
+    data = rollout(algorithm, state, masked=masked)
     tr = data.transition
     actor, critic = (plain_network(algorithm, state, k) for k in ("actor", "critic"))
     log_std = nn.Parameter(torch.full((2,), cfg.action_std_init).log())
@@ -162,6 +163,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     def policy() -> torch.distributions.Distribution:
         head = actor(tr.obs)
         if algorithm.action.discrete:
+            head = head.masked_fill(~tr.mask, -1e9) if masked else head
             return torch.distributions.Categorical(logits=head)
         return torch.distributions.Independent(torch.distributions.Normal(head, log_std.exp()), 1)
 

@@ -174,6 +174,30 @@ def test_a_time_limit_truncates_and_does_not_terminate(engine, name):
         assert raw.truncated.all() == raw.truncated.any() == (t == 200)
 
 
+def fall(obs: np.ndarray, lefts: int) -> list[int]:
+    """The actions that push left some times, then right until the pole has fallen."""
+    taken: list[int] = []
+    while abs(obs[2]) < np.deg2rad(12):
+        taken.append(int(len(taken) >= lefts))
+        obs = cartpole(obs, taken[-1])
+    return taken
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_an_episode_that_terminates_on_its_time_limit_is_not_truncated_too(engine, name):
+    e = engine(name, num_envs=1)
+    obs, plan = e.reset(0)[0], []
+    for t in range(1, 501):
+        if t > 470 and not plan:  # fall on step 500 exactly, if that is possible from here
+            plan = next((p for n in range(4) if len(p := fall(obs, n)) == 501 - t), [])
+        action = plan.pop(0) if plan else int(obs @ [0.1, 0.3, 3.0, 1.0] > 0)
+        raw = e.step(np.array([action]))
+        obs = raw.next_obs[0]
+        assert (raw.terminated[0] or raw.truncated[0]) == (t == 500)
+    # EnvPool cannot tell: it computes `terminated = done & ~truncated` itself.
+    assert (raw.terminated[0], raw.truncated[0]) == (name != "envpool", name == "envpool")
+
+
 @pytest.mark.parametrize("name", GYMNASIUM)
 def test_wrappers_and_settings_reach_every_environment(engine, name):
     wrapper = [

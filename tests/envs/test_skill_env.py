@@ -217,21 +217,26 @@ def test_a_call_starts_only_where_the_skill_may_start(skill_env):
         obs = step.obs
 
 
-def test_waiting_for_a_start_leaves_running_environments_where_they_are(skill_env):
-    class FromStepOne(Skill):
+@pytest.mark.parametrize("name", ENGINES)
+def test_waiting_for_a_start_leaves_running_environments_where_they_are(skill_env, name):
+    class Moving(Skill):
         def initiation(self, obs):
-            return obs[:, STEP] >= 1
+            return np.abs(obs[:, 1]) > 0.3
 
         def termination(self, step):
-            return step.action == 2
+            return step.action == 1
 
-    env = skill_env(skill=FromStepOne())
-    env.reset(Seeds(0))
-    step = env.step(np.array([2, 0, 2]))  # 0 and 2 stop, and look for a start; 1 stands still
-    assert step.ended[[0, 2]].all()
-    assert (step.obs[[0, 2], STEP] >= 1).all()
-    if not step.ended[1]:
-        assert np.array_equal(step.obs[1], step.next_obs[1])
+    env = skill_env(name, "CartPole-v1", Moving())
+    obs = env.reset(Seeds(0)).copy()
+    for t in range(15):
+        action = np.eye(3, dtype=np.int64)[t % 3]  # one stops, and looks for a start
+        step = env.step(action)
+        for before, a, after in zip(obs, action, step.next_obs, strict=True):
+            np.testing.assert_allclose(after, cartpole(before, a), atol=1e-5)
+        assert step.ended[t % 3]
+        assert (np.abs(step.obs[step.ended, 1]) > 0.3).all()
+        assert np.array_equal(step.obs[~step.ended], step.next_obs[~step.ended])
+        obs = step.obs.copy()
 
 
 def test_an_initiation_that_never_holds_is_an_error(skill_env):

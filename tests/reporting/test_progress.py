@@ -81,8 +81,11 @@ def test_speed_is_the_recent_one(clock: Clock, capsys: pytest.CaptureFixture[str
         progress.tick("landing", 50_000, 500.0, {})  # resumed; it was slow before
         clock.now += 6
         progress.tick("landing", 62_000, 506.0, {})
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "landing: 62,000 of 100,000 steps (62%), 2,000 steps/s, 0:19 left"
+        clock.now += 20
+        progress.tick("landing", 72_000, 526.0, {})
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-2] == "landing: 62,000 of 100,000 steps (62%), 2,000 steps/s, 0:19 left"
+    assert lines[-1] == "landing: 72,000 of 100,000 steps (72%), 500 steps/s, 0:56 left"
 
 
 def test_a_phase_done_without_a_start(capsys: pytest.CaptureFixture[str]) -> None:

@@ -203,7 +203,7 @@ def test_cartpole_is_learnt_with_every_engine(engine):
         env.close()
     early, late = (t.metrics["return"] for t in (ticks[3], ticks[-1]))
     assert early < 40
-    assert late > 80
+    assert late > 60
 
 
 class Stop(Exception):
@@ -254,12 +254,14 @@ def test_reported_returns_and_lengths_are_those_of_whole_episodes():
     assert ticks[-1].metrics["length"] == 5.0
 
 
-def test_an_episode_that_was_cut_is_not_reported_as_ended():
+def test_what_a_cut_broke_off_is_not_counted_into_the_next_episode():
     ticks: list[Tick] = []
-    # rollouts of 4 steps, each cut: no episode of 5 steps ever ends
-    train(Countdown(16), 3, replace(CONFIG, n_steps=4), cut_every=64, on_tick=ticks.append)
+    # rollouts of 7 steps, each cut: one episode of 5 steps, and 2 of the next
+    config = replace(CONFIG, n_steps=7)
+    train(Countdown(16), 3, config, cut_every=7 * 16, on_tick=ticks.append)
     assert [t.cut for t in ticks] == [True] * 3
-    assert all("return" not in t.metrics for t in ticks)
+    assert [t.metrics["return"] for t in ticks] == [5.0] * 3
+    assert [t.metrics["length"] for t in ticks] == [5.0] * 3
 
 
 def test_learning_that_diverges_is_an_error_that_says_what_where_and_when():

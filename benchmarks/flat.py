@@ -1,0 +1,93 @@
+"""Figures 4 and 5: flat PPO, training time until an evaluation reaches 200, score after 30 s.
+
+    python -m benchmarks.flat [--seeds 0 1 2 3 4] [--steps 1800000]
+
+The policy is copied once a second of training and scored afterwards, greedily, over 100 episodes
+of Gymnasium's environment with seeds that training never saw.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from benchmarks.common import median, report, table, warm_up
+from skillweave import recipes
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.envs.make import make_engine
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.seeding import Seeds
+from skillweave.training.evaluation import evaluate
+from skillweave.training.on_policy import Tick, train_on_policy
+
+
+def learn(seed: int, steps: int, every: float) -> dict[str, object]:
+    hierarchy = recipes.load("lunar-lander")
+    config = hierarchy.flat or hierarchy.algorithm
+    env = SkillEnv(make_engine(hierarchy.spec, config.num_envs))
+    algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    seeds = Seeds(seed) / "flat"
+    state = algorithm.init([seeds / "member" / 0])
+    copies: list[tuple[float, int, AgentPolicy]] = []
+
+    def on_tick(tick: Tick) -> None:
+        if tick.seconds >= every * (len(copies) + 1):
+            copies.append((tick.seconds, tick.steps, AgentPolicy.of(algorithm, tick.state)))
+
+    last: list[Tick] = []
+    cut = hierarchy.cut_every
+    train_on_policy(
+        algorithm, env, state, seeds, steps, cut_every=cut,
+        on_tick=lambda t: (on_tick(t), last.append(t)),
+    )  # fmt: skip
+    seconds = last[-1].seconds
+    scores = []
+    reached = None
+    for at, spent, policy in copies:
+        score = evaluate(policy, hierarchy.spec, episodes=100)
+        scores.append((at, spent, score.mean, score.solved_fraction))
+        if reached is None and score.mean >= 200:
+            reached = at
+    final = evaluate(AgentPolicy.of(algorithm, state), hierarchy.spec, episodes=100)
+    return {
+        "seed": seed,
+        "seconds_to_200": reached,
+        "seconds": seconds,
+        "steps_per_second": last[-1].steps / seconds,
+        "final": final.mean,
+        "final_solved": final.solved_fraction,
+        "curve": scores,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--steps", type=int, default=1_800_000)
+    parser.add_argument("--every", type=float, default=1.0)
+    given = parser.parse_args()
+    warm_up()
+    rows = []
+    for seed in given.seeds:
+        rows.append(learn(seed, given.steps, given.every))
+        shown = [k for k in rows[0] if k != "curve"]
+        print(table(shown, [[_short(r[k]) for k in shown] for r in rows]), flush=True)
+    times = [r["seconds_to_200"] or float("inf") for r in rows]
+    report(
+        "flat",
+        {
+            "seconds_to_200_median": median(times),
+            "seconds_to_200_worst": max(times),
+            "score_median": median(r["final"] for r in rows),
+            "score_worst": min(r["final"] for r in rows),
+            "seconds_median": median(r["seconds"] for r in rows),
+            "rows": rows,
+        },
+    )
+
+
+def _short(value: object) -> str:
+    return f"{value:,.2f}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Figures 6 to 8: training speed against Stable-Baselines3, and against EnvPool alone.
+
+    python -m benchmarks.speed [--seeds 0 1 2 3 4]
+
+"EnvPool alone" is the bare pool fed with the very calls that the training made: a trained
+lander's physics costs more than a falling one's. Everything is measured in one run, in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from unittest import mock
+
+from benchmarks.common import Recorder, engine_maker, median, report, table, warm_up
+from skillweave import recipes
+from skillweave.hierarchy import training
+
+
+def stable_baselines3(steps: int, seed: int) -> float:
+    """Steps/s of SB3's PPO with rl-zoo3's settings, 16 environments in one process."""
+    import stable_baselines3 as sb3
+    import torch
+    from stable_baselines3.common.env_util import make_vec_env
+
+    env = make_vec_env("LunarLander-v3", n_envs=16, seed=seed)
+    model = sb3.PPO(
+        "MlpPolicy", env, n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4,
+        ent_coef=0.01, device="cpu", seed=seed,
+    )  # fmt: skip
+    threads = torch.get_num_threads()
+    started = time.perf_counter()
+    model.learn(steps)
+    seconds = time.perf_counter() - started
+    torch.set_num_threads(threads)
+    return model.num_timesteps / seconds
+
+
+def trained(seed: int, flat: bool, flat_steps: int) -> tuple[dict[str, float], float]:
+    """Steps/s of each phase, and of EnvPool alone fed with the last phase's calls."""
+    record: list[Recorder] = []
+    hierarchy = recipes.load("lunar-lander")
+    if flat:
+        hierarchy.scale(flat_steps / hierarchy.total_steps)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        mock.patch.object(training, "make_engine", engine_maker(record)),
+    ):
+        run = hierarchy.train(Path(folder) / "run", seed=seed, flat=flat, quiet=True)
+        speed = {p["name"]: p["steps_per_second"] for p in run.info()["phases"]}
+    steps, seconds = record[-1].replay()
+    return speed, steps / seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--flat-steps", type=int, default=1_800_000)
+    parser.add_argument("--sb3-steps", type=int, default=49_152)
+    given = parser.parse_args()
+    warm_up()
+    rows = []
+    for seed in given.seeds:
+        theirs = stable_baselines3(given.sb3_steps, seed)
+        flat, flat_pool = trained(seed, True, given.flat_steps)
+        parts, selector_pool = trained(seed, False, 0)
+        rows.append(
+            {
+                "seed": seed,
+                "sb3": theirs,
+                "flat": flat["flat"],
+                "flat_over_sb3": flat["flat"] / theirs,
+                "envpool_on_flat": flat_pool,
+                "flat_over_envpool": flat["flat"] / flat_pool,
+                "selector": parts["selector"],
+                "envpool_on_selector": selector_pool,
+                "selector_over_envpool": parts["selector"] / selector_pool,
+            }
+        )
+        print(
+            table(
+                list(rows[0]),
+                [[f"{v:.3g}" if v < 100 else f"{v:,.0f}" for v in r.values()] for r in rows],
+            )
+        )
+    ratios = [k for k in rows[0] if "over" in k]
+    report("speed", {"median": {k: median(r[k] for r in rows) for k in ratios}, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""Colours: one for each skill, and those that captions are made of."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+RGB: TypeAlias = tuple[int, int, int]
+
+# From Okabe & Ito (2008), without the yellow that is lost on white, and four more, chosen to be
+# far from these and from each other as people with a protan, deutan or tritan deficiency see them
+# (Machado et al. 2009). Each has a contrast of at least 3 to black and 1.9 to white.
+PALETTE: tuple[RGB, ...] = (
+    (230, 159, 0), (0, 114, 178), (210, 0, 60), (142, 202, 112), (120, 0, 255),
+    (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (135, 105, 255),
+)  # fmt: skip
+WHITE, BLACK = (255, 255, 255), (0, 0, 0)
+BAND, LINE = (28, 28, 32), (110, 110, 118)  # a caption's ground, and what parts it from the frame
+OWN_COLORS = (BAND, LINE, WHITE, BLACK, *PALETTE)
+"""Colours that captions are made of."""
+
+
+def color_of(index: int, wanted: RGB | None = None) -> RGB:
+    """The colour of skill number ``index``: the one it asks for, else the palette's."""
+    return PALETTE[index % len(PALETTE)] if wanted is None else wanted

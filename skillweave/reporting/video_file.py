@@ -1,0 +1,165 @@
+"""Video files, written frame by frame."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import struct
+import subprocess
+from pathlib import Path
+from subprocess import PIPE
+from typing import Any, Self
+
+import numpy as np
+
+from skillweave.reporting.palette import OWN_COLORS
+from skillweave.types import Array, MissingExtra, SkillweaveError
+
+
+class VideoWriter:
+    """Writes a video frame by frame; the file appears only when all of it is there.
+
+    Args:
+        path: ends in .gif or .mp4. An existing file is replaced at the end, and stays as it is
+            if the writing fails or is interrupted.
+        fps: frames per second.
+
+    Raises:
+        SkillweaveError: another suffix, frames of unlike sizes, or no frame at all.
+        MissingExtra: the library for this kind of file is not installed.
+    """
+
+    def __init__(self, path: str | Path, fps: float) -> None:
+        self.path, self.frames = Path(path), 0
+        kinds: dict[str, type[_Gif] | type[_Mp4]] = {".gif": _Gif, ".mp4": _Mp4}
+        kind = kinds.get(self.path.suffix.lower())
+        if kind is None:
+            raise SkillweaveError(f"cannot write a video to {path}: it must end in .gif or .mp4")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        # In the same folder, since renaming works only within a file system, and with the suffix
+        # last, since ffmpeg goes by it.
+        self._part = self.path.with_name(f".{self.path.stem}.{os.getpid()}{self.path.suffix}")
+        self._shape: tuple[int, ...] | None = None
+        self._sink = kind(self._part, fps)
+
+    def add(self, frame: Array, seconds: float | None = None) -> None:
+        """Append a frame (H, W, 3) uint8 that stands for ``seconds``, by default 1 / fps."""
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise SkillweaveError(f"a frame is (H, W, 3) uint8, not {frame.shape} {frame.dtype}")
+        if frame.shape != (self._shape or frame.shape):
+            raise SkillweaveError(f"the frames' size changed from {self._shape} to {frame.shape}")
+        self._shape = frame.shape
+        self._sink.add(frame, seconds)
+        self.frames += 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self._sink.close(complete=kind is None)
+            if kind is None and not self.frames:
+                raise SkillweaveError(f"no frames were given for {self.path}")
+            if kind is None:
+                os.replace(self._part, self.path)
+        finally:
+            self._part.unlink(missing_ok=True)
+
+
+class _Mp4:
+    """H.264 as every browser plays it, through a pipe to ffmpeg."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._ffmpeg = extra("imageio_ffmpeg").get_ffmpeg_exe()
+        self._path, self._fps = path, fps
+        self._process: Any = None
+
+    def add(self, frame: Array, seconds: float | None) -> None:
+        # The colours have half the resolution, so both sides must be even.
+        frame = np.pad(frame, [(0, n % 2) for n in frame.shape[:2]] + [(0, 0)], mode="edge")
+        if self._process is None:
+            size = f"{frame.shape[1]}x{frame.shape[0]}"
+            raw = f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {size} -r {self._fps} -i -"
+            coded = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
+            command = [self._ffmpeg, *raw.split(), *coded.split(), str(self._path)]
+            self._process = subprocess.Popen(command, stdin=PIPE, stderr=PIPE)
+        try:
+            for _ in range(1 if seconds is None else max(1, round(seconds * self._fps))):
+                self._process.stdin.write(frame.tobytes())
+        except BrokenPipeError:
+            self.close(complete=True)
+
+    def close(self, complete: bool) -> None:
+        process, self._process = self._process, None
+        complaint = process.communicate()[1] if process else b""
+        if complete and process and process.returncode:
+            raise SkillweaveError(f"ffmpeg could not write {self._path}: {complaint.decode()}")
+
+
+class _Gif:
+    """An endless GIF, streamed; each frame holds only what has changed since the one before."""
+
+    CLEAR = 255  # the index that leaves a pixel as it is
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._image, self._codec = extra("PIL.Image"), extra("PIL.GifImagePlugin")
+        self._file, self._fps = path.open("wb"), fps
+        self._due, self._written = 0.0, 0  # hundredths of a second
+        self._table: Any = None
+        self._shown: Array = np.empty(0)  # (H, W) uint8
+
+    def add(self, frame: Array, seconds: float | None) -> None:
+        image = self._image.fromarray(frame)
+        if self._table is None:
+            self._start(image)
+        index = np.array(image.quantize(palette=self._table, dither=self._image.Dither.NONE))
+        index[index == self.CLEAR] = 0  # the same colour, see `_start`
+        changed = index != self._shown
+        self._shown = index
+        rows, columns = _extent(changed.any(1)), _extent(changed.any(0))
+        patch = self._image.fromarray(np.where(changed, index, np.uint8(self.CLEAR))[rows, columns])
+        patch.putpalette(self._table.getpalette())
+        # What rounding to hundredths takes from one frame goes to the next. Browsers slow down
+        # frames of less than two.
+        self._due += 100 * (1 / self._fps if seconds is None else seconds)
+        time = max(2, round(self._due) - self._written)
+        self._written += time
+        settings = {"duration": 10 * time, "disposal": 1, "transparency": self.CLEAR}
+        self._file.writelines(self._codec.getdata(patch, (columns.start, rows.start), **settings))
+
+    def _start(self, first: Any) -> None:
+        """One palette for all, or colours would flicker.
+
+        The captions' own colours, so that text stays crisp, a cube for whatever is to come, and
+        the best for the first frame. ``CLEAR`` repeats the first, and so shows nothing of its own.
+        """
+        own = np.reshape(OWN_COLORS, (-1, 3))
+        cube = np.indices((5, 5, 5)).reshape(3, -1).T
+        best = first.quantize(self.CLEAR - len(own) - len(cube)).getpalette()
+        wanted = np.concatenate([own, cube * 255 // 4, np.reshape(best, (-1, 3))])
+        colors = np.zeros((256, 3), np.uint8)
+        colors[: len(wanted)] = wanted
+        self._table = self._image.new("P", (1, 1))
+        self._table.putpalette(colors.tobytes())
+        self._shown = np.full(first.size[::-1], self.CLEAR, np.uint8)
+        screen = struct.pack("<HHBBB", *first.size, 0xF7, 0, 0)
+        endless = b"!\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
+        self._file.write(b"GIF89a" + screen + colors.tobytes() + endless)
+
+    def close(self, complete: bool) -> None:
+        self._file.write(b";")
+        self._file.close()
+
+
+def _extent(changed: Array) -> slice:
+    """From the first to the last true entry; one at least, as GIF has no empty frames."""
+    at = np.flatnonzero(changed)
+    return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1)
+
+
+def extra(module: str) -> Any:
+    """A module of the extra 'video'; MissingExtra where it is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtra("drawing captions and writing videos", "video") from error

@@ -1,0 +1,487 @@
+"""Declarations: what is wrong with them is said, settings change them, files carry their weights."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
+
+from skillweave import PPO, EnvSpec, Hierarchy, Reflex, Skill, SkillweaveError, recipes
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.api import Run
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.settings import apply_settings, list_settings
+from skillweave.hierarchy.weights import read_weights, write_weights
+from skillweave.networks.config import MLP
+from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.seeding import Seeds
+from skillweave.skills.scripted import ScriptedPolicy
+
+torch.set_num_threads(1)
+OBS, ACTION = gym.make("CartPole-v1").observation_space, Discrete(2)
+
+
+def zeros(obs):
+    return np.zeros(len(obs), np.int64)
+
+
+class Center(Skill):
+    max_steps = 30
+
+
+class Lean(Skill):
+    max_steps = 20
+    steps = 5_000
+
+
+class Ready(Skill):
+    max_steps = 10
+    policy = ScriptedPolicy(zeros, OBS, ACTION)
+
+
+def declare(*skills, env="CartPole-v1", **more) -> Hierarchy:
+    return Hierarchy(env, skills or [Center(), Lean()], **more)
+
+
+def named(name: str, **attributes) -> Skill:
+    return type("Custom", (Skill,), {"name": name, **attributes})()
+
+
+
+# What is wrong -------------------------------------------------------------------------------
+
+WRONG = {
+    "no skills": (lambda: Hierarchy("CartPole-v1", []), "at least one skill"),
+    "no name": (lambda: declare(named("")), "Custom.*no name"),
+    "a name that is no file name": (lambda: declare(named("a/b")), "'a/b'.*Custom.*letters"),
+    "two of one name": (lambda: declare(Center(), Center()), "two skills.*'center'"),
+    "the name of the selector": (lambda: declare(named("selector")), "'selector'.*phase"),
+    "the name of the baseline": (lambda: declare(named("flat")), "'flat'.*phase"),
+    "a class": (lambda: declare(Center), r"Center.*not a Skill.*write Center\(\), not Center"),
+    "no skill at all": (lambda: declare("center"), "'center'.*not a Skill"),
+    "max_steps=0": (lambda: declare(named("x", max_steps=0)), "'x'.*max_steps is 0"),
+    "max_steps=1.5": (lambda: declare(named("x", max_steps=1.5)), "'x'.*max_steps is 1.5"),
+    "steps=0": (lambda: declare(named("x", steps=0)), "'x'.*steps is 0"),
+    "steps='many'": (lambda: declare(named("x", steps="many")), "'x'.*steps is 'many'"),
+    "call_steps=0": (lambda: declare(call_steps=0), "call_steps is 0"),
+    "call_steps=2.5": (lambda: declare(call_steps=2.5), "call_steps is 2.5"),
+    "skills that never stop": (
+        lambda: declare(Center(), named("endless"), call_steps=None),
+        "call_steps is None.*'endless'.*max_steps or termination",
+    ),
+    "skill_steps=0": (lambda: declare(skill_steps=0), "skill_steps is 0"),
+    "selector_steps=-1": (lambda: declare(selector_steps=-1), "selector_steps is -1"),
+    "cut_every=0": (lambda: declare(cut_every=0), "cut_every is 0"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_declaration_names_the_skill_and_the_field(case):
+    make, says = WRONG[case]
+    with pytest.raises(SkillweaveError, match=says):
+        make()
+
+
+NOT_CHECKED = {
+    "one skill without a list": (lambda: Hierarchy("CartPole-v1", Center()), "skills"),
+    "a reflex that is only a function": (lambda: declare(reflexes=[zeros]), "reflexes.*not a Reflex"),
+    "skill_steps='many'": (lambda: declare(skill_steps="many"), "skill_steps is 'many'"),
+    "settings as a class": (lambda: declare(algorithm=PPO), "algorithm"),
+    "a selector's settings as a class": (lambda: declare(selector=PPO), "selector"),
+    "a skill's settings as a class": (lambda: declare(named("x", algorithm=PPO)), "'x'.*algorithm"),
+    "a policy's class": (lambda: declare(named("x", policy=ScriptedPolicy)), "'x'.*policy"),
+    "an environment already made": (lambda: declare(env=gym.make("CartPole-v1")), "env"),
+}
+
+
+@pytest.mark.parametrize("case", NOT_CHECKED)
+def test_what_is_of_a_wrong_type_is_named_before_anything_is_trained(case):
+    make, says = NOT_CHECKED[case]
+    with pytest.raises(SkillweaveError, match=says):
+        make().check_spaces()
+
+
+def test_a_right_declaration_passes_and_skills_may_stop_in_any_way():
+    declare().check_spaces()
+    stops = named("stops", termination=lambda self, step: step.terminated)
+    declare(Center(), Ready(), stops, call_steps=None).check_spaces()
+    declare(reflexes=[Reflex(lambda obs: obs[:, 0] > 1, 0)]).check_spaces()
+
+
+class Odd(gym.Env):
+    """An environment with whatever spaces."""
+
+    def __init__(self, observation_space=OBS, action_space=ACTION) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+@pytest.mark.parametrize(
+    ("spaces", "says"),
+    [
+        ({"observation_space": Dict({"x": OBS})}, "observation space Dict.*not supported"),
+        ({"action_space": MultiDiscrete([2, 2])}, "action space MultiDiscrete.*not supported"),
+        ({"action_space": Box(0, 9, (1,), np.int64)}, "action space Box.*not supported"),
+    ],
+)
+def test_a_space_that_is_not_supported_is_named(spaces, says):
+    with pytest.raises(SkillweaveError, match=says):
+        declare(env=lambda: Odd(**spaces)).check_spaces()
+
+
+@pytest.mark.parametrize(
+    ("kind", "space"),
+    [
+        ("observation_space", Box(-1, 1, (3,))),
+        ("observation_space", Discrete(4)),
+        ("action_space", Discrete(3)),
+        ("action_space", Box(-1, 1, ())),
+    ],
+)
+def test_a_policy_for_other_spaces_names_the_skill_and_both_spaces(kind, space):
+    spaces = {"observation_space": OBS, "action_space": ACTION, kind: space}
+    skill = named("foreign", policy=ScriptedPolicy(zeros, **spaces))
+    with pytest.raises(SkillweaveError) as raised:
+        declare(Center(), skill).check_spaces()
+    for word in ("'foreign'", kind, str(space), "CartPole-v1", str(getattr(Odd(), kind))):
+        assert word in str(raised.value)
+
+
+@pytest.mark.parametrize("env", ["CartPol-v1", "CartPole-v99", "Cartpole-v1"])
+def test_an_unknown_environment_is_an_error_with_close_matches(env):
+    with pytest.raises(SkillweaveError, match=rf"'{env}'.*CartPole-v1"):
+        declare(env=env).check_spaces()
+
+
+@pytest.mark.parametrize("env", ["NothingLikeIt-v0", "no_such_module:Env-v0", ""])
+def test_an_environment_like_no_other_is_an_error_too(env):
+    with pytest.raises(SkillweaveError, match="no environment"):
+        declare(env=env).check_spaces()
+
+
+def test_a_wrong_declaration_is_not_trained(tmp_path):
+    with pytest.raises(SkillweaveError, match="CartPole-v1"):
+        declare(env="CartPol-v1").train(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_skill_that_is_not_there_is_answered_with_those_that_are():
+    with pytest.raises(SkillweaveError, match="'middle'.*center, lean"):
+        declare().skill("middle")
+
+
+def test_budgets_are_the_skills_own_else_the_hierarchys_and_nothing_for_ready_policies():
+    d = declare(Center(), Lean(), Ready(), skill_steps=7_000, selector_steps=100)
+    assert [d.budget(s) for s in d.skills] == [7_000, 5_000, 0]
+    assert d.total_steps == 12_100
+    d.scale(0.1)
+    assert [d.budget(s) for s in d.skills] == [700, 500, 0]
+    assert d.selector_steps == 10
+    assert Lean.steps == 5_000, "scaling one declaration changed the class"
+    for factor in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(SkillweaveError, match="scale"):
+            d.scale(factor)
+
+
+@pytest.mark.parametrize(
+    ("make", "is_data"),
+    [
+        (declare, True),
+        (lambda: declare(Ready()), False),
+        (lambda: declare(named("x", initiation=lambda self, obs: zeros(obs) == 0)), False),
+        (lambda: declare(named("x", termination=lambda self, step: step.terminated)), False),
+        (lambda: declare(reflexes=[Reflex(zeros, 0)]), False),
+        (lambda: declare(env=lambda: gym.make("CartPole-v1")), False),
+        (lambda: declare(env=EnvSpec("CartPole-v1", kwargs={"sutton_barto_reward": True})), True),
+        (lambda: declare(env=EnvSpec("CartPole-v1", wrappers=(gym.Wrapper,))), False),
+    ],
+)
+def test_a_declaration_is_data_where_acting_needs_no_code_of_the_users(make, is_data):
+    assert make().is_data is is_data
+
+
+# Settings ------------------------------------------------------------------------------------
+
+SETTINGS = {
+    "call_steps=20": lambda d: d.call_steps == 20,
+    "call_steps=none": lambda d: d.call_steps is None,
+    "skill_steps=1e6": lambda d: d.skill_steps == 1_000_000,
+    "selector_steps=1_000": lambda d: d.selector_steps == 1000,
+    "greedy_skills=false": lambda d: d.greedy_skills is False,
+    "reflexes_in_training=False": lambda d: d.reflexes_in_training is False,
+    "algorithm.gamma=0.5": lambda d: d.algorithm.gamma == 0.5 and d.selector.gamma == PPO().gamma,
+    "selector.gamma=1": lambda d: d.selector.gamma == 1.0 and isinstance(d.selector.gamma, float),
+    "selector.n_steps = 16": lambda d: d.selector.n_steps == 16,
+    "selector.clip_value=0.2": lambda d: d.selector.clip_value == 0.2,
+    "selector.network.hidden=(32, 16)": lambda d: d.selector.network.hidden == (32, 16),
+    "selector.network.hidden=32,16": lambda d: d.selector.network.hidden == (32, 16),
+    "selector.network.hidden=32": lambda d: d.selector.network.hidden == (32,),
+    "selector.network.activation=relu": lambda d: d.selector.network.activation == "relu",
+    "selector.learning_rate_schedule=constant": (
+        lambda d: d.selector.learning_rate_schedule == "constant"
+    ),
+    "flat.learning_rate=1e-4": (
+        lambda d: d.flat.learning_rate == 1e-4 and d.algorithm.learning_rate == 1e-3
+    ),
+    "skills.center.steps=2e4": lambda d: d.budget(d.skill("center")) == 20_000,
+    "skills.lean.gamma=0.9": (
+        lambda d: d.skill("lean").algorithm.gamma == 0.9 and d.skill("center").algorithm is None
+    ),
+    "skills.lean.network.layer_norm=true": lambda d: d.skill("lean").algorithm.network.layer_norm,
+}
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_a_setting_is_changed_by_its_dotted_name(setting):
+    d = declare()
+    before = declare()
+    assert not SETTINGS[setting](before)
+    apply_settings(d, [setting])
+    assert SETTINGS[setting](d)
+    changed = {f.name for f in dataclasses.fields(d) if f.name != "skills"}
+    same = {name for name in changed if getattr(d, name) == getattr(before, name)}
+    assert len(changed - same) == (0 if setting.startswith("skills.") else 1)
+
+
+def test_settings_apply_in_order_and_the_skills_class_is_left_alone():
+    d = declare()
+    apply_settings(d, ["selector.gamma=0.5", "selector.gamma=0.6", "skills.lean.steps=9"])
+    assert (d.selector.gamma, d.skill("lean").steps, Lean.steps) == (0.6, 9, 5_000)
+
+
+WRONG_SETTINGS = {
+    "call_steps": "name=value",
+    "call_step=4": "call_step'.*did you mean call_steps",
+    "selecter.gamma=1": "selecter.gamma.*did you mean.*selector.gamma",
+    "selector.gama=0.9": "selector.gama.*did you mean.*selector.gamma",
+    "skills.center.learning_rat=1": "learning_rat'.*did you mean.*skills.center.learning_rate",
+    "selector.network.hiden=3": "hiden.*did you mean.*selector.network.hidden",
+    "skills.centre.gamma=1": "'centre'.*center, lean",
+    "skills.center=4": "no setting 'skills.center'",
+    "selector=4": "no setting 'selector'",
+    "=4": "no setting ''",
+    "selector.gamma.x=4": "gamma has no parts",
+    "call_steps=soon": "call_steps=soon: expected int",
+    "call_steps=2.5": "call_steps=2.5: expected int",
+    "call_steps=true": "call_steps=true: expected int",
+    "call_steps=": "call_steps=: expected int",
+    "greedy_skills=1": "greedy_skills=1: expected bool",
+    "greedy_skills=none": "greedy_skills=none: expected bool",
+    "skill_steps=none": "skill_steps=none: expected int",
+    "skill_steps=1e999": "skill_steps=1e999: expected int",
+    "selector.gamma=high": "selector.gamma=high: expected float",
+    "selector.gamma=true": "selector.gamma=true: expected float",
+    "selector.gamma=nan": "selector.gamma=nan: expected float",
+    "selector.network.activation=sine": "activation=sine: expected.*tanh",
+    "selector.network.hidden=wide": "hidden=wide: expected tuple",
+    "call_steps=0": "call_steps is 0",
+    "skill_steps=0": "skill_steps is 0",
+    "skills.lean.steps=-4": "'lean'.*steps is -4",
+    "selector.gamma=2": "gamma is 2.0.*between 0 and 1",
+    "skills.center.learning_rate=-1": "learning_rate is -1.0.*positive",
+    "selector.batch_size=100000": "batch_size is 100000.*num_envs",
+    "selector.learning_rate_schedule=kl": "target_kl",
+}
+
+
+@pytest.mark.parametrize("setting", WRONG_SETTINGS)
+def test_a_wrong_setting_is_named(setting):
+    with pytest.raises(SkillweaveError, match=WRONG_SETTINGS[setting]):
+        apply_settings(declare(), [setting])
+
+
+@pytest.mark.parametrize("value", ["(0,)", "(-4, 4)", "('a',)", "(2.5,)", "(True,)"])
+def test_widths_that_no_layer_can_have_are_an_error_for_people(value):
+    with pytest.raises(SkillweaveError, match="hidden"):
+        apply_settings(declare(), [f"selector.network.hidden={value}"])
+
+
+def test_a_critic_of_its_own_can_be_set_where_it_has_been_as_the_actors():
+    d = declare()
+    apply_settings(d, ["selector.critic.hidden=(128,)"])
+    assert d.selector.critic == dataclasses.replace(d.selector.network, hidden=(128,))
+
+
+@pytest.mark.parametrize("make", [declare, lambda: recipes.load("lunar-lander")])
+def test_what_is_listed_can_be_set(make):
+    listed = list_settings(make())
+    assert len(listed) > 50
+    d = make()
+    apply_settings(d, [f"{name}={value}" for name, value in listed.items()])
+    assert list_settings(d) == listed
+
+
+def test_changes_show_in_the_list_and_carry_over_to_another_declaration():
+    d, other = declare(), declare()
+    changes = [
+        "call_steps=7", "skills.center.gamma=0.9", "skills.center.network.hidden=(8, 4)",
+        "skills.lean.steps=77", "selector.target_kl=0.02", "selector.learning_rate_schedule=kl",
+        "selector.normalize_obs=true", "greedy_skills=false",
+    ]  # fmt: skip
+    apply_settings(d, changes)
+    listed = list_settings(d)
+    assert listed != list_settings(other)
+    assert (listed["call_steps"], listed["skills.center.network.hidden"]) == (7, (8, 4))
+    first = ("selector.target_kl",)  # the schedule 'kl' asks for it
+    names = sorted(listed, key=lambda name: name not in first)
+    apply_settings(other, [f"{name}={listed[name]}" for name in names])
+    assert list_settings(other) == listed
+
+
+def test_a_ready_policy_has_no_settings_to_list():
+    assert not [k for k in list_settings(declare(Center(), Ready())) if "ready" in k]
+
+
+# Weights -------------------------------------------------------------------------------------
+
+
+def agent(seed: int, actions: int = 2, **settings) -> AgentPolicy:
+    config = PPO(num_envs=1, n_steps=1, batch_size=1, network=MLP(hidden=(8, 8)), **settings)
+    algorithm = make_algorithm(config, OBS, Discrete(actions))
+    state = algorithm.init([Seeds(seed)])
+    with torch.no_grad():
+        state.params[:] = 5 * state.params
+        state.obs_mean[:] = 0.3
+        state.obs_var[:] = 2.0
+    return AgentPolicy.of(algorithm, state)
+
+
+def trained(d: Hierarchy) -> HierarchyPolicy:
+    policies = [s.policy or agent(i, normalize_obs=i == 0) for i, s in enumerate(d.skills)]
+    return HierarchyPolicy(agent(9, len(policies)), d.skill_set(policies))
+
+
+def acts(policy, steps: int = 30) -> list:
+    rng, memory, found = np.random.default_rng(0), policy.start(16), []
+    for _ in range(steps):
+        obs = rng.normal(size=(16, 4)).astype(np.float32)
+        action, memory = policy.act(memory, obs)
+        found.append((action.tolist(), policy.acting(memory).tolist()))
+        memory["over"][:] = rng.random(16) < 0.5
+    return found
+
+
+@pytest.mark.parametrize("skills", [(Center, Lean), (Center, Ready, Lean)])
+def test_weights_written_and_read_act_the_same(tmp_path, skills):
+    d = declare(*(kind() for kind in skills), call_steps=6, greedy_skills=True)
+    policy = trained(d)
+    path = Run(d, tmp_path, policy).save_weights(tmp_path / "weights.safetensors")
+    other = declare(*(kind() for kind in skills), call_steps=40)
+    run = other.load_weights(path)
+    assert acts(run.policy) == acts(policy)
+    assert len({a for actions, _ in acts(policy) for a in actions}) == 2
+    assert len({s for _, acting in acts(policy) for s in acting}) == len(skills)
+    assert (other.call_steps, run.policy.skills.call_steps) == (6, 6)
+
+
+@pytest.mark.parametrize("call_steps", [None, 3])
+@pytest.mark.parametrize("greedy", [True, False])
+def test_the_file_says_how_long_calls_last_and_whether_skills_are_greedy(
+    tmp_path, call_steps, greedy
+):
+    d = declare(call_steps=call_steps, greedy_skills=greedy)
+    write_weights(tmp_path / "w", d, trained(d), None)
+    skills = read_weights(declare(), tmp_path / "w").skills
+    assert (skills.call_steps, skills.greedy) == (call_steps, greedy)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: declare(Center()), "center, lean on CartPole-v1.*center on CartPole-v1"),
+        (lambda: declare(Lean(), Center()), "center, lean on.*lean, center on"),
+        (lambda: declare(env="Acrobot-v1"), "on CartPole-v1.*on Acrobot-v1"),
+    ],
+)
+def test_weights_of_another_hierarchy_say_whose_they_are(tmp_path, make, says):
+    d = declare()
+    path = tmp_path / "weights.safetensors"
+    write_weights(path, d, trained(d), None)
+    other = make()
+    before = other.call_steps
+    with pytest.raises(SkillweaveError, match=says) as raised:
+        read_weights(other, path)
+    assert str(path) in str(raised.value)
+    assert other.call_steps == before
+
+
+def test_weights_without_a_skill_that_is_to_be_trained_say_which(tmp_path):
+    class Center(Ready):
+        pass
+
+    d = declare(Center(), Lean())
+    write_weights(tmp_path / "w", d, trained(d), None)
+    with pytest.raises(SkillweaveError, match="no weights of 'center'"):
+        read_weights(declare(), tmp_path / "w")
+
+
+@pytest.mark.parametrize("change", ["missing", "shape", "kind"])
+def test_a_file_that_does_not_hold_what_it_says_is_named(tmp_path, change):
+    d, path = declare(), tmp_path / "weights.safetensors"
+    write_weights(path, d, trained(d), None)
+    tensors, header = read_tensors(path)
+    name = next(k for k in tensors if k.startswith("lean/actor"))
+    if change == "missing":
+        del tensors[name]
+    elif change == "shape":
+        tensors[name] = tensors[name][..., :1].clone()
+    else:
+        header["kind"] = "agent"
+    write_tensors(path, tensors, header)
+    says = "holds a agent" if change == "kind" else name.removeprefix("lean/")
+    with pytest.raises(SkillweaveError, match=says) as raised:
+        read_weights(declare(), path)
+    assert str(path) in str(raised.value)
+    assert change == "kind" or "lean" in str(raised.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(SkillweaveError, match="nowhere"):
+        read_weights(declare(), tmp_path / "nowhere")
+
+
+def test_a_flat_agent_has_no_weights_file_of_a_hierarchy(tmp_path):
+    with pytest.raises(SkillweaveError, match="flat"):
+        Run(declare(), tmp_path, agent(0)).save_weights(tmp_path / "w")
+
+
+# A hierarchy as a skill -----------------------------------------------------------------------
+
+
+def test_a_whole_hierarchy_is_a_skill_of_another(tmp_path):
+    inner = declare()
+    skill = Run(inner, tmp_path, trained(inner)).as_skill("stand", max_steps=12)
+    assert (skill.name, skill.max_steps, skill.policy.labels) == ("stand", 12, ("center", "lean"))
+    outer = declare(skill, Center())
+    outer.check_spaces()
+    assert (outer.budget(skill), outer.is_data) == (0, False)
+    policy = trained(outer)
+    assert policy.labels == ("stand", "center")
+    write_weights(tmp_path / "w", outer, policy, None)
+    again = read_weights(declare(skill, Center()), tmp_path / "w")
+    assert acts(again) == acts(policy)
+
+
+def test_a_hierarchy_as_a_skill_may_be_told_where_it_starts_and_stops(tmp_path):
+    inner = declare()
+    skill = Run(inner, tmp_path, trained(inner)).as_skill(
+        "stand", initiation=lambda self, obs: obs[:, 0] > 0, color=(1, 2, 3)
+    )
+    assert skill.initiation(np.array([[1.0], [-1.0]])).tolist() == [True, False]
+    assert skill.color == (1, 2, 3)
+    assert not skill.defines("termination")
+
+
+def test_a_hierarchy_for_another_environment_is_refused_as_a_skill(tmp_path):
+    inner = declare()
+    skill = Run(inner, tmp_path, trained(inner)).as_skill("stand")
+    with pytest.raises(SkillweaveError, match="'stand'.*observation_space.*Acrobot-v1"):
+        declare(skill, env="Acrobot-v1").check_spaces()
+
+
+@pytest.mark.parametrize("name", ["selector", "a b", ""])
+def test_a_hierarchy_as_a_skill_needs_a_proper_name(tmp_path, name):
+    inner = declare()
+    with pytest.raises(SkillweaveError, match="name"):
+        declare(Run(inner, tmp_path, trained(inner)).as_skill(name))

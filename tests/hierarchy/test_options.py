@@ -1,0 +1,658 @@
+"""OptionsEnv equals a scalar loop, call for call, and is an ordinary Gymnasium vector."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from reference_calls import (
+    EPISODE,
+    POSITION,
+    Counter,
+    Left,
+    Right,
+    Scalar,
+    T,
+    Walk,
+    Zigzag,
+    scripted,
+    seeds_of,
+    shy,
+)
+from toys import cartpole
+
+from skillweave.algorithms.config import PPO
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.envs.foreign import FromVectorEnv
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.hierarchy.calls import SkillSet
+from skillweave.hierarchy.options import OptionsEnv
+from skillweave.seeding import Seeds
+from skillweave.skills import Reflex, Skill
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.types import SkillweaveError, Step
+
+torch.set_num_threads(1)
+N = 5
+ALL = (Left, Right, Zigzag, Counter)
+
+
+def skill_set(*kinds, call_steps=4, **more) -> SkillSet:
+    skills = tuple(kind() for kind in kinds)
+    return SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps, **more)
+
+
+@pytest.fixture
+def options():
+    """Makes OptionsEnvs of Gymnasium environments, and closes them in the end."""
+    opened = []
+
+    def make(skills, env=Walk, gamma=0.97, num_envs=N, engine="sync", **spec):
+        made = make_engine(EnvSpec(env, engine=engine, **spec), num_envs, threads=1)
+        opened.append(OptionsEnv(made, skills, gamma))
+        return opened[-1]
+
+    yield make
+    for env in opened:
+        env.close()
+
+
+@pytest.fixture
+def walks():
+    """A maker of Walks that keeps them, to be looked into."""
+
+    def make() -> Walk:
+        make.made.append(Walk())
+        return make.made[-1]
+
+    make.made = []
+    return make
+
+
+def agree(env: OptionsEnv, scalars: list[Scalar], calls: int, seed: int) -> dict[str, list]:
+    """Play the same random allowed calls in both and compare everything."""
+    rng, seen = np.random.default_rng(seed), {"steps": [], "terminated": [], "truncated": []}
+    obs, info = env.reset(seed=seed)
+    first = [s.reset(at) for s, at in zip(scalars, seeds_of(seed, len(scalars)), strict=True)]
+    np.testing.assert_array_equal(obs, first)
+    for _ in range(calls):
+        allowed = np.array([s.allowed() for s in scalars])
+        np.testing.assert_array_equal(info.get("action_mask", np.ones_like(allowed)), allowed)
+        choice = np.array([rng.choice(np.flatnonzero(a)) for a in allowed])
+        obs, reward, terminated, truncated, info = env.step(choice)
+        want = [s.call(int(c)) for s, c in zip(scalars, choice, strict=True)]
+
+        def wanted(name, want=want):
+            return np.array([getattr(w, name) for w in want])
+
+        np.testing.assert_array_equal(info["steps"], wanted("steps"))
+        np.testing.assert_array_equal(obs, wanted("obs"))
+        np.testing.assert_array_equal(info["next_obs"], wanted("next_obs"))
+        np.testing.assert_array_equal(terminated, wanted("terminated"))
+        ended = wanted("terminated") | wanted("truncated")
+        np.testing.assert_array_equal(terminated | truncated, ended)
+        np.testing.assert_array_equal(truncated & ~terminated, ended & ~wanted("terminated"))
+        np.testing.assert_allclose(info["call_return"], wanted("plain"), rtol=0, atol=1e-12)
+        for got, name in ((reward, "reward"), (info["discount"], "discount")):
+            single = wanted(name).astype(np.float32)
+            np.testing.assert_array_max_ulp(np.asarray(got, np.float32), single, 1)
+        seen["steps"].append(info["steps"].copy())
+        seen["terminated"].append(terminated.copy())
+        seen["truncated"].append(truncated & ~terminated)
+    return {k: np.array(v) for k, v in seen.items()}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("call_steps", [1, 2, 5, 40])
+def test_every_call_is_that_of_a_scalar_loop(options, call_steps, seed):
+    env = options(skill_set(*ALL, call_steps=call_steps))
+    skills = env.skills.skills
+    seen = agree(env, [Scalar(Walk(), skills, call_steps, 0.97) for _ in range(N)], 60, seed)
+    assert seen["terminated"].any()
+    assert seen["truncated"].any()
+    if call_steps > 2:
+        assert (seen["steps"].min(axis=1) < seen["steps"].max(axis=1)).any(), "calls all equally long"
+
+
+def test_a_power_of_two_as_gamma_agrees_to_the_last_bit(options):
+    env = options(skill_set(*ALL, call_steps=7), gamma=0.5)
+    scalars = [Scalar(Walk(), env.skills.skills, 7, 0.5) for _ in range(N)]
+    rng = np.random.default_rng(0)
+    env.reset(seed=1)
+    for scalar, seed in zip(scalars, seeds_of(1, N), strict=True):
+        scalar.reset(seed)
+    for _ in range(40):
+        choice = np.array([rng.choice(np.flatnonzero(s.allowed())) for s in scalars])
+        _, reward, _, _, info = env.step(choice)
+        want = [s.call(int(c)) for s, c in zip(scalars, choice, strict=True)]
+        assert reward.tolist() == [float(np.float32(w.reward)) for w in want]
+        assert info["discount"].tolist() == [w.discount for w in want]
+        assert info["call_return"].tolist() == [w.plain for w in want]
+
+
+def test_environments_in_processes_of_their_own_agree_too(options):
+    env = options(skill_set(*ALL), num_envs=2, engine="async")
+    agree(env, [Scalar(Walk(), env.skills.skills, 4, 0.97) for _ in range(2)], 20, seed=0)
+
+
+class Push(Skill):
+    """CartPole: to the left."""
+
+    max_steps = 2
+    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
+
+
+class Balance(Skill):
+    """CartPole: against the fall, while the cart is left of the middle."""
+
+    policy = ScriptedPolicy(lambda obs: (obs[:, 2] + obs[:, 3] > 0).astype(np.int64), None, None)
+
+    def initiation(self, obs):
+        return obs[:, 0] < 0.05
+
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 1]) > 0.4
+
+
+class Fall(Skill):
+    """LunarLander: nothing."""
+
+    max_steps = 9
+    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
+
+
+class Hover(Skill):
+    """LunarLander: the main engine while sinking, until rising."""
+
+    policy = ScriptedPolicy(lambda obs: np.where(obs[:, 3] < -0.1, 2, 0), None, None)
+
+    def initiation(self, obs):
+        return obs[:, 3] < 0
+
+    def termination(self, step):
+        return step.next_obs[:, 3] > 0
+
+
+class Turn(Skill):
+    """LunarLander: against the lean."""
+
+    policy = ScriptedPolicy(lambda obs: np.where(obs[:, 4] > 0, 3, 1), None, None)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    ("env_id", "kinds", "limit"),
+    [("CartPole-v1", (Push, Balance), 23), ("LunarLander-v3", (Fall, Hover, Turn), 95)],
+)
+def test_real_environments_agree_with_a_scalar_loop(options, env_id, kinds, limit, seed):
+    env = options(
+        skill_set(*kinds, call_steps=7), env_id, 0.99, 4, kwargs={"max_episode_steps": limit}
+    )
+    made = [gym.make(env_id, max_episode_steps=limit) for _ in range(4)]
+    seen = agree(env, [Scalar(e, env.skills.skills, 7, 0.99) for e in made], 80, seed)
+    assert seen["terminated"].any()
+    assert seen["truncated"].any()
+    assert (seen["steps"].min(axis=1) < seen["steps"].max(axis=1)).any()
+
+
+def test_a_waiting_environment_is_not_stepped(options, walks):
+    env = options(skill_set(Left, Zigzag, call_steps=5), walks, num_envs=4)
+    env.reset(seed=0)
+    stepped = np.array([w.steps for w in walks.made[-4:]])
+    for _ in range(20):
+        *_, info = env.step(np.array([0, 1, 0, 1]))
+        now = np.array([w.steps for w in walks.made[-4:]])
+        assert (now - stepped).tolist() == info["steps"].tolist()
+        stepped = now
+
+
+def test_an_episode_that_ends_within_a_call_starts_anew_once_and_then_waits(options, walks):
+    env = options(skill_set(Zigzag, call_steps=40), walks)
+    env.reset(seed=0)
+    mine = walks.made[-N:]
+    for call in range(1, 6):
+        obs, _, terminated, truncated, _ = env.step(np.zeros(N, int))
+        assert (terminated | truncated).all()
+        assert [w.episode for w in mine] == [call] * N
+        assert obs[:, EPISODE].tolist() == [call] * N
+        assert (obs[:, T] == 0).all()
+
+
+def test_without_call_steps_a_skill_goes_on_until_it_stops(options):
+    env = options(skill_set(Left, Counter, call_steps=None))
+    scalars = [Scalar(Walk(), env.skills.skills, None, 0.97) for _ in range(N)]
+    seen = agree(env, scalars, 60, seed=4)
+    assert seen["steps"].max() > 3
+
+
+def test_every_environment_may_have_its_own_gamma(options):
+    gamma = np.linspace(0.5, 1.0, N)
+    env = options(skill_set(*ALL, call_steps=6), gamma=gamma)
+    agree(env, [Scalar(Walk(), env.skills.skills, 6, float(g)) for g in gamma], 40, seed=2)
+
+
+def test_a_time_limit_keeps_the_discount_and_a_termination_makes_it_zero(options):
+    env = options(skill_set(Zigzag, call_steps=40), gamma=0.5)
+    env.reset(seed=0)
+    limits = 0
+    for _ in range(10):
+        _, _, terminated, truncated, info = env.step(np.zeros(N, int))
+        assert info["discount"][terminated].tolist() == [0.0] * int(terminated.sum())
+        only = truncated & ~terminated
+        assert info["discount"][only].tolist() == (0.5 ** info["steps"][only]).tolist()
+        limits += int(only.sum())
+    assert limits
+
+
+@pytest.mark.parametrize("call_steps", [3, 40])
+def test_reflexes_override_and_the_last_one_wins(options, walks, call_steps):
+    back = Reflex(lambda obs: obs[:, POSITION] <= -2, lambda obs: 1 + (obs[:, T] % 2).astype(int))
+    reflexes = (back, shy())
+    env = options(skill_set(Left, Zigzag, call_steps=call_steps, reflexes=reflexes), walks)
+    skills = env.skills.skills
+    scalars = [Scalar(Walk(), skills, call_steps, 0.97, reflexes) for _ in range(N)]
+    agree(env, scalars, 60, seed=3)
+    assert walks.made[-1].log == scalars[-1].env.log
+    lefts = [a for w in walks.made[-N:] for _, _, a in w.log]
+    assert {0, 1, 2} <= set(lefts)
+
+
+def test_a_skill_that_watches_sees_the_action_that_reflexes_left(options):
+    seen = []
+
+    class Watching(Left):
+        def termination(self, step):
+            seen.extend(zip(step.obs[:, POSITION], step.action, strict=True))
+            return np.zeros(len(step.reward), bool)
+
+    env = options(skill_set(Watching, reflexes=(shy(),)))
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(np.zeros(N, int))
+    assert {a for x, a in seen if x == -3} == {2}
+    assert {a for x, a in seen if x != -3} == {0}
+
+
+# What a skill's termination sees -------------------------------------------------------------
+
+
+def recorder(seen: dict, max_steps=None, stops=False):
+    """A skill that writes down every step that its termination was shown."""
+
+    def termination(self, step):
+        for i in range(len(step.reward)):
+            key = (step.obs[i, 0].item(), step.obs[i, EPISODE].item(), step.obs[i, T].item())
+            seen[key] = (
+                step.next_obs[i].tolist(), step.reward[i].item(), bool(step.terminated[i]),
+                bool(step.truncated[i]), bool(step.timed_out[i]), int(step.elapsed[i]),
+                int(np.asarray(step.info["t"]).reshape(-1)[i]),
+            )  # fmt: skip
+        return np.full(len(step.reward), stops)
+
+    attributes = {"termination": termination, "max_steps": max_steps, "policy": scripted(2)}
+    return type("Recorder", (Skill,), attributes)
+
+
+def test_termination_sees_the_step_of_its_own_environment_and_call(options, walks):
+    seen = {}
+    env = options(skill_set(Left, recorder(seen, max_steps=3), call_steps=4), walks)
+    rng = np.random.default_rng(0)
+    obs, _ = env.reset(seed=0)
+    expected = 0
+    for _ in range(30):
+        seen.clear()
+        choice = rng.integers(2, size=N)
+        before = obs.copy()
+        obs, _, terminated, _, info = env.step(choice)
+        mine = np.flatnonzero(choice == 1)
+        assert len(seen) == info["steps"][mine].sum()
+        for i in mine:
+            tag, episode, t, position = before[i].tolist()
+            for k in range(1, int(info["steps"][i]) + 1):
+                row, _, ended, _, timed_out, elapsed, told = seen[tag, episode, t + k - 1]
+                assert row == [tag, episode, t + k, position + k]
+                assert (elapsed, told) == (k, t + k)
+                assert ended == (bool(terminated[i]) and k == info["steps"][i])
+                assert ended or timed_out == (k == 3)
+                expected += 1
+    assert expected > 100
+
+
+def test_a_skill_sees_the_same_steps_under_a_selector_as_in_training(options):
+    in_training, in_calls = {}, {}
+    trained, called = recorder(in_training, max_steps=3), recorder(in_calls, max_steps=3)
+    engine = make_engine(EnvSpec(Walk, engine="sync"), 200)
+    alone = SkillEnv(engine, trained())
+    alone.reset(Seeds(0))
+    env = options(skill_set(called, call_steps=None), num_envs=200)
+    env.reset(seed=(Seeds(0) / "env").integer())
+    for _ in range(3):
+        alone.step(np.full(200, 2))
+    env.step(np.zeros(200, int))
+    ends = [v for v in in_calls.values() if v[5] == 3]
+    assert any(v[2] for v in ends), "no episode terminated on the skill's last step"
+    assert any(not v[2] for v in ends)
+    # in training a skill's episode is over at its end, and its next begins: compare what both saw
+    shared = in_calls.keys() & in_training.keys()
+    assert len(shared) >= len(in_calls) > 400
+    assert [in_calls[k] for k in sorted(shared)] == [in_training[k] for k in sorted(shared)]
+
+
+# Initiation sets -----------------------------------------------------------------------------
+
+
+def test_initiation_sets_are_the_action_mask_of_what_to_act_on_next(options):
+    env = options(skill_set(Left, Right, Zigzag, call_steps=6))
+    obs, info = env.reset(seed=0)
+    forbidden = 0
+    for _ in range(30):
+        mask = info["action_mask"]
+        assert (mask.shape, mask.dtype) == ((N, 3), np.bool_)
+        assert mask[:, [0, 2]].all()
+        assert mask[:, 1].tolist() == (obs[:, POSITION] < 2).tolist()
+        forbidden += int((~mask).sum())
+        obs, *_, info = env.step(np.where(mask[:, 1], 1, 2))
+    assert forbidden
+
+
+def test_without_initiation_sets_there_is_no_mask(options):
+    env = options(skill_set(Left, Zigzag))
+    assert "action_mask" not in env.reset(seed=0)[1]
+    assert "action_mask" not in env.step(np.zeros(N, int))[-1]
+    assert FromVectorEnv(env).mask() is None
+
+
+def test_choosing_a_skill_that_may_not_start_names_it_and_the_environment(options):
+    env = options(skill_set(Left, Right, Zigzag, call_steps=6))
+    _, info = env.reset(seed=0)
+    while info["action_mask"].all():
+        *_, info = env.step(np.where(info["action_mask"][:, 1], 1, 2))
+    row = int(np.flatnonzero(~info["action_mask"][:, 1])[0])
+    with pytest.raises(SkillweaveError, match=rf"'right' may not start in environment {row}\b"):
+        env.step(np.ones(N, int))
+
+
+def test_where_no_skill_may_start_the_error_names_them_all(options):
+    class Early(Left):
+        def initiation(self, obs):
+            return obs[:, T] < 3
+
+    class Never(Left):
+        def initiation(self, obs):
+            return np.zeros(len(obs), bool)
+
+    env = options(skill_set(Early, Never, call_steps=1))
+    _, info = env.reset(seed=6)
+    with pytest.raises(SkillweaveError, match=r"no skill may start .*'early', 'never'"):
+        for _ in range(4):
+            *_, info = env.step(np.zeros(N, int))
+            assert info["action_mask"].tolist() == [[True, False]] * N
+
+
+@pytest.mark.parametrize("bad", [4, 17, -1])
+def test_an_action_that_is_no_skill_is_named(options, bad):
+    env = options(skill_set(*ALL))
+    env.reset(seed=0)
+    choice = np.zeros(N, int)
+    choice[2] = bad
+    with pytest.raises(SkillweaveError, match=rf"action {bad} .*there are 4"):
+        env.step(choice)
+
+
+@pytest.mark.parametrize(
+    ("method", "value"),
+    [
+        ("initiation", lambda n: np.ones((n, 1), bool)),
+        ("initiation", lambda n: True),
+        ("termination", lambda n: np.zeros(n + 1, bool)),
+    ],
+)
+def test_a_wrong_shape_names_the_skill_and_the_method(options, method, value):
+    def given(self, x):
+        return value(len(x.reward) if isinstance(x, Step) else len(x))
+
+    wrong = type("Wrong", (Left,), {method: given})
+    env = options(skill_set(wrong))
+    with pytest.raises(SkillweaveError, match=rf"'wrong'.*{method}\(\).*shape"):
+        for _ in range(2):
+            env.reset(seed=0)
+            env.step(np.zeros(N, int))
+
+
+# Stochastic skills ---------------------------------------------------------------------------
+
+
+class Sampler(ScriptedPolicy):
+    """Greedy: 0; else a die."""
+
+    def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
+        n = len(obs)
+        return np.zeros(n, np.int64) if deterministic else rng.integers(3, size=n), memory
+
+
+class Die(Skill):
+    policy = Sampler(None, Walk.observation_space, Walk.action_space)
+
+
+class Agent(Skill):
+    policy = None
+
+
+def agent(seed: int, observation_space=Walk.observation_space, actions: int = 3) -> AgentPolicy:
+    """A fresh network's policy."""
+    config = PPO(num_envs=1, n_steps=1, batch_size=1)
+    algorithm = make_algorithm(config, observation_space, gym.spaces.Discrete(actions))
+    state = algorithm.init([Seeds(seed)])
+    with torch.no_grad():
+        state.params[:] = 5 * state.params
+    return AgentPolicy.of(algorithm, state)
+
+
+@pytest.mark.parametrize("kind", ["scripted", "network"])
+def test_skills_that_sample_are_reproduced_by_the_seed(options, walks, kind):
+    skills = (Die(), Zigzag())
+    policies = (Die.policy if kind == "scripted" else agent(0), Zigzag.policy)
+
+    def play(seed: int, greedy: bool) -> list:
+        env = options(SkillSet(skills, policies, call_steps=4, greedy=greedy), walks)
+        env.reset(seed=seed)
+        for t in range(12):
+            env.step((np.arange(N) + t) % 2)
+        return [w.log for w in walks.made[-N:]]
+
+    sampled = play(0, greedy=False)
+    assert sampled == play(0, greedy=False)
+    assert sampled != play(1, greedy=False)
+    assert sampled != play(0, greedy=True)
+    if kind == "scripted":
+        draws = [a for log in sampled for _, _, a in log]
+        assert min(np.bincount(draws, minlength=3)) > len(draws) / 6, "the die is loaded"
+
+
+def test_skills_go_on_sampling_anew_from_call_to_call(options, walks):
+    env = options(skill_set(Die, call_steps=3, greedy=False), walks, num_envs=1)
+    env.reset(seed=0)
+    for _ in range(40):
+        env.step(np.zeros(1, int))
+    actions = [a for _, _, a in walks.made[-1].log]
+    assert len({tuple(actions[i : i + 3]) for i in range(0, 90, 3)}) > 10
+
+
+# Gymnasium's conventions ---------------------------------------------------------------------
+
+
+def test_its_spaces_and_reset_mode_are_those_of_a_gymnasium_vector(options):
+    env = options(skill_set(*ALL))
+    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert env.single_observation_space == Walk.observation_space
+    assert env.single_action_space == gym.spaces.Discrete(4)
+    assert env.action_space == gym.spaces.MultiDiscrete([4] * N)
+    assert env.observation_space.shape == (N, 4)
+    obs, info = env.reset(seed=0)
+    assert isinstance(info, dict)
+    assert env.observation_space.contains(obs)
+    obs, reward, terminated, truncated, info = env.step(np.zeros(N, int))
+    assert env.observation_space.contains(obs)
+    assert (reward.shape, reward.dtype) == ((N,), np.float32)
+    for flag in (terminated, truncated):
+        assert (flag.shape, flag.dtype) == ((N,), np.bool_)
+    assert (info["discount"].dtype, info["steps"].dtype) == (np.float32, np.int64)
+
+
+def test_the_final_observation_is_there_where_an_episode_ended_and_only_there(options):
+    env = options(skill_set(Left, Zigzag, call_steps=5))
+    env.reset(seed=0)
+    ends = 0
+    for _ in range(25):
+        obs, _, terminated, truncated, info = env.step(np.arange(N) % 2)
+        ended = terminated | truncated
+        assert ("final_obs" in info) == bool(ended.any())
+        if not ended.any():
+            continue
+        assert info["_final_obs"].tolist() == ended.tolist()
+        for i in range(N):
+            if ended[i]:
+                assert info["final_obs"][i].tolist() == info["next_obs"][i].tolist()
+                assert info["final_obs"][i][EPISODE] == obs[i, EPISODE] - 1
+                ends += 1
+            else:
+                assert info["final_obs"][i] is None
+                assert info["next_obs"][i].tolist() == obs[i].tolist()
+    assert ends > 5
+
+
+def test_a_seed_reproduces_everything_another_does_not_and_no_seed_goes_on(options):
+    env = options(skill_set(*ALL))
+
+    def play(seed):
+        found = [env.reset(seed=seed)[0]]
+        for _ in range(5):
+            obs, reward, *_ = env.step(np.zeros(N, int))
+            found += [obs, reward]
+        return [x.tolist() for x in found]
+
+    first = play(3)
+    assert play(3) == first
+    assert play(4) != first
+    after = play(3), play(None), play(None)
+    assert after[1] != first
+    assert after[2] != after[1]
+    assert (play(3), play(None), play(None)) == after
+
+
+def test_what_was_returned_is_not_changed_by_later_steps(options):
+    env = options(skill_set(*ALL, call_steps=5))
+    kept, copies = [], []
+    obs, _ = env.reset(seed=0)
+    for _ in range(10):
+        kept.append(obs)
+        copies.append(obs.copy())
+        obs, reward, terminated, truncated, info = env.step(np.arange(N) % 2 * 2)
+        for x in (reward, terminated, truncated, info["next_obs"], info["steps"], info["discount"]):
+            kept.append(x)
+            copies.append(x.copy())
+    for x, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(x, copy)
+
+
+def test_a_list_of_seeds_is_an_error_for_people(options):
+    with pytest.raises(SkillweaveError, match="one seed"):
+        options(skill_set(*ALL)).reset(seed=[1] * N)
+
+
+def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):
+    env = RecordEpisodeStatistics(options(skill_set(Left, Zigzag, call_steps=2), gamma=1.0))
+    env.reset(seed=0)
+    running, counted = np.zeros(N), 0
+    for _ in range(30):
+        _, reward, terminated, truncated, info = env.step(np.ones(N, int))
+        running += reward
+        for i in np.flatnonzero(terminated | truncated):
+            assert info["episode"]["r"][i] == pytest.approx(running[i], abs=1e-5)
+            running[i] = 0
+            counted += 1
+    assert counted > 10
+
+
+def test_the_loops_view_of_it_has_steps_masks_and_true_successors(options):
+    env = FromVectorEnv(options(skill_set(Left, Right, Zigzag, call_steps=6)))
+    obs = env.reset(Seeds(0))
+    ended = 0
+    for _ in range(20):
+        mask = env.mask()
+        assert mask[:, 1].tolist() == (obs[:, POSITION] < 2).tolist()
+        step = env.step(np.where(mask[:, 1], 1, 2))
+        same = step.next_obs[:, EPISODE] == obs[:, EPISODE]
+        assert same.all()
+        moved = step.next_obs[:, T] - obs[:, T]
+        assert step.steps.tolist() == moved.tolist()
+        assert not (step.terminated & step.truncated).any()
+        ended += int(step.ended.sum())
+        obs = step.obs
+    assert ended
+
+
+# EnvPool -------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:.*precision lowered")
+def test_envpool_steps_only_those_whose_calls_go_on(options):
+    pytest.importorskip("envpool")
+    told = []
+
+    class Told(Balance):
+        """Balance, from anywhere, that writes down how EnvPool counts its environments' steps."""
+
+        def initiation(self, obs):
+            return np.ones(len(obs), bool)
+
+        def termination(self, step):
+            told.extend(zip(step.info["env_id"], step.info["elapsed_step"], strict=True))
+            return super().termination(step)
+
+    env = options(skill_set(Push, Told, call_steps=7), "CartPole-v1", 0.9, 4, engine="envpool")
+    assert type(env.engine).__name__ == "EnvPoolEngine"
+    rng = np.random.default_rng(0)
+    obs, _ = env.reset(seed=5)
+    elapsed, skills = np.zeros(4, int), env.skills.skills
+    different, ends = 0, 0
+    for _ in range(40):
+        choice = rng.integers(2, size=4)
+        told.clear()
+        before = obs.copy()
+        obs, reward, terminated, truncated, info = env.step(choice)
+        for i, c in enumerate(choice):
+            skill, now = skills[c], before[i]
+            for tau in range(1, 8):
+                action = skill.policy.act({}, now[None])[0]
+                was, now = now, cartpole(now, action[0])
+                fell = abs(now[0]) > 2.4 or abs(now[2]) > 12 * np.pi / 180
+                step = Step(
+                    was[None], action, now[None], np.ones(1), np.array([fell]), np.array([False]),
+                    np.array([False]), np.array([tau]), {"env_id": [i], "elapsed_step": [-1]},
+                )  # fmt: skip
+                if fell or tau == min(7, skill.max_steps or 7):
+                    break
+                if c == 1 and Balance.termination(skill, step)[0]:
+                    break
+            assert info["steps"][i] == tau
+            np.testing.assert_allclose(info["next_obs"][i], now, atol=1e-5)
+            assert reward[i] == pytest.approx(sum(0.9**k for k in range(tau)), rel=1e-6)
+            assert info["call_return"][i] == tau
+            assert (terminated[i], truncated[i]) == (fell, False)
+            assert info["discount"][i] == pytest.approx(0.0 if fell else 0.9**tau, rel=1e-6)
+            if c == 1:
+                mine = [int(k) for j, k in told if j == i and k >= 0]
+                assert mine == list(range(elapsed[i] + 1, elapsed[i] + tau + 1))
+            elapsed[i] = 0 if fell else elapsed[i] + tau
+            if not fell:
+                assert obs[i].tolist() == info["next_obs"][i].tolist()
+            else:
+                assert np.abs(obs[i]).max() <= 0.05
+                assert np.abs(info["final_obs"][i]).max() > 0.05
+        different += len(set(info["steps"].tolist())) > 1
+        ends += int(terminated.sum())
+    assert different > 10
+    assert ends > 3

@@ -1,0 +1,445 @@
+"""An interrupted run, resumed, ends with the same weights, bit for bit, as an uninterrupted one."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skillweave import Hierarchy, recipes
+from skillweave.cli import main
+from skillweave.hierarchy import training
+from skillweave.runs.directory import RunDirectory
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "kill_and_resume.py"
+
+RECIPE = '''
+"""A small hierarchy on CartPole with a piece of everything that could keep state."""
+import numpy as np
+from skillweave import MLP, PPO, EnvSpec, Hierarchy, Reflex, Skill
+
+class Left(Skill):
+    max_steps = 15
+    def reward(self, step):
+        return -step.next_obs[:, 0] + 0.1 * step.timed_out
+
+class Balance(Skill):
+    def initiation(self, obs):
+        return np.abs(obs[:, 2]) < 0.15
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 0]) > 0.5
+
+small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=MLP(hidden=(8,)))
+moving = PPO(
+    num_envs=4, n_steps=8, batch_size=32, update_epochs=1, network=MLP(hidden=(6,)), overlap=False,
+    normalize_obs=True, learning_rate_schedule="kl", target_kl=0.01, critic=MLP(hidden=(5, 5)),
+)
+Left.algorithm = moving
+hierarchy = Hierarchy(
+    env=EnvSpec("CartPole-v1", engine="ENGINE"),
+    skills=[Left(), Balance()],
+    call_steps=6,
+    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.2, action=1, name="catch")],
+    algorithm=small,
+    selector=small,
+    skill_steps=600,
+    selector_steps=1500,
+    cut_every=150,
+    greedy_skills=False,
+)
+'''
+
+ENGINES = ["sync", "envpool"]
+
+
+class Stopped(Exception):
+    """What interrupts a run here."""
+
+
+class StopAt:
+    """A listener that raises at its n-th tick."""
+
+    def __init__(self, tick: int) -> None:
+        self.left = tick
+
+    def phase(self, name: str, budget: int) -> None:
+        pass
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Stopped
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        pass
+
+
+def write_recipe(folder: Path, engine: str = "sync") -> Path:
+    path = folder / f"{engine}.py"
+    path.write_text(RECIPE.replace("ENGINE", engine))
+    return path
+
+
+def policies(run: Path) -> dict[str, tuple[dict[str, Any], bytes]]:
+    """Header (as JSON, its keys in any order) and the tensors' bytes of every policy."""
+    found = {}
+    for path in sorted((run / "policies").iterdir()):
+        data = path.read_bytes()
+        size = int.from_bytes(data[:8], "little")
+        found[path.name] = (json.loads(data[8 : 8 + size]), data[8 + size :])
+    return found
+
+
+def lines(run: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_same(run: Path, reference: Path) -> None:
+    mine, theirs = policies(run), policies(reference)
+    assert mine.keys() == theirs.keys()
+    assert len(mine) >= 1
+    for name, (header, weights) in theirs.items():
+        assert mine[name][0] == header, f"{name}: another header"
+        assert mine[name][1] == weights, f"{name}: other weights"
+    assert_metrics_fit(run, reference)
+
+
+def assert_metrics_fit(run: Path, reference: Path) -> None:
+    """No line twice, none missing, updates and steps rising; learning's numbers the same."""
+    mine, theirs = lines(run), lines(reference)
+    keys = [(r["phase"], r["update"]) for r in mine]
+    assert len(set(keys)) == len(keys), "a line stands twice"
+    assert keys == [(r["phase"], r["update"]) for r in theirs]
+    for phase in {r["phase"] for r in mine}:
+        rows = [r for r in mine if r["phase"] == phase]
+        for field in ("update", "steps"):
+            values = [r[field] for r in rows]
+            assert values == sorted(set(values)), f"{field} of {phase} does not rise"
+    for a, b in zip(mine, theirs, strict=True):
+        for key in ("steps", "policy_loss", "value_loss", "entropy", "learning_rate"):
+            assert a[key] == b[key], f"{key} of {a['phase']} at update {a['update']}"
+
+
+def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> RunDirectory:
+    """A new run that was interrupted by an exception at a tick."""
+    options = {"seed": 3, "flat": False} | options
+    run = RunDirectory.create(path, training.manifest(hierarchy, **options) | {"recipe": None})
+    try:
+        with pytest.raises(Stopped):
+            training.train(hierarchy, run, (StopAt(tick),))
+    finally:
+        run.close()
+    return run
+
+
+Reference = Callable[[str], tuple[Path, Path]]
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
+    """An engine's recipe and an uninterrupted run of it, made once."""
+    made: dict[str, tuple[Path, Path]] = {}
+
+    def make(engine: str) -> tuple[Path, Path]:
+        if engine == "envpool":
+            pytest.importorskip("envpool")
+        if engine not in made:
+            folder = tmp_path_factory.mktemp(engine)
+            recipe = write_recipe(folder, engine)
+            recipes.load(str(recipe)).train(folder / "run", seed=3, quiet=True)
+            made[engine] = recipe, folder / "run"
+        return made[engine]
+
+    return make
+
+
+# Two uninterrupted runs
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others(
+    tmp_path: Path, reference: Reference, engine: str
+) -> None:
+    recipe, whole = reference(engine)
+    recipes.load(str(recipe)).train(tmp_path / "again", seed=3, quiet=True)
+    assert_same(tmp_path / "again", whole)
+    recipes.load(str(recipe)).train(tmp_path / "other", seed=4, quiet=True)
+    mine, theirs = policies(tmp_path / "other"), policies(whole)
+    assert all(mine[name][1] != theirs[name][1] for name in theirs)
+
+
+def test_the_files_of_two_equal_runs_are_equal_byte_by_byte(
+    tmp_path: Path, reference: Reference
+) -> None:
+    recipe, whole = reference("sync")
+    recipes.load(str(recipe)).train(tmp_path / "again", seed=3, quiet=True)
+    for path in (whole / "policies").iterdir():
+        assert (tmp_path / "again" / "policies" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
+    _, whole = reference("sync")
+    found = lines(whole)
+    assert {r["phase"] for r in found} == {"left", "balance", "selector"}
+    for phase in ("left", "balance", "selector"):
+        steps = [r["steps"] for r in found if r["phase"] == phase]
+        assert len({s // 150 for s in steps}) >= 4, "too few clean cuts"
+    one, two = [r["learning_rate"] for r in found if r["phase"] == "left"][:2]
+    assert one != two
+
+
+# Interrupted within the process
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("tick", [1, 7, 19, 21, 24, 30, 33])
+def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
+    tmp_path: Path, reference: Reference, engine: str, tick: int
+) -> None:
+    recipe, whole = reference(engine)
+    run = stopped_run(recipes.load(str(recipe)), tmp_path / "run", tick)
+    assert not run.finished
+    recipes.load(str(recipe)).resume(run.path, quiet=True)
+    assert_same(run.path, whole)
+
+
+def test_a_run_stopped_again_and_again_ends_as_if_it_had_not_been(
+    tmp_path: Path, reference: Reference
+) -> None:
+    recipe, whole = reference("sync")
+    path = stopped_run(recipes.load(str(recipe)), tmp_path / "run", 5).path
+    stops = 1
+    while True:
+        run = RunDirectory.open(path)
+        try:
+            # As many ticks as reach the next clean cut, but not the one after it.
+            training.train(recipes.load(str(recipe)), run, (StopAt(7),))
+            break
+        except Stopped:
+            stops += 1
+        finally:
+            run.close()
+    assert stops >= 4
+    assert_same(path, whole)
+
+
+def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
+    recipe = str(write_recipe(tmp_path))
+    recipes.load(recipe).train(tmp_path / "whole", seed=3, flat=True, quiet=True)
+    run = stopped_run(recipes.load(recipe), tmp_path / "run", 20, flat=True)
+    recipes.load(recipe).resume(run.path, quiet=True)
+    assert_same(run.path, tmp_path / "whole")
+
+
+def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(
+    tmp_path: Path, reference: Reference
+) -> None:
+    recipe, whole = reference("sync")
+    path = stopped_run(recipes.load(str(recipe)), tmp_path / "run", 16).path
+    assert (path / "checkpoint.previous.safetensors").exists()
+    checkpoint = path / "checkpoint.safetensors"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-1])
+    recipes.load(str(recipe)).resume(path, quiet=True)
+    assert_same(path, whole)
+
+
+def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
+    tmp_path: Path, reference: Reference, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, whole = reference("sync")
+    path = tmp_path / "run"
+
+    def stop(*_: Any) -> None:
+        raise Stopped
+
+    monkeypatch.setattr(RunDirectory, "save_policy", stop)
+    with pytest.raises(Stopped):
+        recipes.load(str(recipe)).train(path, seed=3, quiet=True)
+    monkeypatch.undo()
+    recipes.load(str(recipe)).resume(path, quiet=True)
+    assert_same(path, whole)
+    mine, theirs = (RunDirectory.open(p).phase("left") for p in (path, whole))
+    assert mine["steps"] == theirs["steps"]
+    assert mine["final"].keys() == theirs["final"].keys()
+    assert mine["final"]["policy_loss"] == theirs["final"]["policy_loss"]
+
+
+def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Reference) -> None:
+    recipe, whole = reference("sync")
+    shutil.copytree(whole, tmp_path / "run")
+    before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*.*")}
+    recipes.load(str(recipe)).resume(tmp_path / "run", quiet=True)
+    assert {p: p.read_bytes() for p in (tmp_path / "run").rglob("*.*")} == before
+
+
+# What a resumed run must take from the run, not from the recipe
+
+
+SETTINGS = [
+    "reflexes_in_training=false",
+    "greedy_skills=true",
+    "call_steps=9",
+    "cut_every=250",
+    "skills.left.gamma=0.9",
+    "skills.left.steps=400",
+    "selector.learning_rate=0.01",
+    "selector_steps=700",
+]
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
+    tmp_path: Path, setting: str
+) -> None:
+    from skillweave.hierarchy.settings import apply_settings
+
+    recipe = str(write_recipe(tmp_path))
+
+    def changed() -> Hierarchy:
+        hierarchy = recipes.load(recipe)
+        apply_settings(hierarchy, [setting])
+        return hierarchy
+
+    changed().train(tmp_path / "whole", seed=3, quiet=True)
+    run = stopped_run(changed(), tmp_path / "run", 3)
+    recipes.load(recipe).resume(run.path, quiet=True)
+    assert_same(run.path, tmp_path / "whole")
+
+
+def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Acting needs none of this recipe's code, but finishing the training does.
+    recipe = tmp_path / "rewards.py"
+    text = RECIPE.replace("ENGINE", "sync").replace("def initiation", "def _unused")
+    text = text.replace("def termination", "def _neither").replace("    reflexes=", "    # ")
+    recipe.write_text(text)
+    assert recipes.load(str(recipe)).is_data
+    run = stopped_run(recipes.load(str(recipe)), tmp_path / "run", 3)
+    assert main(["resume", str(run.path), "--quiet", "--evaluate", "0"]) == 1
+    assert "--recipe" in capsys.readouterr().err
+    assert not RunDirectory.open(run.path).finished
+
+
+# Interrupted from outside
+
+
+def wait_for_lines(process: subprocess.Popen[str], run: Path, count: int) -> None:
+    """Until the run's metrics have so many lines, or its process is over."""
+    metrics = run / "metrics.jsonl"
+    while process.poll() is None:
+        if metrics.exists() and metrics.read_bytes().count(b"\n") >= count:
+            return
+        time.sleep(0.001)
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """A training process that was sent SIGINT (Ctrl-C) in its first phase."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    recipe = write_recipe(folder)
+    command = [sys.executable, "-m", "skillweave", "train", str(recipe), "-o", str(folder / "run")]
+    command += ["--seed", "3", "--set", "skill_steps=6000", "--evaluate", "0"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        wait_for_lines(process, folder / "run", 20)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate()
+    done = {"code": process.returncode, "out": out, "err": err}
+    return done | {"recipe": recipe, "run": folder / "run"}
+
+
+def test_ctrl_c_ends_with_code_130_and_says_how_to_go_on(interrupted: dict[str, Any]) -> None:
+    assert interrupted["code"] == 130
+    assert "Traceback" not in interrupted["err"]
+    assert "stopped: saved at" in interrupted["err"]
+    assert f"skillweave resume {interrupted['run']}" in interrupted["err"]
+    assert interrupted["out"] == ""
+
+
+def test_the_command_that_ctrl_c_names_is_complete(interrupted: dict[str, Any]) -> None:
+    # A recipe in a user's file must be pointed to (contract 7), so the command must say so.
+    assert f"--recipe {interrupted['recipe']}" in interrupted["err"]
+
+
+def test_a_run_stopped_by_ctrl_c_ends_as_if_it_had_not_been(
+    tmp_path: Path, interrupted: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe, run = str(interrupted["recipe"]), tmp_path / "run"
+    shutil.copytree(interrupted["run"], run)
+    assert not RunDirectory.open(run).finished
+    common = ["--quiet", "--evaluate", "0"]
+    assert main(["resume", str(run), "--recipe", recipe, *common]) == 0
+    whole = str(tmp_path / "whole")
+    more = ["--set", "skill_steps=6000", "--seed", "3"]
+    assert main(["train", recipe, "-o", whole, *more, *common]) == 0
+    assert_same(run, tmp_path / "whole")
+
+
+def test_three_kills_at_random_moments_change_no_weight(tmp_path: Path) -> None:
+    recipe = write_recipe(tmp_path)
+    command = [sys.executable, str(SCRIPT), str(recipe), "--kills", "3", "--seed", "11"]
+    command += ["--out", str(tmp_path / "kills"), "--set", "skill_steps=3000"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert_same(tmp_path / "kills" / "killed", tmp_path / "kills" / "whole")
+    table = [line for line in done.stdout.splitlines() if line.strip()[:1].isdigit()]
+    assert len(table) == 3
+    assert any(" killed " in line for line in table), done.stdout
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+# The script can tell a difference
+
+
+@pytest.fixture(scope="module")
+def script() -> Any:
+    spec = importlib.util.spec_from_file_location("kill_and_resume", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_script_finds_equal_runs_equal(
+    tmp_path: Path, reference: Reference, script: Any
+) -> None:
+    _, whole = reference("sync")
+    shutil.copytree(whole, tmp_path / "run")
+    assert script.differences(tmp_path / "run", whole) == []
+
+
+@pytest.mark.parametrize("how", ["one bit", "missing", "one more", "a line twice"])
+def test_the_script_finds_any_difference(
+    tmp_path: Path, reference: Reference, script: Any, how: str
+) -> None:
+    _, whole = reference("sync")
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    policy = run / "policies" / "left.safetensors"
+    match how:
+        case "one bit":
+            data = bytearray(policy.read_bytes())
+            data[-1] ^= 1
+            policy.write_bytes(data)
+        case "missing":
+            policy.unlink()
+        case "one more":
+            (run / "policies" / "right.safetensors").write_bytes(b"")
+        case "a line twice":
+            metrics = run / "metrics.jsonl"
+            text = metrics.read_text()
+            metrics.write_text(text + text.splitlines(keepends=True)[-1])
+    found = script.differences(run, whole)
+    assert len(found) == 1
+    assert ("metrics" in found[0]) if how == "a line twice" else ("right" in found[0] or "left" in found[0])

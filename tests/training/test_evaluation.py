@@ -1,0 +1,301 @@
+"""Evaluation equals a scalar loop from the same seeds, and its numbers are those of a hand."""
+
+import dataclasses
+import json
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete
+
+from skillweave import PPO, EnvSpec, Evaluation, Skill, SkillweaveError, evaluate
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.hierarchy.calls import SkillSet
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.seeding import Seeds
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.training.evaluation import FIRST_SEED, interquartile_mean
+
+torch.set_num_threads(1)
+
+
+def spaces(env_id: str) -> tuple:
+    env = gym.make(env_id)
+    return env.observation_space, env.action_space
+
+
+def agent(env_id: str, seed: int = 0) -> AgentPolicy:
+    """A fresh network, its weights made large enough to act in more than one way."""
+    config = PPO(num_envs=1, n_steps=1, batch_size=1)
+    algorithm = make_algorithm(config, *spaces(env_id))
+    state = algorithm.init([Seeds(seed)])
+    with torch.no_grad():
+        state.params[:] = 5 * state.params
+    return AgentPolicy.of(algorithm, state)
+
+
+def lander() -> ScriptedPolicy:
+    function = lambda obs: np.where(obs[:, 3] < -0.3, 2, np.where(obs[:, 4] > 0.1, 3, 0))  # noqa: E731
+    return ScriptedPolicy(function, *spaces("LunarLander-v3"))
+
+
+def scalar(policy, make, seeds) -> tuple[list[float], list[int]]:
+    """One environment, one episode after the other."""
+    env, returns, lengths = make(), [], []
+    for seed in seeds:
+        obs, _ = env.reset(seed=seed)
+        rewards, over = [], False
+        while not over:
+            action, _ = policy.act({}, obs[None])
+            obs, reward, terminated, truncated, _ = env.step(action[0])
+            rewards.append(float(np.float32(reward)))
+            over = terminated or truncated
+        returns.append(math.fsum(rewards))
+        lengths.append(len(rewards))
+    return returns, lengths
+
+
+CASES = {
+    "a network on CartPole": ("CartPole-v1", agent, {"max_episode_steps": 30}),
+    "a script on LunarLander": ("LunarLander-v3", lambda _: lander(), {"max_episode_steps": 200}),
+    "continuous actions": ("Pendulum-v1", agent, {"max_episode_steps": 20}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("seed", [0, 3])
+def test_returns_and_lengths_are_those_of_a_scalar_loop_from_the_same_seeds(case, seed):
+    env_id, make, kwargs = CASES[case]
+    policy, spec = make(env_id), EnvSpec(env_id, kwargs=kwargs)
+    found = evaluate(policy, spec, episodes=12, seed=seed, num_envs=5)
+    seeds = [1_000_000 * (seed + 1) + i for i in range(12)]
+    returns, lengths = scalar(policy, lambda: gym.make(env_id, **kwargs), seeds)
+    # networks multiply one row and five rows in another order: continuous actions differ in bits
+    exact = case != "continuous actions"
+    np.testing.assert_allclose(found.returns, returns, rtol=1e-12 if exact else 1e-4)
+    assert list(found.lengths) == lengths
+    assert len(set(found.returns)) == 12, "episodes are alike: the seeds say nothing"
+    assert exact is False or len(set(lengths)) > 1
+
+
+def test_the_result_does_not_depend_on_how_many_environments_stand_side_by_side():
+    policy = agent("CartPole-v1")
+    results = [
+        evaluate(policy, EnvSpec("CartPole-v1"), episodes=17, num_envs=n)
+        for n in (1, 2, 5, 16, 17, 100)
+    ]
+    assert all(r == results[0] for r in results)
+    assert len(results[0].returns) == len(results[0].lengths) == 17
+    assert len(set(results[0].lengths)) > 3
+
+
+def test_more_episodes_begin_with_the_same_ones_and_another_seed_has_others():
+    policy, spec = agent("CartPole-v1"), EnvSpec("CartPole-v1")
+    few, many = (evaluate(policy, spec, episodes=n, num_envs=4).returns for n in (6, 15))
+    assert many[:6] == few
+    assert evaluate(policy, spec, episodes=15, seed=1, num_envs=4).returns != many
+
+
+def test_every_policy_meets_the_same_starts():
+    starts = {}
+
+    def noting(name):
+        seen = starts.setdefault(name, set())
+
+        def act(obs):
+            seen.update(tuple(o) for o in obs if np.abs(o).max() <= 0.05)
+            return np.full(len(obs), int(name == "right"))
+
+        return ScriptedPolicy(act, *spaces("CartPole-v1"))
+
+    for name in ("left", "right"):
+        evaluate(noting(name), EnvSpec("CartPole-v1"), episodes=10, num_envs=3)
+    env = gym.make("CartPole-v1")
+    wanted = {tuple(env.reset(seed=FIRST_SEED + i)[0]) for i in range(10)}
+    assert starts["left"] >= wanted
+    assert starts["right"] >= wanted
+
+
+def test_acting_by_sampling_is_reproduced_by_the_seed_and_differs_from_greedy():
+    policy, spec = agent("CartPole-v1"), EnvSpec("CartPole-v1")
+
+    def play(**how):
+        return evaluate(policy, spec, episodes=8, num_envs=4, **how).returns
+
+    assert play(deterministic=False) == play(deterministic=False)
+    assert play(deterministic=False) != play()
+
+
+# Skills ----------------------------------------------------------------------------------------
+
+
+class Line(gym.Env):
+    """Episode i (by seed) lasts 5 + i steps; the observation is the time; action a pays a."""
+
+    observation_space = Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        if seed:
+            self.length, self.truncates = 5 + (seed - FIRST_SEED), seed % 2 == 0
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        ended = self.t == self.length
+        obs = np.array([self.t], np.float32)
+        return obs, float(action), ended and not self.truncates, ended and self.truncates, {}
+
+
+def fixed(action: int) -> ScriptedPolicy:
+    return ScriptedPolicy(
+        lambda obs: np.full(len(obs), action), Line.observation_space, Line.action_space
+    )
+
+
+class Short(Skill):
+    max_steps = 2
+
+
+class Long(Skill):
+    max_steps = 9
+
+
+class Never(Skill):
+    pass
+
+
+def woven() -> HierarchyPolicy:
+    """Short where the time is a multiple of 5, else Long: calls of 2 and 3 steps by turns."""
+    selector = ScriptedPolicy(
+        lambda obs: (obs[:, 0] % 5 != 0).astype(int), Line.observation_space, Discrete(3)
+    )
+    policies = tuple(fixed(a) for a in (1, 2, 0))
+    return HierarchyPolicy(selector, SkillSet((Short(), Long(), Never()), policies, call_steps=3))
+
+
+@pytest.mark.parametrize("num_envs", [1, 2, 3, 4])
+def test_steps_and_calls_of_each_skill_are_counted_exactly(num_envs):
+    # episodes of 5, 6, 7 and 8 steps, in calls of 2 3 | 2 3 1 | 2 3 2 | 2 3 2 1 steps
+    found = evaluate(woven(), EnvSpec(Line), episodes=4, num_envs=num_envs)
+    assert found.lengths == (5, 6, 7, 8)
+    assert found.returns == (2 + 6, 2 + 6 + 1, 2 + 6 + 2, 2 + 6 + 2 + 2)
+    assert found.skill_steps == {"short": 2 + 3 + 4 + 4, "long": 3 + 3 + 3 + 4, "never": 0}
+    assert found.skill_calls == {"short": 1 + 2 + 2 + 2, "long": 1 + 1 + 1 + 2, "never": 0}
+    summary = found.to_json()
+    assert summary["skill_usage"] == {"short": 13 / 26, "long": 13 / 26, "never": 0}
+    assert summary["call_length_mean"] == {"short": 13 / 7, "long": 13 / 5}
+    assert sum(found.skill_steps.values()) == sum(found.lengths)
+    assert "short 50%, long 50%, never 0%" in str(found)
+
+
+def test_a_plain_policy_has_no_skills_to_count():
+    found = evaluate(fixed(1), EnvSpec(Line), episodes=3)
+    assert found.skill_steps == found.skill_calls == {}
+    assert found.to_json()["skill_usage"] == {}
+    assert "skills" not in str(found)
+
+
+# Numbers ---------------------------------------------------------------------------------------
+
+
+def test_the_interquartile_mean_by_hand():
+    assert interquartile_mean(np.array([7.0])) == 7
+    assert interquartile_mean(np.array([1.0, 3.0])) == 2
+    # the middle half of 3 is 1.5 wide: a quarter of each end, and the middle one
+    assert interquartile_mean(np.array([0.0, 6.0, 30.0])) == pytest.approx((6 + 30 / 4) / 1.5)
+    assert interquartile_mean(np.array([100.0, 1.0, 3.0, -50.0])) == 2
+    # of 5: three quarters of the second and fourth, and the third
+    assert interquartile_mean(np.array([9, 0, 1, 2, 4])) == pytest.approx((0.75 + 2 + 3) / 2.5)
+    assert interquartile_mean(np.arange(8.0) ** 2) == (4 + 9 + 16 + 25) / 4
+
+
+def evaluation(returns, lengths=None, threshold=None) -> Evaluation:
+    return Evaluation(tuple(returns), tuple(lengths or [1] * len(returns)), threshold, {}, {})
+
+
+def test_the_summary_by_hand():
+    summary = evaluation((1.0, 2.0, 3.0, 6.0), (10, 20, 30, 60), threshold=3.0).to_json()
+    std = math.sqrt((4 + 1 + 0 + 9) / 3)
+    assert summary["std"] == pytest.approx(std)
+    assert summary["ci95"] == pytest.approx([3 - 1.96 * std / 2, 3 + 1.96 * std / 2])
+    assert {k: summary[k] for k in ("episodes", "mean", "median", "min", "max", "iqm")} == {
+        "episodes": 4, "mean": 3.0, "median": 2.5, "min": 1.0, "max": 6.0, "iqm": 2.5,
+    }  # fmt: skip
+    assert (summary["length_mean"], summary["threshold"]) == (30, 3.0)
+    assert summary["solved_fraction"] == 0.5, "the threshold itself is solved"
+
+
+def test_one_episode_has_no_deviation():
+    summary = evaluation((4.0,)).to_json()
+    assert (summary["mean"], summary["std"], summary["ci95"], summary["iqm"]) == (4, 0, [4, 4], 4)
+
+
+def test_the_summary_is_strict_json_and_the_line_says_it():
+    found = evaluate(woven(), EnvSpec(Line), episodes=3)
+    assert json.loads(json.dumps(found.to_json(), allow_nan=False)) == found.to_json()
+    line = str(evaluation((100.0, 300.0), (50, 150), 200.0))
+    assert "200.0 ± 141.4 over 2 episodes" in line
+    assert "50% at 200 or more" in line
+    assert "100 steps an episode" in line
+
+
+def test_the_threshold_is_the_environments_own():
+    found = evaluate(agent("CartPole-v1"), EnvSpec("CartPole-v1"), episodes=2)
+    assert found.threshold == 475
+    assert found.solved_fraction == 0
+    assert dataclasses.replace(found, returns=(475.0, 474.0)).solved_fraction == 0.5
+
+
+@pytest.mark.parametrize("env", [Line, "Pendulum-v1"])
+def test_without_a_threshold_nothing_is_solved_or_unsolved(env):
+    policy = fixed(1) if env is Line else agent("Pendulum-v1")
+    kwargs = {} if env is Line else {"max_episode_steps": 3}
+    found = evaluate(policy, EnvSpec(env, kwargs=kwargs), episodes=2)
+    assert found.threshold is None
+    assert found.solved_fraction is None
+    assert found.to_json()["solved_fraction"] is None
+    assert "or more" not in str(found)
+
+
+# What is wrong ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "says"),
+    [
+        (Box(-1, 1, (3,)), Discrete(2), r"observation space Box.*\(3,\).*CartPole-v1 has Box"),
+        (None, Discrete(3), r"action space Discrete\(3\).*CartPole-v1 has Discrete\(2\)"),
+        (None, Box(-1, 1, (2,)), r"action space Box.*CartPole-v1 has Discrete\(2\)"),
+    ],
+)
+def test_a_policy_made_for_other_spaces_is_told_both(observation, action, says):
+    observation = observation or spaces("CartPole-v1")[0]
+    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), int), observation, action)
+    with pytest.raises(SkillweaveError, match=says):
+        evaluate(policy, EnvSpec("CartPole-v1"), episodes=1)
+
+
+@pytest.mark.parametrize("episodes", [0, -3])
+def test_at_least_one_episode_is_played(episodes):
+    with pytest.raises(SkillweaveError, match=f"episodes is {episodes}"):
+        evaluate(fixed(0), EnvSpec(Line), episodes=episodes)
+
+
+@pytest.mark.parametrize("num_envs", [0, -1])
+def test_at_least_one_environment_is_needed(num_envs):
+    with pytest.raises(SkillweaveError, match="num_envs"):
+        evaluate(fixed(0), EnvSpec(Line), episodes=2, num_envs=num_envs)
+
+
+def test_evaluation_is_on_gymnasiums_environment_whatever_trains_it():
+    pytest.importorskip("envpool")
+    policy = agent("CartPole-v1")
+    results = [
+        evaluate(policy, EnvSpec("CartPole-v1", engine=engine), episodes=5)
+        for engine in ("sync", "envpool")
+    ]
+    assert results[0] == results[1]
