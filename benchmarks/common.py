@@ -81,7 +81,7 @@ class Recorder:
             elif kind == "reset":
                 pool.reset(ids)
             else:
-                pool = self.engine._make(what)
+                pool = self.engine.make_pool(what)
                 pool.reset()
         return steps, time.perf_counter() - started
 

@@ -80,17 +80,19 @@ class ActionCodec:
     space: gym.Space[Any]
     discrete: bool
     size: int
-    low: Array | None = None  # (A,), where bounded
-    high: Array | None = None
+    low: Array | None = None  # (A,), of a Box; a Discrete's first value
+    high: Array | None = None  # (A,), of a Box
 
     def to_env(self, action: Array) -> Array:
         """Policy units to the environment's; int64 (n,), or float (n, A) to (n, *shape)."""
         if self.discrete:
             return np.asarray(action + self.low) if self.low is not None else action
-        if self.low is not None and self.high is not None:
-            unit = np.clip(action, -1.0, 1.0)
-            action = self.low + 0.5 * (unit + 1.0) * (self.high - self.low)
-        return action.astype(self.space.dtype).reshape(-1, *(self.space.shape or ()))
+        assert self.low is not None
+        assert self.high is not None
+        if np.isfinite(self.low).all() and np.isfinite(self.high).all():
+            action = self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+        action = action.astype(self.space.dtype).clip(self.low, self.high)
+        return action.reshape(-1, *(self.space.shape or ()))
 
 
 def action_codec(space: gym.Space[Any]) -> ActionCodec:
@@ -104,8 +106,6 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
         return ActionCodec(space, True, int(space.n), low)  # type: ignore[arg-type]
     if isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating):
         size = int(np.prod(space.shape))
-        if not np.isfinite(space.low).all() or not np.isfinite(space.high).all():
-            return ActionCodec(space, False, size)
         return ActionCodec(space, False, size, space.low.reshape(-1), space.high.reshape(-1))
     raise SkillweaveError(
         f"action space {space} is not supported; supported are: {ACTIONS} (of floats)."
@@ -129,7 +129,10 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
         start = np.asarray(space.start)
         return {"type": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": start.tolist()}
     if isinstance(space, gym.spaces.MultiBinary):
-        return {"type": "MultiBinary", "n": list(space.shape)}
+        return {
+            "type": "MultiBinary",
+            "n": space.n if isinstance(space.n, int) else list(space.shape),
+        }
     raise SkillweaveError(f"space {space} is not supported; supported are: {OBSERVATIONS}")
 
 
@@ -146,7 +149,7 @@ def space_from_json(data: dict[str, Any]) -> gym.Space[Any]:
                 bounds = (
                     np.array(data[k], float).reshape(shape).astype(dtype) for k in ("low", "high")
                 )
-                box: gym.Space[Any] = gym.spaces.Box(next(bounds), next(bounds), shape, dtype)  # type: ignore[arg-type]
+                box: gym.Space[Any] = gym.spaces.Box(next(bounds), next(bounds), shape, dtype)
                 return box
             case "Discrete":
                 return gym.spaces.Discrete(data["n"], start=data["start"])
@@ -163,8 +166,10 @@ def space_from_json(data: dict[str, Any]) -> gym.Space[Any]:
 
 def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
     """Whether a policy made for one space can act in the other: same kind, shape and choices."""
-    choices = [getattr(s, "nvec", getattr(s, "n", None)) for s in (a, b)]
-    return type(a) is type(b) and a.shape == b.shape and bool(np.all(choices[0] == choices[1]))
+    if type(a) is not type(b) or a.shape != b.shape:
+        return False
+    kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete
+    return not isinstance(a, kinds) or space_to_json(a) == space_to_json(b)
 
 
 def _number(x: Any) -> float | str:

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from skillweave import Hierarchy, recipes
 from skillweave.cli import main
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "kill_and_resume.py"
 
@@ -48,7 +50,7 @@ hierarchy = Hierarchy(
     env=EnvSpec("CartPole-v1", engine="ENGINE"),
     skills=[Left(), Balance()],
     call_steps=6,
-    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.2, action=1, name="catch")],
+    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.05, action=1, name="catch")],
     algorithm=small,
     selector=small,
     skill_steps=600,
@@ -320,7 +322,7 @@ def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_the
 ) -> None:
     # Acting needs none of this recipe's code, but finishing the training does.
     recipe = tmp_path / "rewards.py"
-    text = RECIPE.replace("ENGINE", "sync").replace("def initiation", "def _unused")
+    text = RECIPE.replace(', engine="ENGINE"', "").replace("def initiation", "def _unused")
     text = text.replace("def termination", "def _neither").replace("    reflexes=", "    # ")
     recipe.write_text(text)
     assert recipes.load(str(recipe)).is_data
@@ -392,9 +394,9 @@ def test_three_kills_at_random_moments_change_no_weight(tmp_path: Path) -> None:
     command += ["--out", str(tmp_path / "kills"), "--set", "skill_steps=3000"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert_same(tmp_path / "kills" / "killed", tmp_path / "kills" / "whole")
-    table = [line for line in done.stdout.splitlines() if line.strip()[:1].isdigit()]
-    assert len(table) == 3
-    assert any(" killed " in line for line in table), done.stdout
+    table = [line.split() for line in done.stdout.splitlines() if " update " in line]
+    assert [row[0] for row in table] == ["1", "2", "3"], done.stdout
+    assert any("killed" in row for row in table), done.stdout
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -402,13 +404,15 @@ def test_three_kills_at_random_moments_change_no_weight(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def script() -> Any:
+def script() -> Iterator[Any]:
     spec = importlib.util.spec_from_file_location("kill_and_resume", SCRIPT)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # its dataclass looks itself up there
     spec.loader.exec_module(module)
-    return module
+    yield module
+    del sys.modules[spec.name]
 
 
 def test_the_script_finds_equal_runs_equal(
@@ -441,5 +445,5 @@ def test_the_script_finds_any_difference(
             text = metrics.read_text()
             metrics.write_text(text + text.splitlines(keepends=True)[-1])
     found = script.differences(run, whole)
-    assert len(found) == 1
-    assert ("metrics" in found[0]) if how == "a line twice" else ("right" in found[0] or "left" in found[0])
+    named = {"one more": "right.safetensors", "a line twice": "metrics.jsonl"}
+    assert [line.split(":")[0] for line in found] == [named.get(how, "left.safetensors")]

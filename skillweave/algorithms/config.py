@@ -119,12 +119,21 @@ def config_from_json(data: dict[str, Any]) -> AlgorithmConfig:
     kind = values.pop("algorithm", None)
     if kind not in _KINDS:
         raise SkillweaveError(f"unknown algorithm {kind!r}; known are: {', '.join(_KINDS)}")
-    known = {f.name for f in fields(_KINDS[kind])}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise SkillweaveError(f"{kind} has no field {', '.join(unknown)}: made by a newer version?")
+    _check_fields(values, _KINDS[kind], kind)
     for name in ("network", "critic"):
         if values.get(name) is not None:
-            net = dict(values[name])
-            values[name] = MLP(**{**net, "hidden": tuple(net["hidden"])})
+            values[name] = _mlp_from_json(values[name], f"{kind}.{name}")
     return _KINDS[kind](**values)
+
+
+def _mlp_from_json(data: dict[str, Any], where: str) -> MLP:
+    _check_fields(data, MLP, where)
+    return MLP(**{**data, "hidden": tuple(data["hidden"])})
+
+
+def _check_fields(values: dict[str, Any], kind: type, where: str) -> None:
+    unknown = sorted(set(values) - {f.name for f in fields(kind)})
+    if unknown:
+        raise SkillweaveError(
+            f"{where} has no field {', '.join(unknown)}: made by a newer version?"
+        )

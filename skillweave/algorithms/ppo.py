@@ -5,7 +5,7 @@ Read down the page: State, Actor, init, act, loss, update. The settings are ``co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,8 @@ from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.types import Transition
 
+REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
+"""Metrics of a minibatch."""
 _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
 
@@ -200,49 +202,54 @@ class PPOAlgorithm:
         """
         cfg, tr = self.config, rollout.transition
         data, metrics = self._prepare(state, rollout)
-        size = data["advantage"].shape[1]
-        minibatches = max(1, size // cfg.batch_size)
         leaves = self.layout.leaves(state.params)
-        rate = state.learning_rate
+        rate, ent_coef = state.learning_rate, state.ent_coef
         if cfg.learning_rate_schedule == "linear":
             rate = rate * (1.0 - progress)
-        ent_coef = state.ent_coef
         if cfg.ent_coef_final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(rate, cfg.ent_coef_final), progress)
-        stops = cfg.target_kl is not None and cfg.learning_rate_schedule != "kl"
-        active = torch.ones(len(seeds), dtype=torch.bool) if stops else None
-        sums: dict[str, Tensor] = {}
-        for epoch in range(cfg.update_epochs):
-            order = [torch.randperm(size, generator=(s / epoch).torch()) for s in seeds]
-            shuffled = {k: _take(v, torch.stack(order)) for k, v in data.items()}
-            for part in range(minibatches):
-                cut = slice(part * size // minibatches, (part + 1) * size // minibatches)
-                batch = {k: v[:, cut] for k, v in shuffled.items()}
-                loss, report = self.loss(leaves, state, batch, ent_coef)
-                grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
-                grad = torch.cat([g.flatten(1) for g in grads], dim=1)
-                report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
-                if active is not None:
-                    # As in Stable-Baselines3: a member stops before the step that oversteps.
-                    active = active & (report["kl"] <= 1.5 * cfg.target_kl)  # type: ignore[operator]
-                    if not bool(active.any()):
-                        break
-                adam_(
-                    state.params, grad, state.mu, state.nu, state.count, rate,
-                    eps=cfg.adam_eps, active=active,
-                )  # fmt: skip
-                for k, v in report.items():
-                    sums[k] = sums[k] + v if k in sums else v
-            if active is not None and not bool(active.any()):
-                break
-        steps = max(1, minibatches * cfg.update_epochs)
-        metrics |= {k: v / steps for k, v in sums.items()}
+        limit = (
+            1.5 * cfg.target_kl if cfg.target_kl and cfg.learning_rate_schedule != "kl" else None
+        )
+        active = torch.ones(len(seeds), dtype=torch.bool)
+        counted = torch.zeros(len(seeds))
+        sums = dict.fromkeys(REPORT, torch.zeros(len(seeds)))
+        for batch in self._minibatches(data, seeds):
+            loss, report = self.loss(leaves, state, batch, ent_coef)
+            grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
+            grad = torch.cat([g.flatten(1) for g in grads], dim=1)
+            report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
+            counted = counted + active
+            sums = {k: v + report[k] * active for k, v in sums.items()}
+            if limit is not None:
+                # As in Stable-Baselines3: a member stops before the step that oversteps.
+                active = active & (report["kl"] <= limit)
+                if not bool(active.any()):
+                    break
+            adam_(
+                state.params, grad, state.mu, state.nu, state.count, rate,
+                eps=cfg.adam_eps, active=None if limit is None else active,
+            )  # fmt: skip
+        metrics |= {k: v / counted for k, v in sums.items()}
         if cfg.learning_rate_schedule == "kl":
             target = torch.full_like(rate, cfg.target_kl or 0.0)
             state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)
         metrics["learning_rate"] = rate
         metrics["samples"] = torch.full_like(rate, float(tr.reward[0].numel()))
         return state, metrics
+
+    def _minibatches(
+        self, data: Mapping[str, Tensor], seeds: list[Seeds]
+    ) -> Iterator[dict[str, Tensor]]:
+        """Every epoch's minibatches, (P, b, ...), each member's in an order of its own."""
+        size = data["advantage"].shape[1]
+        parts = max(1, size // self.config.batch_size)
+        for epoch in range(self.config.update_epochs):
+            order = [torch.randperm(size, generator=(s / epoch).torch()) for s in seeds]
+            shuffled = {k: _take(v, torch.stack(order)) for k, v in data.items()}
+            for part in range(parts):
+                cut = slice(part * size // parts, (part + 1) * size // parts)
+                yield {k: v[:, cut] for k, v in shuffled.items()}
 
     def loss(
         self, views: Views, state: State, batch: Mapping[str, Tensor], ent_coef: Tensor
@@ -312,14 +319,12 @@ class PPOAlgorithm:
         last = tr.last.flatten(1)
         widest = int(last.sum(1).max())
         # Members may have different numbers of ends: the first `widest` of a stable sort holds
-        # them all, and the surplus rows are only computed, then overwritten by their own value.
+        # them all. Surplus rows get what the shift gave them, the value of their true successor.
         rows = last.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :widest]
         ends = self._value(
             views, state, self._inputs(_take(tr.next_obs.flatten(1, 2), rows), actor)
         )
-        flat = next_value.flatten(1)
-        ends = torch.where(last.gather(1, rows), ends, flat.gather(1, rows))
-        return flat.scatter(1, rows, ends).view_as(value)
+        return next_value.flatten(1).scatter(1, rows, ends).view_as(value)
 
     def _inputs(self, obs: Tensor, actor: Actor) -> Tensor:
         x = self.obs.encode(obs)

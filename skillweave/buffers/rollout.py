@@ -61,9 +61,14 @@ class RolloutBuffer:
             discount=discount,
             next_obs=self._by_member(self._next_obs),
             last=self._by_member(self._last),
-            mask=self._by_member(np.stack(masks)) if masks else None,
+            mask=self._by_member(self._masks(masks[0])) if masks else None,
         )
         return transition, torch.stack(self._head, dim=1)
+
+    def _masks(self, example: Array) -> Array:
+        """(T, N, A) bool; a step without a mask allows everything."""
+        free = np.ones_like(example)
+        return np.stack([free if m is None else m for m in self._mask])
 
     def _by_member(self, x: Array) -> Tensor:
         """(T, P·B, ...) to (P, T, B, ...)."""

@@ -8,7 +8,9 @@ An environment that has ended must be reset before the next step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -89,8 +91,9 @@ class GymnasiumEngine:
             AsyncVectorEnv(makers, **kwargs) if processes else SyncVectorEnv(makers, **kwargs)
         )
         self.num_envs = num_envs
-        self.observation_space = self._vector.single_observation_space
-        self.action_space = self._vector.single_action_space[1]
+        self.observation_space: gym.Space[Any] = self._vector.single_observation_space
+        go_and_action: Any = self._vector.single_action_space
+        self.action_space: gym.Space[Any] = go_and_action[1]
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
         self._actions: Any = gym.vector.utils.create_empty_array(
             self.action_space, num_envs, np.zeros
@@ -118,12 +121,15 @@ class GymnasiumEngine:
             go[:] = 0
             go[ids] = 1
             self._actions[ids] = action
-        obs, reward, terminated, truncated, info = self._vector.step((go, self._actions))
+        # A copy: environments get views of it, and may keep them.
+        acted = go, self._actions.copy()
+        obs, reward, terminated, truncated, info = self._vector.step(acted)
         if ids is not None:
             obs, reward, terminated, truncated = (
                 x[ids] for x in (obs, reward, terminated, truncated)
             )
-            info = {k: v[ids] if isinstance(v, np.ndarray) else v for k, v in info.items()}
+            info = _info_rows(info, ids)
+        truncated = truncated & ~terminated
         return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
 
     def close(self) -> None:
@@ -134,9 +140,7 @@ class EnvPoolEngine:
     """EnvPool's environments: C++ threads, the same dynamics, several times the speed."""
 
     def __init__(self, env_id: str, num_envs: int, threads: int, spaces: gym.Env[Any, Any]) -> None:
-        self._make = lambda seed: _envpool().make_gymnasium(
-            env_id, num_envs=num_envs, num_threads=min(threads, num_envs), seed=seed
-        )
+        self._id, self._threads = env_id, min(threads, num_envs)
         self._pool: Any = None
         self.num_envs = num_envs
         # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
@@ -152,8 +156,9 @@ class EnvPoolEngine:
             return False
         if env_id not in envpool.list_all_envs():
             return False
-        spec = envpool.make_spec(env_id)
-        theirs = (spec.gymnasium_observation_space, spec.gymnasium_action_space)
+        with _no_precision_warnings():
+            spec = envpool.make_spec(env_id)
+            theirs = (spec.gymnasium_observation_space, spec.gymnasium_action_space)
         ours = (reference.observation_space, reference.action_space)
         same = all(
             isinstance(a, type(b))
@@ -170,9 +175,18 @@ class EnvPoolEngine:
             and spec.config.max_episode_steps == limit
         )
 
+    def make_pool(self, seed: int) -> Any:
+        """A bare pool of EnvPool's."""
+        with _no_precision_warnings():
+            pool = _envpool().make_gymnasium(
+                self._id, num_envs=self.num_envs, num_threads=self._threads, seed=seed
+            )
+            _ = pool.observation_space  # made on first use, with the warning
+            return pool
+
     def reset(self, seed: int) -> Array:
         # A pool takes its seed only when made; making one takes milliseconds.
-        self._pool = self._make(seed)
+        self._pool = self.make_pool(seed)
         obs, _ = self._pool.reset()
         return np.asarray(obs)
 
@@ -187,11 +201,28 @@ class EnvPoolEngine:
             action = action.astype(np.int32)
         ids = None if ids is None else ids.astype(np.int32)
         obs, reward, terminated, truncated, info = self._pool.step(action, ids)
-        # EnvPool says `truncated` for the time limit also where the episode terminates on it.
-        return RawStep(obs, reward, terminated, truncated & ~terminated, info)
+        # An episode that terminates on the very step of its time limit arrives as truncated:
+        # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
+        return RawStep(obs, reward, terminated, truncated, info)
 
     def close(self) -> None:
         self._pool = None
+
+
+@contextmanager
+def _no_precision_warnings() -> Iterator[None]:
+    """EnvPool states bounds in float64 for float32 spaces, and Gymnasium warns of it each time."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*precision lowered.*")
+        yield
+
+
+def _info_rows(info: dict[str, Any], ids: Array) -> dict[str, Any]:
+    """Some environments' part of Gymnasium's batched info, nested dicts included."""
+    return {
+        k: _info_rows(v, ids) if isinstance(v, dict) else v[ids] if isinstance(v, np.ndarray) else v
+        for k, v in info.items()
+    }
 
 
 def _envpool() -> Any:

@@ -80,7 +80,7 @@ class SkillEnv:
 
     def _judge(self, skill: Skill, obs: Array, action: Array, raw: Any) -> Any:
         """The skill's reward and ends for one step of all environments."""
-        n, who, at = self.num_envs, f"skill {skill.name!r}", int(self._elapsed.max())
+        n, who, at = self.num_envs, f"skill {skill.name!r}", self._elapsed
         timed_out = self._never
         if skill.max_steps is not None:
             timed_out = (self._elapsed >= skill.max_steps) & ~raw.terminated

@@ -12,7 +12,7 @@ def clip_grad_norm_(grad: Tensor, max_norm: Tensor) -> Tensor:
     Returns:
         The norms before clipping, (P,).
     """
-    norm = torch.linalg.vector_norm(grad, dim=1)
+    norm: Tensor = torch.linalg.vector_norm(grad, dim=1)
     grad.mul_((max_norm / (norm + 1e-6)).clamp_max(1.0)[:, None])
     return norm
 

@@ -28,7 +28,9 @@ def gae(
     Returns:
         Advantages, (P, T, B).
     """
-    delta = reward + discount * next_value - value
+    # Not a product: what a terminal observation is worth may be anything, 0·NaN is NaN.
+    future = torch.where(discount == 0.0, 0.0, discount * next_value)
+    delta = reward + future - value
     decay = discount * gae_lambda[:, None, None] * (~last)
     advantage = torch.empty_like(delta)
     running = torch.zeros_like(delta[:, 0])

@@ -120,27 +120,30 @@ def apply_reflexes(reflexes: tuple[Reflex, ...], obs: Array, action: Array) -> A
 
 
 def checked(
-    value: Any, n: int, dtype: type, who: str, method: str, step: int | None = None
+    value: Any, n: int, dtype: type, who: str, method: str, elapsed: Array | int | None = None
 ) -> Array:
-    """``value`` as an array (n,) of ``dtype``.
+    """``value`` as an array (n,) of ``dtype``; ``elapsed`` (n,) or () says at which steps.
 
     Raises:
         SkillweaveError: it has another shape, or is a NaN or an infinity; the message names the
             skill, the method and the step.
     """
-    when = "" if step is None else f" at step {step}"
     array = np.asarray(value)
     if array.shape != (n,):
+        when = "" if elapsed is None else f" at step {np.max(elapsed)}"
         raise SkillweaveError(
             f"{who}: {method}() returned shape {array.shape}{when}, but ({n},) was expected: one "
             f"number for each of the {n} environments"
         )
     if dtype is bool:
         return array if array.dtype == bool else array.astype(bool)
+    with np.errstate(over="ignore"):  # an overflow is an infinity, reported below
+        array = array.astype(dtype, copy=False)
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array))[0])
+        when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
         raise SkillweaveError(
             f"{who}: {method}() returned {array[row]}{when} for environment {row}: "
             "rewards must be finite"
         )
-    return array.astype(dtype, copy=False)
+    return array

@@ -222,13 +222,16 @@ SETTINGS = {
         lambda d: d.selector.learning_rate_schedule == "constant"
     ),
     "flat.learning_rate=1e-4": (
-        lambda d: d.flat.learning_rate == 1e-4 and d.algorithm.learning_rate == 1e-3
+        lambda d: d.flat and d.flat.learning_rate == 1e-4 and d.algorithm.learning_rate == 1e-3
     ),
     "skills.center.steps=2e4": lambda d: d.budget(d.skill("center")) == 20_000,
     "skills.lean.gamma=0.9": (
-        lambda d: d.skill("lean").algorithm.gamma == 0.9 and d.skill("center").algorithm is None
+        lambda d: (config := d.skill("lean").algorithm)
+        and (config.gamma, d.skill("center").algorithm) == (0.9, None)
     ),
-    "skills.lean.network.layer_norm=true": lambda d: d.skill("lean").algorithm.network.layer_norm,
+    "skills.lean.network.layer_norm=true": (
+        lambda d: (config := d.skill("lean").algorithm) and config.network.layer_norm
+    ),
 }
 
 

@@ -1,0 +1,618 @@
+"""Every command: what it prints, what it writes, how it fails, and that a run runs no code."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skillweave import recipes
+from skillweave.cli import main
+
+COMMANDS = ("train", "resume", "evaluate", "render", "list", "info", "weights")
+
+# The same hierarchy twice: as plain data, and with a reflex, which only code can say.
+PLAIN = '''
+"""Two skills on CartPole."""
+from skillweave import MLP, PPO, EnvSpec, Hierarchy, Reflex, Skill
+
+class Left(Skill):
+    max_steps = 10
+    def reward(self, step):
+        return -step.next_obs[:, 0]
+
+class Balance(Skill):
+    pass
+
+small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=MLP(hidden=(8,)))
+hierarchy = Hierarchy(
+    env=EnvSpec("CartPole-v1", engine="sync"),
+    skills=[Left(), Balance()],
+    call_steps=5,
+    algorithm=small,
+    selector=small,
+    skill_steps=256,
+    selector_steps=512,
+    cut_every=128,
+)
+'''
+CODED = PLAIN.replace(
+    "    algorithm=small",
+    '    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.1, action=1, name="catch")],\n    algorithm=small',
+)
+KEYS = {"episodes", "mean", "std", "ci95", "iqm", "solved_fraction", "length_mean", "skill_usage"}
+
+
+@dataclass
+class Answer:
+    """What a command answered."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """The one JSON object that standard output must be."""
+        assert self.out.endswith("}\n")
+        assert self.out.count("\n") == 1
+        found: dict[str, Any] = json.loads(self.out)
+        return found
+
+
+Call = Callable[..., Answer]
+
+
+def run_main(*arguments: object) -> int:
+    try:
+        return main([str(a) for a in arguments])
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+
+
+@pytest.fixture
+def call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Call:
+    """Runs a command in an empty directory, in this process."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+    def call(*arguments: object) -> Answer:
+        capsys.readouterr()
+        code = run_main(*arguments)
+        out, err = capsys.readouterr()
+        return Answer(code, out, err)
+
+    return call
+
+
+def in_a_process(*arguments: object, cwd: Path) -> Answer:
+    command = [sys.executable, "-m", "skillweave", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=False)
+    return Answer(done.returncode, done.stdout, done.stderr)
+
+
+@dataclass
+class Trained:
+    """Recipes and the runs trained from them."""
+
+    plain: Path
+    coded: Path
+    plain_run: Path
+    coded_run: Path
+    flat_run: Path
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    folder = tmp_path_factory.mktemp("trained")
+    (folder / "plain.py").write_text(PLAIN)
+    (folder / "coded.py").write_text(CODED)
+    found = Trained(
+        folder / "plain.py",
+        folder / "coded.py",
+        folder / "plain-run",
+        folder / "coded-run",
+        folder / "flat-run",
+    )
+    common = ("--evaluate", 0, "--quiet")
+    assert run_main("train", found.plain, "-o", found.plain_run, *common) == 0
+    assert run_main("train", found.coded, "-o", found.coded_run, *common) == 0
+    assert run_main("train", found.coded, "-o", found.flat_run, "--flat", *common) == 0
+    return found
+
+
+def score(call: Call, *arguments: object) -> dict[str, Any]:
+    answer = call("evaluate", *arguments, "--episodes", 4, "--json")
+    assert answer.code == 0, answer.err
+    return {k: v for k, v in answer.json.items() if k != "target"}
+
+
+# Help
+
+
+def test_help_lists_every_command(call: Call) -> None:
+    answer = call("--help")
+    assert answer.code == 0
+    listed = answer.out.split("subcommands")[1]
+    assert all(f"• {name} " in listed for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_of_its_own(call: Call, command: str) -> None:
+    answer = call(command, "--help")
+    assert answer.code == 0
+    assert f"usage: skillweave {command}" in answer.out
+    assert "--json" in answer.out
+
+
+def test_no_arguments_mean_no_arguments_whatever_the_process_was_called_with(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pytest", "list"])
+    answer = call()
+    assert answer.code == 2
+    assert "recipes:" not in answer.out
+
+
+# train
+
+
+def test_train_prints_one_json_object_and_tells_progress_on_stderr(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    answer = call("train", trained.plain, "-o", tmp_path / "run", "--evaluate", 2, "--json")
+    assert answer.code == 0
+    assert answer.json["run"] == str(tmp_path / "run")
+    assert [p["name"] for p in answer.json["phases"]] == ["left", "balance", "selector"]
+    assert all(p["status"] == "done" for p in answer.json["phases"])
+    assert set(answer.json["evaluation"]) >= KEYS
+    assert "left: training for 256 steps" in answer.err
+
+
+def test_train_and_evaluate_in_a_process_of_their_own_print_one_json_object(
+    trained: Trained, tmp_path: Path
+) -> None:
+    common = ("--evaluate", 0, "--json")
+    answer = in_a_process("train", trained.coded, "-o", "run", *common, cwd=tmp_path)
+    assert answer.code == 0, answer.err
+    assert answer.json["run"] == "run"
+    assert "selector: training for 512 steps" in answer.err
+    arguments = ("evaluate", "run", "--recipe", trained.coded, "--episodes", 3, "--json")
+    answer = in_a_process(*arguments, cwd=tmp_path)
+    assert answer.code == 0, answer.err
+    assert set(answer.json) >= KEYS
+    assert answer.err == ""
+
+
+def test_train_tells_people_where_the_run_is_and_how_well_it_does(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    answer = call("train", trained.plain, "-o", tmp_path / "run", "--evaluate", 2)
+    assert answer.code == 0
+    assert answer.out.startswith("trained 1,")
+    assert "over 2 episodes" in answer.out
+    assert f"run     {tmp_path / 'run'}" in answer.out
+
+
+def test_quiet_training_says_nothing_on_stderr(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    answer = call(
+        "train", trained.plain, "-o", tmp_path / "run", "--evaluate", 0, "--quiet", "--json"
+    )
+    assert (answer.code, answer.err) == (0, "")
+
+
+def test_train_without_a_directory_takes_a_free_one_under_runs(
+    call: Call, trained: Trained
+) -> None:
+    common = ("--evaluate", 0, "--quiet", "--json", "--scale", 0.1)
+    names = [call("train", trained.plain, *common).json["run"] for _ in range(2)]
+    names.append(call("train", trained.plain, "--seed", 5, "--flat", *common).json["run"])
+    assert names == ["runs/plain-s0", "runs/plain-s0-2", "runs/plain-flat-s5"]
+    assert all((Path(name) / "run.json").exists() for name in names)
+
+
+def test_train_into_an_existing_run_refuses_and_changes_nothing(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained.plain_run, run)
+    before = {p: p.read_bytes() for p in run.rglob("*.*")}
+    answer = call("train", trained.plain, "-o", run, "--seed", 9)
+    assert answer.code == 1
+    assert answer.out == ""
+    assert f"error: {run} already holds a run" in answer.err
+    assert f"skillweave resume {run}" in answer.err
+    assert {p: p.read_bytes() for p in run.rglob("*.*")} == before
+
+
+def test_scale_and_set_change_budgets_and_settings(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    answer = call(
+        "train", trained.plain, "-o", tmp_path / "run", "--scale", 0.5, "--evaluate", 0, "--json",
+        "--set", "skills.left.steps=130", "--set", "selector.gamma=0.9", "--quiet",
+    )  # fmt: skip
+    left, balance, selector = answer.json["phases"]
+    assert (left["budget"], balance["budget"], selector["budget"]) == (65, 128, 256)
+    assert selector["algorithm"]["gamma"] == 0.9
+    assert left["algorithm"]["gamma"] == 0.99
+
+
+def test_settings_that_only_fit_together_may_be_given_in_any_order(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    # The recipe's batch_size, 32, does not fit into a rollout of 2·8 steps.
+    common = ("--evaluate", 0, "--quiet", "--json", "--scale", 0.1)
+    settings = ["selector.num_envs=2", "selector.n_steps=8", "selector.batch_size=16"]
+    for number, order in enumerate((settings, settings[::-1])):
+        flags = [part for setting in order for part in ("--set", setting)]
+        answer = call("train", trained.plain, "-o", tmp_path / f"run{number}", *flags, *common)
+        assert answer.code == 0, answer.err
+
+
+def test_the_flat_baseline_trains_on_as_many_steps_as_the_hierarchy(trained: Trained) -> None:
+    hierarchy = json.loads((trained.coded_run / "run.json").read_text())
+    flat = json.loads((trained.flat_run / "run.json").read_text())
+    (phase,) = flat["phases"]
+    assert flat["kind"] == "flat"
+    assert phase["budget"] == sum(p["budget"] for p in hierarchy["phases"]) == 256 + 256 + 512
+    assert phase["budget"] <= phase["steps"] < phase["budget"] + 64
+
+
+def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
+    call: Call, tmp_path: Path
+) -> None:
+    before = recipes.load("lunar-lander").total_steps
+    small = ("--set", "skill_steps=100", "--set", "selector_steps=100", "--scale", 0.5)
+    tiny = [f"algorithm.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
+    tiny += [f"selector.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
+    sets = [part for setting in tiny for part in ("--set", setting)]
+    for number in range(2):
+        path = tmp_path / f"run{number}"
+        answer = call(
+            "train", "lunar-lander", "-o", path, *small, *sets, "--evaluate", 0, "--json", "--quiet"
+        )
+        assert answer.code == 0, answer.err
+        assert {p["budget"] for p in answer.json["phases"]} == {50}
+    assert recipes.load("lunar-lander").total_steps == before
+
+
+# evaluate, render, weights
+
+
+def test_evaluate_tells_people_a_line_and_programs_every_number(
+    call: Call, trained: Trained
+) -> None:
+    answer = call("evaluate", trained.plain_run, "--episodes", 4)
+    assert answer.code == 0
+    assert answer.out.count("\n") == 1
+    assert "over 4 episodes" in answer.out
+    found = call("evaluate", trained.plain_run, "--episodes", 4, "--json").json
+    assert set(found) >= KEYS | {"target", "env", "seed", "deterministic", "skill"}
+    assert found["episodes"] == 4
+    assert found["env"] == "CartPole-v1"
+    assert set(found["skill_usage"]) == {"left", "balance"}
+    assert sum(found["skill_usage"].values()) == pytest.approx(1.0)
+    assert found["ci95"][0] <= found["mean"] <= found["ci95"][1]
+    assert found["mean"] == found["length_mean"]  # CartPole pays 1 a step
+    assert f"{found['mean']:.1f}" in answer.out
+
+
+def test_the_same_seed_gives_the_same_score_and_another_seed_another(
+    call: Call, trained: Trained
+) -> None:
+    run = trained.plain_run
+    one = score(call, run, "--seed", 3)
+    assert score(call, run, "--seed", 3) == one
+    assert score(call, run, "--seed", 4)["mean"] != one["mean"]
+
+
+@pytest.mark.parametrize("flag", ["--no-deterministic", "--stochastic"])
+def test_sampling_differs_from_acting_greedily_and_can_be_repeated(
+    call: Call, trained: Trained, flag: str
+) -> None:
+    greedy = score(call, trained.flat_run)
+    sampled = score(call, trained.flat_run, flag)
+    assert sampled["deterministic"] is False
+    assert sampled["mean"] != greedy["mean"]
+    assert score(call, trained.flat_run, flag) == sampled
+
+
+def test_one_skill_can_be_evaluated_alone(call: Call, trained: Trained) -> None:
+    found = score(call, trained.plain_run, "--skill", "left")
+    assert found["skill"] == "left"
+    assert found["skill_usage"] == {}
+
+
+def test_a_weights_file_scores_as_the_run_it_was_written_from(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    recipe = ("--recipe", trained.coded)
+    path = tmp_path / "w.safetensors"
+    answer = call("weights", trained.coded_run, *recipe, "-o", path, "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json == {"path": str(path), "bytes": path.stat().st_size}
+    assert score(call, path, *recipe) == score(call, trained.coded_run, *recipe)
+
+
+def test_render_writes_a_film_and_says_what_is_in_it(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    pytest.importorskip("pygame")
+    path = tmp_path / "film.gif"
+    answer = call("render", trained.plain_run, "-o", path, "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["path"] == str(path)
+    assert path.read_bytes()[:4] == b"GIF8"
+    assert answer.json["frames"] >= len(answer.json["episodes"]) == 1
+
+
+# resume, info, list
+
+
+def test_resuming_a_finished_run_scores_it_and_trains_no_more(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained.coded_run, run)
+    arguments = ("--recipe", trained.coded, "--evaluate", 2, "--json")
+    answer = call("resume", run, *arguments)
+    assert answer.code == 0, answer.err
+    assert answer.json["evaluation"]["episodes"] == 2
+    assert answer.json["phases"] == json.loads((run / "run.json").read_text())["phases"]
+
+
+def test_info_of_a_run_shows_its_phases_and_what_made_it(call: Call, trained: Trained) -> None:
+    answer = call("info", trained.coded_run)
+    assert answer.code == 0
+    assert "hierarchy on CartPole-v1, seed 0" in answer.out
+    assert f"recipe: {trained.coded}" in answer.out
+    assert all(name in answer.out for name in ("left", "balance", "selector", "torch"))
+    found = call("info", trained.coded_run, "--json").json
+    assert found == json.loads((trained.coded_run / "run.json").read_text())
+
+
+def test_info_of_a_recipe_shows_settings_that_can_be_set(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    found = call("info", trained.plain, "--json").json
+    settings = found["settings"]
+    assert settings["selector_steps"] == 512
+    assert settings["skills.left.steps"] == 256
+    assert settings["selector.network.hidden"] == [8]
+    lines = call("info", trained.plain).out.splitlines()
+    assert {line.split("=")[0] for line in lines} == set(settings)
+    flags = [part for line in lines for part in ("--set", line)]
+    common = ("--evaluate", 0, "--quiet", "--scale", 0.1)
+    answer = call("train", trained.plain, "-o", tmp_path / "run", *flags, *common)
+    assert answer.code == 0, answer.err
+
+
+def test_list_shows_recipes_and_the_runs_here_even_a_damaged_one(
+    call: Call, trained: Trained
+) -> None:
+    shutil.copytree(trained.flat_run, "runs/flat")
+    for name, text in (("bad", "{"), ("poor", '{"schema": 1, "seed": 0, "phases": [], "env": ""}')):
+        Path("runs", name).mkdir()
+        Path("runs", name, "run.json").write_text(text)
+    answer = call("list", "--json")
+    assert answer.code == 0, answer.err
+    assert [r["name"] for r in answer.json["recipes"]] == recipes.names()
+    runs = {r["path"]: r["status"] for r in answer.json["runs"]}
+    assert runs["runs/flat"] == "finished"
+    assert "damaged" in runs["runs/bad"]
+    assert "damaged" in runs["runs/poor"]
+    people = call("list").out
+    assert "lunar-lander" in people
+    assert "runs/flat" in people
+
+
+# Mistakes
+
+MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
+    "recipe": (["train", "lunar-landr"], 1, ["'lunar-landr'", "Did you mean lunar-lander?"]),
+    "recipe file": (["train", "nowhere.py"], 1, ["'nowhere.py'", "lunar-lander"]),
+    "setting": (["train", "PLAIN", "--set", "selector.gama=0.9"], 1, ["selector.gamma"]),
+    "plain setting": (["train", "PLAIN", "--set", "call_step=9"], 1, ["call_steps"]),
+    "skill's setting": (["train", "PLAIN", "--set", "skills.lef.steps=9"], 1, ["'lef'", "left"]),
+    "no value": (["train", "PLAIN", "--set", "call_steps"], 1, ["name=value"]),
+    "value's type": (["train", "PLAIN", "--set", "call_steps=few"], 1, ["call_steps=few", "int"]),
+    "value's range": (["train", "PLAIN", "--set", "selector.gamma=2"], 1, ["gamma", "0 and 1"]),
+    "call length": (["train", "PLAIN", "--set", "call_steps=0"], 1, ["call_steps", "at least 1"]),
+    "scale": (["train", "PLAIN", "--scale", "0"], 1, ["scale", "positive"]),
+    "seed": (["train", "PLAIN", "--seed", "-1"], 1, ["seed", "-1"]),
+    "seed of episodes": (["evaluate", "RUN", "--seed", "-1"], 1, ["seed", "-1"]),
+    "episodes": (["evaluate", "RUN", "--episodes", "0"], 1, ["episodes", "at least 1"]),
+    "final episodes": (["train", "PLAIN", "--evaluate", "-1"], 1, ["evaluate", "-1"]),
+    "skill": (["evaluate", "RUN", "--skill", "lift"], 1, ["'lift'", "left, balance"]),
+    "flat skill": (["evaluate", "FLAT", "--skill", "left"], 1, ["flat"]),
+    "flat weights": (["weights", "FLAT"], 1, ["flat"]),
+    "target": (["evaluate", "nothing"], 1, ["nothing is neither a run nor a weights file"]),
+    "target is a recipe": (["evaluate", "lunar-lander"], 1, ["--pretrained"]),
+    "no run": (["info", "."], 1, ["holds no run"]),
+    "resume nothing": (["resume", "nothing"], 1, ["holds no run"]),
+    "command": (["trian", "lunar-lander"], 2, ["trian", "train"]),
+    "option": (["train", "PLAIN", "--sed", "3"], 2, ["--sed", "--seed"]),
+    "option's type": (["train", "PLAIN", "--seed", "three"], 2, ["--seed", "three"]),
+    "tracker": (["train", "PLAIN", "--track", "wandbee"], 2, ["wandbee", "wandb"]),
+    "nothing to train": (["train"], 2, ["Missing", "A shipped recipe"]),
+}
+
+
+@pytest.mark.parametrize(("arguments", "code", "said"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_is_explained_on_stderr_and_writes_nothing(
+    call: Call, trained: Trained, arguments: list[str], code: int, said: list[str]
+) -> None:
+    names = {"PLAIN": trained.plain, "RUN": trained.plain_run, "FLAT": trained.flat_run}
+    answer = call(*[names.get(a, a) for a in arguments])
+    assert answer.code == code
+    assert answer.out == ""
+    assert all(part in answer.err for part in said), answer.err
+    assert list(Path().iterdir()) == []
+
+
+def test_an_environment_that_does_not_exist_is_answered_with_close_matches(
+    call: Call, tmp_path: Path
+) -> None:
+    recipe = tmp_path / "typo.py"
+    recipe.write_text(PLAIN.replace("CartPole-v1", "CartPool-v1"))
+    answer = call("train", recipe, "-o", "run")
+    assert answer.code == 1
+    assert "CartPool" in answer.err
+    assert "CartPole-v1" in answer.err
+    assert not Path("run").exists()
+
+
+def test_a_file_without_a_hierarchy_says_so(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "empty.py").write_text("x = 1\n")
+    answer = call("train", tmp_path / "empty.py")
+    assert answer.code == 1
+    assert "defines no Hierarchy" in answer.err
+
+
+def test_a_failed_command_with_json_prints_one_json_object_too(call: Call) -> None:
+    answer = call("train", "lunar-landr", "--json")
+    assert answer.code == 1
+    assert set(answer.json) == {"error"}
+    assert "lunar-lander" in answer.json["error"]
+
+
+def test_exit_codes_reach_the_shell(tmp_path: Path) -> None:
+    assert in_a_process("info", "nothing", cwd=tmp_path).code == 1
+    assert in_a_process("infos", cwd=tmp_path).code == 2
+
+
+# A run never runs code
+
+
+def test_a_run_of_a_users_file_is_not_loaded_without_pointing_to_the_file(
+    call: Call, trained: Trained
+) -> None:
+    for command in ("evaluate", "render", "resume", "weights"):
+        answer = call(command, trained.coded_run)
+        assert answer.code == 1
+        assert "--recipe FILE.py" in answer.err
+        assert str(trained.coded) in answer.err
+    assert score(call, trained.coded_run, "--recipe", trained.coded)["episodes"] == 4
+
+
+def test_a_run_that_needs_no_recipe_is_evaluated_without_one(
+    call: Call, trained: Trained
+) -> None:
+    assert score(call, trained.flat_run)["skill_usage"] == {}
+    without = score(call, trained.plain_run)
+    assert without == score(call, trained.plain_run, "--recipe", trained.plain)
+
+
+def test_a_flat_run_needs_nothing_of_the_skills_that_it_was_not_trained_with(
+    call: Call, tmp_path: Path
+) -> None:
+    # Its skills stop by themselves, which only their code knows; the flat agent has no skills.
+    recipe = tmp_path / "stops.py"
+    text = PLAIN.replace("call_steps=5", "call_steps=None")
+    stops = "    def termination(self, step):\n        return step.reward > 2\n"
+    recipe.write_text(text.replace("    pass\n", stops))
+    common = ("--flat", "--evaluate", 0, "--quiet")
+    assert call("train", recipe, "-o", tmp_path / "run", *common).code == 0
+    assert score(call, tmp_path / "run")["episodes"] == 4
+
+
+def test_a_run_of_other_skills_is_not_loaded_into_a_hierarchy(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    (tmp_path / "other.py").write_text(PLAIN.replace("class Balance", "class Stand"))
+    other = PLAIN.replace("Left(), Balance()", "Left(), Stand()").replace("Balance", "Stand")
+    (tmp_path / "other.py").write_text(other)
+    answer = call("evaluate", trained.plain_run, "--recipe", tmp_path / "other.py")
+    assert answer.code == 1
+    assert "left, balance" in answer.err
+    assert "left, stand" in answer.err
+
+
+TRAP = "from pathlib import Path\nPath({marker!r}).write_text('executed')\n"
+
+
+def trap(run: Path, source: Path, recipe: str, **fields: Any) -> Path:
+    """A copy of a run with code inside that its manifest names; returns the code's marker."""
+    shutil.copytree(source, run)
+    marker = run.parent / "executed"
+    for place in (run / "trap.py", run / "policies" / "trap.py", run / "__init__.py"):
+        place.write_text(TRAP.format(marker=str(marker)) + PLAIN)
+    data = json.loads((run / "run.json").read_text())
+    data |= {"recipe": recipe, **fields}
+    (run / "run.json").write_text(json.dumps(data))
+    return marker
+
+
+@pytest.mark.parametrize("recipe", ["RUN/trap.py", "trap.py", "trap", "./trap.py"])
+@pytest.mark.parametrize("command", ["evaluate", "render", "resume", "weights", "info"])
+def test_code_inside_a_run_is_never_executed(
+    call: Call,
+    trained: Trained,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    recipe: str,
+    command: str,
+) -> None:
+    run = tmp_path / "run"
+    marker = trap(
+        run, trained.coded_run, recipe.replace("RUN", str(run)), needs_recipe=True
+    )
+    monkeypatch.chdir(run)
+    monkeypatch.syspath_prepend(run)
+    answer = call(command, run)
+    assert answer.code == (0 if command == "info" else 1)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("kind", ["hierarchy", "flat"])
+@pytest.mark.parametrize("command", ["evaluate", "render", "resume"])
+def test_an_environment_named_by_a_run_never_imports_code(
+    call: Call,
+    trained: Trained,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    command: str,
+) -> None:
+    run = tmp_path / "run"
+    source = trained.flat_run if kind == "flat" else trained.plain_run
+    marker = trap(run, source, "trap.py", env="trap:CartPole-v1", needs_recipe=False)
+    monkeypatch.chdir(run)
+    monkeypatch.syspath_prepend(run)
+    assert call(command, run).code == 1
+    assert not marker.exists()
+
+
+def test_the_trap_would_spring(tmp_path: Path, trained: Trained) -> None:
+    marker = trap(tmp_path / "run", trained.coded_run, "trap.py")
+    recipes.load(str(tmp_path / "run" / "trap.py"))
+    assert marker.exists()
+
+
+def test_a_weights_file_that_names_code_is_refused(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    from skillweave.runs.files import read_tensors, write_tensors
+
+    path = tmp_path / "w.safetensors"
+    assert call("weights", trained.coded_run, "--recipe", trained.coded, "-o", path).code == 0
+    tensors, header = read_tensors(path)
+    marker = tmp_path / "executed"
+    (tmp_path / "trap.py").write_text(TRAP.format(marker=str(marker)) + PLAIN)
+    write_tensors(path, tensors, header | {"recipe": str(tmp_path / "trap.py")})
+    answer = call("evaluate", path)
+    assert answer.code == 1
+    assert "--recipe" in answer.err
+    assert not marker.exists()

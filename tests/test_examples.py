@@ -1,0 +1,101 @@
+"""Every example runs, and their number is known."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+COUNT = 1
+"""Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
+SMALL = {"sb3_selector.py": ("--steps", "3000", "--episodes", "2")}
+"""Small budgets, for those that take long."""
+NEEDS = {"sb3_selector.py": "stable_baselines3"}
+SAYS = {"sb3_selector.py": "woven by the selector: "}
+
+
+def run(path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        [sys.executable, str(path), *arguments],
+        capture_output=True, text=True, env=env, timeout=120, check=False,
+    )  # fmt: skip
+
+
+def test_there_are_as_many_examples_as_are_known():
+    assert len(EXAMPLES) == COUNT
+    assert {p.name for p in EXAMPLES} == set(SAYS)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.name)
+def test_an_example_runs_to_its_end(path, tmp_path):
+    if path.name in NEEDS:
+        pytest.importorskip(NEEDS[path.name])
+    done = run(path, *SMALL.get(path.name, ()))
+    assert done.returncode == 0, done.stderr
+    assert SAYS[path.name] in done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def adapter():
+    pytest.importorskip("stable_baselines3")
+    import importlib.util
+
+    path = ROOT / "examples" / "sb3_selector.py"
+    spec = importlib.util.spec_from_file_location("sb3_selector_example", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_stable_baselines3_is_told_final_observations_and_time_limits():
+    import numpy as np
+
+    from skillweave import EnvSpec, OptionsEnv
+    from skillweave.envs.make import make_engine
+    from skillweave.hierarchy.calls import SkillSet
+
+    module = adapter()
+    skills = (module.DriftLeft(), module.DriftRight())
+    policies = tuple(s.policy for s in skills)
+    spec = EnvSpec("CartPole-v1", kwargs={"max_episode_steps": 47}, engine="sync")
+
+    def make() -> OptionsEnv:
+        return OptionsEnv(make_engine(spec, 6), SkillSet(skills, policies, call_steps=10), 0.99)
+
+    theirs, ours = module.SB3VecEnv(make(), seed=3), make()
+    assert (theirs.num_envs, theirs.action_space.n) == (6, 2)
+    obs, _ = ours.reset(seed=3)
+    np.testing.assert_array_equal(theirs.reset(), obs)
+    limits = falls = 0
+    for t in range(60):
+        # half of them drift off the track or fall over, the others change about
+        action = np.where(np.arange(6) < 3, 0, t % 2)
+        obs, reward, done, infos = theirs.step(action)
+        want, pay, terminated, truncated, info = ours.step(action)
+        np.testing.assert_array_equal(obs, want)
+        np.testing.assert_array_equal(reward, pay)
+        np.testing.assert_array_equal(done, terminated | truncated)
+        for i in range(6):
+            assert infos[i]["steps"] == info["steps"][i]
+            assert ("terminal_observation" in infos[i]) == done[i]
+            if done[i]:
+                final = infos[i]["terminal_observation"]
+                np.testing.assert_array_equal(final, info["next_obs"][i])
+                assert np.abs(final - obs[i]).max() > 0
+                assert infos[i]["TimeLimit.truncated"] == (truncated[i] and not terminated[i])
+        limits += int((truncated & ~terminated).sum())
+        falls += int(terminated.sum())
+    theirs.close()
+    ours.close()
+    assert limits > 5
+
+
+def test_stable_baselines3s_own_checker_of_budgets_stops_at_environment_steps():
+    module = adapter()
+    budget = module.StepBudget(25)
+    budget.locals = {"infos": [{"steps": 10}, {"steps": 2}]}
+    assert [budget._on_step(), budget._on_step(), budget._on_step()] == [True, True, False]

@@ -1,0 +1,329 @@
+"""The rooms' import order, sizes, docstrings and public names, read from the source alone.
+
+Only the last tests import the library: those on what its public names are.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1] / "skillweave"
+MODULES = sorted(ROOT.rglob("*.py"))
+LONGEST_FILE, LONGEST_FUNCTION = 300, 60
+
+# The table of docs/architecture.md: what a room may import. `seeding` is open to all.
+BASE = {"types"}
+LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
+EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "recipes", "api"}
+ROOMS: dict[str, set[str]] = {
+    "seeding": set(),
+    "types": set(),
+    "ops": BASE,
+    "spaces": BASE,
+    "skills": BASE | {"spaces"},
+    "networks": BASE | {"ops", "spaces"},
+    "envs": BASE | {"spaces", "skills"},
+    "buffers": BASE | {"ops", "spaces"},
+    "algorithms": BASE | {"ops", "spaces", "networks"},
+    "runs": BASE | {"spaces", "networks", "algorithms", "skills"},
+    "training": LEARNING,
+    "hierarchy": LEARNING | {"training"},
+    "evolution": LEARNING | {"training"},
+    "reporting": BASE | {"skills", "envs", "runs", "hierarchy"},
+    "recipes": {"skillweave", "api"},
+    "api": EVERYTHING,
+    "cli": EVERYTHING | {"skillweave"},
+    "compat": EVERYTHING | {"skillweave"},
+    "skillweave": EVERYTHING,  # the package itself: lazy exports
+    "__main__": {"cli"},
+}
+# Modules that are stricter than their room: settings, which help and errors read, need no torch.
+LEAVES: dict[str, set[str]] = {
+    "networks.config": set(),
+    "algorithms.config": {"types", "networks.config"},
+}
+
+
+def module_of(path: Path) -> str:
+    """``algorithms.ppo`` for skillweave/algorithms/ppo.py; ``skillweave`` for the package."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = parts[:-1] if parts[-1] == "__init__" else parts
+    return ".".join(parts) or "skillweave"
+
+
+def room_of(module: str) -> str:
+    """The room that a module stands in."""
+    return module.split(".")[0]
+
+
+NAMES = {module_of(p) for p in MODULES}
+
+
+def imported(source: str, module: str, package: bool) -> Iterator[tuple[int, str]]:
+    """Line and name of every module of the library that a source imports, wherever it does.
+
+    Imports within functions and under TYPE_CHECKING count, and so do relative ones and
+    ``import_module`` of a plain string.
+    """
+    here = ["skillweave", *(module.split(".") if module != "skillweave" else [])]
+    for node in ast.walk(ast.parse(source)):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [a.name for a in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                stem = here[: len(here) - node.level + package]
+                base = ".".join([*stem, *([node.module] if node.module else [])])
+            deeper = [f"{base}.{a.name}" for a in node.names]
+            # `from skillweave import recipes` imports a room, `… import PPO` the public names.
+            names = [d if d.removeprefix("skillweave.") in NAMES else base for d in deeper]
+        elif isinstance(node, ast.Call) and "import_module" in ast.dump(node.func):
+            names = [a.value for a in node.args if isinstance(a, ast.Constant)]
+        for name in names:
+            if name == "skillweave" or name.startswith("skillweave."):
+                yield node.lineno, name.removeprefix("skillweave.")
+
+
+def violations(source: str, module: str, package: bool = False) -> list[str]:
+    """The imports of a module that its room's row does not name."""
+    room = room_of(module)
+    found = []
+    for line, name in imported(source, module, package):
+        if module in LEAVES:
+            allowed = name == "seeding" or name in LEAVES[module]
+        else:
+            allowed = room_of(name) in ROOMS[room] | {room, "seeding"} - (
+                {"skillweave"} if room == "skillweave" else set()
+            )
+        if not allowed:
+            found.append(f"{module}, line {line}: imports {name}")
+    return found
+
+
+# The search itself
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("envs.make", "from skillweave.training.phase import Phase"),
+        ("envs.make", "import skillweave.runs.files as files"),
+        ("envs.make", "def f():\n    from skillweave.algorithms.ppo import State"),
+        ("envs.make", "if TYPE_CHECKING:\n    from skillweave.api import Run"),
+        ("envs.make", "from ..hierarchy import calls"),
+        ("envs.make", "from skillweave import PPO"),
+        ("envs.make", "from skillweave import recipes"),
+        ("envs.make", "importlib.import_module('skillweave.runs')"),
+        ("evolution.tournament", "from skillweave.hierarchy.calls import SkillSet"),
+        ("hierarchy.calls", "from skillweave.evolution import tournament"),
+        ("algorithms.config", "from skillweave.networks.stacked import mlp"),
+        ("networks.config", "from skillweave.types import Step"),
+        ("seeding", "from skillweave.types import Step"),
+        ("reporting.plots", "from skillweave.compat import x"),
+        ("recipes.x", "from skillweave.hierarchy.calls import SkillSet"),
+    ],
+)
+def test_the_search_finds_an_import_against_the_order(module: str, source: str) -> None:
+    assert len(violations(source, module)) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("envs.make", "from skillweave.skills import Skill"),
+        ("envs.make", "from .engine import Engine"),
+        ("envs.make", "import numpy, gymnasium"),
+        ("algorithms.config", "from skillweave.networks.config import MLP"),
+        ("recipes.x", "from skillweave import PPO, Hierarchy"),
+        ("cli.actions", "from skillweave import recipes"),
+        ("ops.returns", "from skillweave.seeding import Seeds"),
+    ],
+)
+def test_the_search_lets_pass_what_the_order_allows(module: str, source: str) -> None:
+    assert violations(source, module) == []
+
+
+# The order
+
+
+def test_every_room_has_a_row() -> None:
+    assert {room_of(module_of(p)) for p in MODULES} <= set(ROOMS)
+    assert len(MODULES) > 30
+
+
+def test_rows_name_only_rooms_and_nobody_may_import_compat() -> None:
+    named = set().union(*ROOMS.values())
+    assert named <= set(ROOMS)
+    assert not named & {"compat", "__main__"}
+    assert [room for room, row in ROOMS.items() if "cli" in row] == ["__main__"]
+
+
+def test_the_order_has_no_circle_below_the_facade() -> None:
+    rooms = {k: v for k, v in ROOMS.items() if k not in {"recipes", "api", "skillweave"}}
+    done: set[str] = set()
+    while rooms:
+        ready = [k for k, v in rooms.items() if not v & set(rooms)]
+        assert ready, f"these import one another: {sorted(rooms)}"
+        done |= set(ready)
+        rooms = {k: v for k, v in rooms.items() if k not in done}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_of)
+def test_a_module_imports_only_what_its_row_names(path: Path) -> None:
+    found = violations(path.read_text(), module_of(path), path.name == "__init__.py")
+    assert found == []
+
+
+def test_settings_and_commands_need_neither_torch_nor_a_heavy_room() -> None:
+    modules = [*(f"skillweave.{name}" for name in LEAVES), "skillweave", "skillweave.seeding"]
+    modules += ["skillweave.types", "skillweave.cli.commands"]
+    code = "import importlib, sys\n"
+    code += "".join(f"importlib.import_module({name!r})\n" for name in modules)
+    code += "print(sorted({'torch', 'skillweave.api', 'skillweave.training'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# Sizes and docstrings
+
+
+def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_of)
+def test_a_file_is_at_most_300_lines(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= LONGEST_FILE
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_of)
+def test_a_function_is_at_most_60_lines(path: Path) -> None:
+    sizes = {
+        f"{f.name}, line {f.lineno}": (f.end_lineno or 0) - f.lineno + 1
+        for f in functions(ast.parse(path.read_text()))
+    }
+    assert {k: v for k, v in sizes.items() if v > LONGEST_FUNCTION} == {}
+
+
+def undocumented(source: str) -> list[str]:
+    """Public modules, classes, functions and methods without a docstring.
+
+    What lies within a function or a private class is not public; of magic methods the class
+    speaks.
+    """
+
+    def within(node: ast.Module | ast.ClassDef, prefix: str) -> Iterator[str]:
+        for child in node.body:
+            if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                continue
+            if child.name.startswith("_"):
+                continue
+            if ast.get_docstring(child) is None:
+                yield f"{prefix}{child.name}, line {child.lineno}"
+            if isinstance(child, ast.ClassDef):
+                yield from within(child, f"{prefix}{child.name}.")
+
+    tree = ast.parse(source)
+    found = [] if ast.get_docstring(tree) or not tree.body else ["the module"]
+    return [*found, *within(tree, "")]
+
+
+def test_the_search_for_docstrings_finds_what_has_none() -> None:
+    source = '"""Doc."""\nclass A:\n    """Doc."""\n    def f(self): ...\n    def _g(self): ...\n'
+    assert undocumented(source + "def h(): ...\n") == ["A.f, line 4", "h, line 6"]
+    assert undocumented("x = 1\n") == ["the module"]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_of)
+def test_everything_public_has_a_docstring(path: Path) -> None:
+    assert undocumented(path.read_text()) == []
+
+
+def fields_without_a_string(source: str) -> list[str]:
+    """Fields of dataclasses that no string follows."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.ClassDef):
+            continue
+        if not any("dataclass" in ast.dump(d) for d in node.decorator_list):
+            continue
+        for statement, after in zip(node.body, [*node.body[1:], None], strict=True):
+            if not isinstance(statement, ast.AnnAssign):
+                continue
+            said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            if not said or not isinstance(after.value.value, str) or not after.value.value.strip():
+                found.append(f"{node.name}.{ast.unparse(statement.target)}")
+    return found
+
+
+def test_the_search_for_field_strings_finds_what_has_none() -> None:
+    source = '@dataclass(frozen=True)\nclass A:\n    """Doc."""\n    x: int = 1\n    """X."""\n'
+    assert fields_without_a_string(source) == []
+    assert fields_without_a_string(source + "    y: int = 2\n") == ["A.y"]
+
+
+@pytest.mark.parametrize(
+    "name", ["algorithms/config.py", "networks/config.py", "cli/commands.py", "hierarchy/declaration.py"]
+)
+def test_every_field_of_the_settings_is_followed_by_a_string(name: str) -> None:
+    source = (ROOT / name).read_text()
+    assert "@dataclass" in source
+    assert fields_without_a_string(source) == []
+
+
+# Public names
+
+
+def test_the_public_names_are_those_of_the_lazy_table_and_of_the_type_checker() -> None:
+    import skillweave
+
+    assert set(skillweave.__all__) == set(skillweave._HOME)
+    assert len(skillweave.__all__) == len(set(skillweave.__all__))
+    tree = ast.parse((ROOT / "__init__.py").read_text())
+    (checked,) = (n for n in tree.body if isinstance(n, ast.If))
+    seen = {
+        alias.name: (statement.module or "").removeprefix("skillweave.")
+        for statement in checked.body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+    }
+    assert seen.pop("Any", None) is None
+    assert seen == skillweave._HOME
+
+
+def test_every_public_name_resolves_and_no_other_does() -> None:
+    import skillweave
+
+    for name in skillweave.__all__:
+        found = getattr(skillweave, name)
+        assert getattr(found, "__name__", name) == name
+        assert found.__doc__
+    with pytest.raises(AttributeError, match="no attribute 'PPPO'"):
+        _ = skillweave.PPPO
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_of)
+def test_a_module_with_a_list_of_names_has_them(path: Path) -> None:
+    tree = ast.parse(path.read_text())
+    names: list[str] = []
+    bound: set[str] = set()
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            names = ast.literal_eval(node.value)
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            bound |= {a.asname or a.name for a in node.names}
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            bound.add(node.name)
+        elif isinstance(node, ast.Assign):
+            bound |= {ast.unparse(t) for t in node.targets}
+    if module_of(path) != "skillweave":
+        assert set(names) <= bound
