@@ -174,7 +174,9 @@ def differences(run: Path, whole: Path) -> list[str]:
             found.append(f"{name}: only in {mine.parent if mine.exists() else theirs.parent}")
         elif mine.read_bytes() != theirs.read_bytes():
             same = weights(mine) == weights(theirs)
-            found.append(f"{name}: {'the same weights in other bytes' if same else 'other weights'}")
+            found.append(
+                f"{name}: {'the same weights in other bytes' if same else 'other weights'}"
+            )
     mine_keys, their_keys = ([(r["phase"], r["update"]) for r in records(p)] for p in (run, whole))
     if len(set(mine_keys)) != len(mine_keys):
         found.append("metrics.jsonl: a line stands twice")

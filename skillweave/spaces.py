@@ -115,7 +115,7 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
     """A supported space as plain JSON; infinities become strings."""
     if isinstance(space, gym.spaces.Box):
-        low, high = ([_number(x) for x in b.reshape(-1)] for b in (space.low, space.high))
+        low, high = ([_number(x) for x in b.reshape(-1).tolist()] for b in (space.low, space.high))
         return {
             "type": "Box",
             "shape": space.shape,
@@ -147,7 +147,8 @@ def space_from_json(data: dict[str, Any]) -> gym.Space[Any]:
             case "Box":
                 shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
                 bounds = (
-                    np.array(data[k], float).reshape(shape).astype(dtype) for k in ("low", "high")
+                    np.array([dtype.type(x) for x in data[k]], dtype).reshape(shape)
+                    for k in ("low", "high")
                 )
                 box: gym.Space[Any] = gym.spaces.Box(next(bounds), next(bounds), shape, dtype)
                 return box
@@ -172,5 +173,5 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
     return not isinstance(a, kinds) or space_to_json(a) == space_to_json(b)
 
 
-def _number(x: Any) -> float | str:
-    return float(x) if np.isfinite(x) else str(float(x))
+def _number(x: float) -> float | str:
+    return x if np.isfinite(x) else str(x)

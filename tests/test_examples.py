@@ -70,7 +70,7 @@ def test_stable_baselines3_is_told_final_observations_and_time_limits():
     assert (theirs.num_envs, theirs.action_space.n) == (6, 2)
     obs, _ = ours.reset(seed=3)
     np.testing.assert_array_equal(theirs.reset(), obs)
-    limits = falls = 0
+    limits = 0
     for t in range(60):
         # half of them drift off the track or fall over, the others change about
         action = np.where(np.arange(6) < 3, 0, t % 2)
@@ -88,7 +88,6 @@ def test_stable_baselines3_is_told_final_observations_and_time_limits():
                 assert np.abs(final - obs[i]).max() > 0
                 assert infos[i]["TimeLimit.truncated"] == (truncated[i] and not terminated[i])
         limits += int((truncated & ~terminated).sum())
-        falls += int(terminated.sum())
     theirs.close()
     ours.close()
     assert limits > 5

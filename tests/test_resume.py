@@ -388,6 +388,40 @@ def test_a_run_stopped_by_ctrl_c_ends_as_if_it_had_not_been(
     assert_same(run, tmp_path / "whole")
 
 
+FULL = """
+mount -t tmpfs -o size=40k tmpfs "$1" || exit 77
+"$3" -m skillweave train "$2" -o "$1/run" --seed 3 --evaluate 0 --quiet
+echo "code $?"
+cp -r "$1/run" "$4/stopped"
+mount -o remount,size=4m "$1" || exit 77
+"$3" -m skillweave resume "$1/run" --recipe "$2" --evaluate 0 --quiet
+echo "code $?"
+cp -r "$1/run" "$4/finished"
+"""
+
+
+def test_a_run_stopped_by_a_full_disk_goes_on_when_there_is_room_again(
+    tmp_path: Path, reference: Reference
+) -> None:
+    if shutil.which("unshare") is None:
+        pytest.skip("no small file system can be mounted here")
+    recipe, whole = reference("sync")
+    (tmp_path / "disk").mkdir()
+    command = ["unshare", "-rm", "sh", "-c", FULL, "sh", str(tmp_path / "disk"), str(recipe)]
+    done = subprocess.run(
+        [*command, sys.executable, str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    if done.returncode == 77 or "unshare:" in done.stderr:
+        pytest.skip("no small file system can be mounted here")
+    codes = [line for line in done.stdout.splitlines() if line.startswith("code ")]
+    assert codes == ["code 1", "code 0"], done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    assert "could not write" in done.stderr
+    assert "No space left on device" in done.stderr
+    assert not RunDirectory.open(tmp_path / "stopped").finished
+    assert_same(tmp_path / "finished", whole)
+
+
 def test_three_kills_at_random_moments_change_no_weight(tmp_path: Path) -> None:
     recipe = write_recipe(tmp_path)
     command = [sys.executable, str(SCRIPT), str(recipe), "--kills", "3", "--seed", "11"]

@@ -63,7 +63,7 @@ class EnvSpec:
             if "box2d" in str(error).lower():
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error
             raise SkillweaveError(f"the environment {env_id} needs more: {error}") from error
-        except (gym.error.UnregisteredEnv, gym.error.Error) as error:
+        except (gym.error.Error, ImportError) as error:
             near = difflib.get_close_matches(env_id, list(gym.registry), n=4, cutoff=0.6)
             hint = f" Close matches: {', '.join(near)}." if near else ""
             raise SkillweaveError(f"no environment {env_id!r}: {error}.{hint}") from error

@@ -138,7 +138,9 @@ class SkillSet:
 
 def _rows(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
     """Some rows of a step, with the time as the running skill counts it."""
-    timed_out = np.zeros(len(rows), bool) if max_steps is None else elapsed >= max_steps
+    timed_out = np.zeros(len(rows), bool)
+    if max_steps is not None:
+        timed_out = (elapsed >= max_steps) & ~step.terminated[rows]
     info = {
         k: v[rows] if isinstance(v, np.ndarray) and len(v) == len(step.reward) else v
         for k, v in step.info.items()

@@ -53,7 +53,43 @@ class Declaration:
     """Environment steps between checkpoints."""
 
     def __post_init__(self) -> None:
-        self.skills, self.reflexes = tuple(self.skills), tuple(self.reflexes)
+        self._check_env()
+        self._check_skills()
+        self.reflexes = tuple(self.reflexes)
+        for reflex in self.reflexes:
+            if not isinstance(reflex, Reflex):
+                raise SkillweaveError(
+                    f"reflexes holds {reflex!r}, which is not a Reflex: Reflex(condition, action)"
+                )
+        for name in ("algorithm", "selector", "flat"):
+            _check_algorithm(getattr(self, name), f"{name}", optional=name == "flat")
+        for name in ("skill_steps", "selector_steps", "cut_every", "call_steps"):
+            value = getattr(self, name)
+            none = name == "call_steps"
+            if (value is None and none) or (type(value) is int and value >= 1):
+                continue
+            what = "at least 1, or None" if none else "a whole number, at least 1"
+            raise SkillweaveError(f"{name} is {value!r}; it must be {what}")
+        if self.call_steps is None:
+            for skill in self.skills:
+                if skill.max_steps is None and not skill.defines("termination"):
+                    raise SkillweaveError(
+                        f"call_steps is None, but skill {skill.name!r} never stops by itself: give "
+                        "it max_steps or termination()"
+                    )
+
+    def _check_env(self) -> None:
+        made = isinstance(self.env, gym.Env)
+        if made or not (isinstance(self.env, str | EnvSpec) or callable(self.env)):
+            raise SkillweaveError(
+                f"env is {self.env!r}; it must be a Gymnasium id, a function that makes an "
+                "environment, or an EnvSpec (environments are made many times over)"
+            )
+
+    def _check_skills(self) -> None:
+        if isinstance(self.skills, Skill | type):
+            raise SkillweaveError("skills must be a list of skills: skills=[Center(), ...]")
+        self.skills = tuple(self.skills)
         if not self.skills:
             raise SkillweaveError("a hierarchy needs at least one skill: skills is empty")
         for skill in self.skills:
@@ -61,6 +97,12 @@ class Declaration:
                 hint = " (write Center(), not Center)" if isinstance(skill, type) else ""
                 raise SkillweaveError(f"skills holds {skill!r}, which is not a Skill{hint}")
             skill.validate()
+            _check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
+            if isinstance(skill.policy, type):
+                raise SkillweaveError(
+                    f"skill {skill.name!r}: policy is the class {skill.policy.__name__}, "
+                    "not a policy"
+                )
         names = [s.name for s in self.skills]
         for name in names:
             if names.count(name) > 1:
@@ -69,22 +111,6 @@ class Declaration:
                 )
             if name in RESERVED:
                 raise SkillweaveError(f"a skill cannot be named {name!r}, which names a phase")
-        if self.call_steps is not None and (
-            not isinstance(self.call_steps, int) or self.call_steps < 1
-        ):
-            raise SkillweaveError(
-                f"call_steps is {self.call_steps!r}; it must be at least 1, or None"
-            )
-        if self.call_steps is None:
-            for skill in self.skills:
-                if skill.max_steps is None and not skill.defines("termination"):
-                    raise SkillweaveError(
-                        f"call_steps is None, but skill {skill.name!r} never stops by itself: give "
-                        "it max_steps or termination()"
-                    )
-        for field_name in ("skill_steps", "selector_steps", "cut_every"):
-            if getattr(self, field_name) < 1:
-                raise SkillweaveError(f"{field_name} is {getattr(self, field_name)}; at least 1")
 
     @property
     def spec(self) -> EnvSpec:
@@ -154,3 +180,10 @@ class Declaration:
                         )
         finally:
             env.close()
+
+
+def _check_algorithm(value: object, where: str, *, optional: bool) -> None:
+    if (value is None and optional) or isinstance(value, AlgorithmConfig):
+        return
+    hint = f" (write {value.__name__}(), not {value.__name__})" if isinstance(value, type) else ""
+    raise SkillweaveError(f"{where} is {value!r}, which is no algorithm's settings{hint}")

@@ -127,10 +127,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         return info if self._mask is None else info | {"action_mask": self._mask}
 
     def _check(self, skill: Array) -> None:
-        if skill.min() < 0 or skill.max() >= len(self.skills.skills):
-            raise SkillweaveError(
-                f"action {int(skill.max())} is no skill: there are {len(self.skills.skills)}"
-            )
+        count = len(self.skills.skills)
+        wrong = skill[(skill < 0) | (skill >= count)]
+        if len(wrong):
+            raise SkillweaveError(f"action {int(wrong[0])} is no skill: there are {count}")
         if self._mask is not None and not self._mask[np.arange(self.num_envs), skill].all():
             row = int(np.flatnonzero(~self._mask[np.arange(self.num_envs), skill])[0])
             name = self.skills.skills[int(skill[row])].name

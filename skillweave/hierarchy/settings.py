@@ -78,6 +78,8 @@ def _replaced(config: T, path: list[str], name: str, text: str) -> T:
     hint = typing.get_type_hints(type(config))[field]
     if deeper:
         inner = getattr(config, field)
+        if inner is None and field == "critic":
+            inner = getattr(config, "network", None)  # what it stands for
         if not is_dataclass(inner):
             raise SkillweaveError(f"--set {name}: {field} has no parts")
         return replace(config, **{field: _replaced(inner, deeper, name, text)})  # type: ignore[type-var]
@@ -109,6 +111,8 @@ def _parse(name: str, text: str, hint: Any) -> Any:
         if origin is typing.Literal and value in typing.get_args(option):
             return value
     wanted = getattr(hint, "__name__", str(hint).replace("typing.", ""))
+    if typing.get_origin(hint) is typing.Literal:
+        wanted = "one of " + ", ".join(map(str, typing.get_args(hint)))
     raise SkillweaveError(f"--set {name}={text}: expected {wanted}")
 
 

@@ -108,8 +108,9 @@ def evaluate(
     Raises:
         SkillweaveError: the policy was made for other spaces.
     """
-    if episodes < 1:
-        raise SkillweaveError(f"episodes is {episodes}; it must be at least 1")
+    for name, value in (("episodes", episodes), ("num_envs", num_envs)):
+        if value < 1:
+            raise SkillweaveError(f"{name} is {value}; it must be at least 1")
     n = min(num_envs, episodes)
     engine = make_engine(replaced(env, engine="sync"), n)
     try:

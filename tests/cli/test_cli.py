@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,10 +43,8 @@ hierarchy = Hierarchy(
     cut_every=128,
 )
 '''
-CODED = PLAIN.replace(
-    "    algorithm=small",
-    '    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.1, action=1, name="catch")],\n    algorithm=small',
-)
+CATCH = '    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.1, action=1, name="catch")],\n'
+CODED = PLAIN.replace("    algorithm=small", CATCH + "    algorithm=small")
 KEYS = {"episodes", "mean", "std", "ci95", "iqm", "solved_fraction", "length_mean", "skill_usage"}
 
 
@@ -270,6 +268,18 @@ def test_the_flat_baseline_trains_on_as_many_steps_as_the_hierarchy(trained: Tra
     assert phase["budget"] <= phase["steps"] < phase["budget"] + 64
 
 
+@pytest.fixture
+def unshared_recipe() -> Iterator[None]:
+    """Whatever a test does to the shipped recipe is not seen by other tests."""
+    name = "skillweave.recipes.lunar_lander"
+    before = sys.modules.pop(name, None)
+    yield
+    sys.modules.pop(name, None)
+    if before is not None:
+        sys.modules[name] = before
+
+
+@pytest.mark.usefixtures("unshared_recipe")
 def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
     call: Call, tmp_path: Path
 ) -> None:
@@ -507,9 +517,7 @@ def test_a_run_of_a_users_file_is_not_loaded_without_pointing_to_the_file(
     assert score(call, trained.coded_run, "--recipe", trained.coded)["episodes"] == 4
 
 
-def test_a_run_that_needs_no_recipe_is_evaluated_without_one(
-    call: Call, trained: Trained
-) -> None:
+def test_a_run_that_needs_no_recipe_is_evaluated_without_one(call: Call, trained: Trained) -> None:
     assert score(call, trained.flat_run)["skill_usage"] == {}
     without = score(call, trained.plain_run)
     assert without == score(call, trained.plain_run, "--recipe", trained.plain)
@@ -566,9 +574,7 @@ def test_code_inside_a_run_is_never_executed(
     command: str,
 ) -> None:
     run = tmp_path / "run"
-    marker = trap(
-        run, trained.coded_run, recipe.replace("RUN", str(run)), needs_recipe=True
-    )
+    marker = trap(run, trained.coded_run, recipe.replace("RUN", str(run)), needs_recipe=True)
     monkeypatch.chdir(run)
     monkeypatch.syspath_prepend(run)
     answer = call(command, run)

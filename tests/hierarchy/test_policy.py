@@ -126,9 +126,7 @@ class Logged(gym.Wrapper):
 
 class Push(Skill):
     max_steps = 2
-    policy = ScriptedPolicy(
-        lambda obs: np.zeros(len(obs), np.int64), None, gym.spaces.Discrete(2)
-    )
+    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, gym.spaces.Discrete(2))
 
 
 class Balance(Skill):
@@ -255,7 +253,7 @@ def play_one(one: One, seed: int, steps: int) -> list[tuple[int, int]]:
 
 
 def nested() -> tuple[HierarchyPolicy, One]:
-    """Three levels: top over (middle, Left); middle over (bottom, Zigzag); bottom: three scripts."""
+    """Three levels: top of (middle, Left); middle of (bottom, Zigzag); bottom of three scripts."""
     bottom_kinds, declared = (Counter, Right, Left), Hierarchy(Walk, [Left(), Right()])
     bottom = hierarchy(*bottom_kinds, call_steps=2)
     as_bottom = Run(declared, None, bottom).as_skill("bottom", max_steps=3)
@@ -291,9 +289,9 @@ def test_a_hierarchy_as_a_skill_of_options_env_acts_as_the_scalar_one():
     keeper = Keeper()
     engine = make_engine(EnvSpec(keeper, engine="sync"), N)
     env = OptionsEnv(engine, skill_set(skill, Left, call_steps=9), 0.99)
-    obs, _ = env.reset(seed=1)
+    env.reset(seed=1)
     for t in range(40):
-        obs, *_, info = env.step((np.arange(N) + t) % 2)
+        env.step((np.arange(N) + t) % 2)
     kinds = [Counter(), Right(), Left()]
     for i, at in enumerate(seeds_of(1, N)):
 
@@ -464,7 +462,7 @@ def test_the_selector_chooses_only_among_skills_that_may_start():
 
 def test_where_no_skill_may_start_the_error_names_them():
     policy = hierarchy(Right)
-    with pytest.raises(SkillweaveError, match="no skill may start.*'right'"):
+    with pytest.raises(SkillweaveError, match=r"no skill may start.*'right'"):
         policy.act(policy.start(2), walk_obs(0, 2))
 
 

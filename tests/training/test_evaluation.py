@@ -198,6 +198,31 @@ def test_a_plain_policy_has_no_skills_to_count():
     assert "skills" not in str(found)
 
 
+@pytest.mark.parametrize("num_envs", [1, 2, 3])
+def test_a_policy_is_shown_true_transitions_and_the_time_in_each_episode(num_envs):
+    seen = []
+
+    class Watching(ScriptedPolicy):
+        def observe(self, memory, step):
+            seen.extend(
+                zip(
+                    step.elapsed.tolist(), step.obs[:, 0].tolist(), step.next_obs[:, 0].tolist(),
+                    step.action.tolist(), step.reward.tolist(), step.terminated.tolist(),
+                    step.truncated.tolist(), step.timed_out.tolist(), strict=True,
+                )
+            )  # fmt: skip
+            return memory
+
+    policy = Watching(fixed(2).function, Line.observation_space, Line.action_space)
+    evaluate(policy, EnvSpec(Line), episodes=4, num_envs=num_envs)
+    wanted = [
+        (t, t - 1, t, 2, 2.0, t == n and n % 2 == 0, t == n and n % 2 == 1, False)
+        for n in (5, 6, 7, 8)
+        for t in range(1, n + 1)
+    ]
+    assert sorted(seen) == sorted(wanted)
+
+
 # Numbers ---------------------------------------------------------------------------------------
 
 
