@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from skillweave.networks.config import MLP
     from skillweave.skills import Reflex, Skill
     from skillweave.training.evaluation import Evaluation, evaluate
-    from skillweave.types import SkillweaveError, Step
+    from skillweave.types import Array, SkillweaveError, Step
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "Array": "types",
     "EnvSpec": "envs.make",
     "Evaluation": "training.evaluation",
     "Hierarchy": "api",
@@ -35,6 +36,7 @@ _HOME = {
 __all__ = [
     "MLP",
     "PPO",
+    "Array",
     "EnvSpec",
     "Evaluation",
     "Hierarchy",

@@ -52,6 +52,8 @@ class Hierarchy(Declaration):
         Raises:
             SkillweaveError: the declaration does not fit the environment, or training diverged.
         """
+        if seed < 0:
+            raise SkillweaveError(f"seed is {seed}; it must be at least 0")
         self.check_spaces()
         content = training.manifest(self, seed=seed, flat=flat)
         track = tuple(track)
@@ -86,11 +88,12 @@ class Hierarchy(Declaration):
         spec = EnvSpec(manifest["env"], kwargs=manifest["env_kwargs"])
         if not spec.is_data:
             raise SkillweaveError(f"the environment {spec.name!r} names code; give the recipe")
+        call_steps = 1 if manifest["kind"] == "flat" else manifest["call_steps"]
         skills = [
             type(s["name"], (Skill,), {"name": s["name"], "max_steps": s["max_steps"]})()
             for s in manifest["skills"]
         ]
-        return cls(spec, skills, call_steps=manifest["call_steps"])
+        return cls(spec, skills, call_steps=call_steps)
 
     def _go_on(self, run: RunDirectory, quiet: bool) -> Run:
         with ExitStack() as stack:
@@ -116,6 +119,7 @@ class Hierarchy(Declaration):
                 f"{self.spec.name}"
             )
         self.call_steps = run.manifest["call_steps"]
+        self.reflexes_in_training = run.manifest.get("reflexes_in_training", True)
         self.greedy_skills = run.manifest["greedy_skills"]
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.config import PPO, config_from_json, config_to_json
-from skillweave.algorithms.ppo import Actor, PPOAlgorithm, State
+from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.spaces import space_from_json, space_to_json
 from skillweave.types import Array, Memory, SkillweaveError, Step
 
@@ -26,7 +26,7 @@ class AgentPolicy:
 
     def __init__(self, algorithm: PPOAlgorithm, weights: dict[str, Tensor]) -> None:
         self._algorithm, self.weights = algorithm, weights
-        self._actor: Actor = algorithm.actor_from(weights)
+        self._actor = algorithm.net.from_weights(weights)
         self.observation_space = algorithm.observation_space
         self.action_space = algorithm.action_space
 
@@ -54,11 +54,11 @@ class AgentPolicy:
         if not deterministic:
             rng = rng or np.random.default_rng()
             generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-            noise = self._algorithm.noise([generator], 1, len(obs))[0]
+            noise = self._algorithm.net.head.noise([generator], 1, len(obs))[0]
         allowed = None if mask is None else torch.from_numpy(mask)[None]
         rows = torch.from_numpy(np.ascontiguousarray(obs))[None]
-        action, _ = self._algorithm.act(self._actor, rows, allowed, noise)
-        return self._algorithm.action.to_env(action[0].numpy()), memory
+        action, _ = self._algorithm.net.act(self._actor, rows, allowed, noise)
+        return self._algorithm.net.head.codec.to_env(action[0].numpy()), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Nothing to notice."""

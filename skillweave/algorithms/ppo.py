@@ -14,23 +14,27 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.config import PPO
-from skillweave.networks.stacked import Layout, Views, mlp, mlp_init_, mlp_shapes
-from skillweave.ops.distributions import (
-    categorical_sample,
-    categorical_stats,
-    gumbel,
-    mask_logits,
-    normal_stats,
+from skillweave.networks.actor import Actor, ActorNet
+from skillweave.networks.stacked import (
+    Layout,
+    Views,
+    mlp,
+    mlp_init_,
+    mlp_shapes,
+    take_rows,
 )
 from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate, merge_moments
 from skillweave.ops.returns import explained_variance, gae, normalise
 from skillweave.seeding import Seeds
-from skillweave.spaces import action_codec, obs_codec
 from skillweave.types import Transition
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""
+SETTINGS = (
+    "learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "vf_coef", "max_grad_norm",
+)  # fmt: skip
+"""Settings that each member has a value of its own of; all others shape the computation."""
 _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
 
@@ -58,15 +62,6 @@ class State:
 
 
 @dataclass
-class Actor:
-    """What acting needs of a State: a copy, so that learning may go on beside it."""
-
-    views: dict[str, Tensor]  # the actor's parameters, each (P, *shape)
-    shift: Tensor | None  # (P, 1, O), where observations are normalised
-    scale: Tensor | None  # (P, 1, O)
-
-
-@dataclass
 class Rollout:
     """Transitions with what the acting policy's distribution was (``head``: logits, or mean)."""
 
@@ -83,14 +78,10 @@ class PPOAlgorithm:
     ) -> None:
         self.config = config
         self.observation_space, self.action_space = observation_space, action_space
-        self.obs, self.action = obs_codec(observation_space), action_codec(action_space)
+        self.net = ActorNet(observation_space, action_space, config.network, config.normalize_obs)
         self.critic_net = config.critic or config.network
-        actor = mlp_shapes("actor", self.obs.size, config.network, self.action.size)
-        if not self.action.discrete:
-            actor["actor.log_std"] = (1, self.action.size)
-        critic = mlp_shapes("critic", self.obs.size, self.critic_net, 1)
-        self.actor_layout, self.layout = Layout(actor), Layout(actor | critic)
-        self.normalize_obs = config.normalize_obs and self.obs.scaled
+        critic = mlp_shapes("critic", self.net.obs.size, self.critic_net, 1)
+        self.layout = Layout(self.net.layout.shapes | critic)
 
     def init(self, seeds: list[Seeds]) -> State:
         """Fresh members, one for each seed; a member does not depend on its neighbours."""
@@ -100,95 +91,43 @@ class PPOAlgorithm:
         generators = [(s / "init").torch() for s in seeds]
         mlp_init_(views, "actor", cfg.network, 0.01, generators)
         mlp_init_(views, "critic", self.critic_net, 1.0, generators)
-        if not self.action.discrete:
+        if not self.net.head.discrete:
             views["actor.log_std"].fill_(cfg.action_std_init).log_()
-
-        def setting(value: float) -> Tensor:
-            return torch.full((members,), value)
 
         return State(
             params=params,
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
             count=torch.zeros(members),
-            obs_mean=torch.zeros(members, self.obs.size),
-            obs_var=torch.ones(members, self.obs.size),
+            obs_mean=torch.zeros(members, self.net.obs.size),
+            obs_var=torch.ones(members, self.net.obs.size),
             obs_count=torch.full((members,), 1e-4),
             return_mean=torch.zeros(members, 1),
             return_var=torch.ones(members, 1),
             return_count=torch.full((members,), 1e-4),
-            learning_rate=setting(cfg.learning_rate),
-            gamma=setting(cfg.gamma),
-            gae_lambda=setting(cfg.gae_lambda),
-            clip_coef=setting(cfg.clip_coef),
-            ent_coef=setting(cfg.ent_coef),
-            vf_coef=setting(cfg.vf_coef),
-            max_grad_norm=setting(cfg.max_grad_norm),
+            **{name: torch.full((members,), float(getattr(cfg, name))) for name in SETTINGS},
         )
 
     def actor(self, state: State) -> Actor:
         """A copy of what acting needs."""
-        flat = state.params[:, : self.actor_layout.size].clone()
-        if not self.normalize_obs:
-            return Actor(self.actor_layout.views(flat), None, None)
-        scale = (state.obs_var + 1e-8).rsqrt()[:, None]
-        return Actor(self.actor_layout.views(flat), state.obs_mean[:, None].clone(), scale)
+        return self.net.copy(state.params, state.obs_mean, state.obs_var)
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of one member's ``weights``."""
-        scaling = {"obs_mean": (self.obs.size,), "obs_var": (self.obs.size,)}
-        return self.layout.shapes | (scaling if self.normalize_obs else {})
+        scaling = {"obs_mean": (self.net.obs.size,), "obs_var": (self.net.obs.size,)}
+        return self.layout.shapes | (scaling if self.net.normalize_obs else {})
 
     def weights(self, state: State, member: int = 0) -> dict[str, Tensor]:
         """One member's policy by name: parameters and observation scaling, copied."""
         named = {k: v[member].clone() for k, v in self.layout.views(state.params).items()}
-        if self.normalize_obs:
+        if self.net.normalize_obs:
             named |= {"obs_mean": state.obs_mean[member].clone()}
             named |= {"obs_var": state.obs_var[member].clone()}
         return named
 
-    def actor_from(self, weights: Mapping[str, Tensor]) -> Actor:
-        """The inverse of ``weights``, for acting only (P = 1)."""
-        views = {k: weights[k][None] for k in self.actor_layout.shapes}
-        if not self.normalize_obs:
-            return Actor(views, None, None)
-        scale = (weights["obs_var"] + 1e-8).rsqrt()
-        return Actor(views, weights["obs_mean"][None, None], scale[None, None])
-
-    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
-        """Noise for ``steps`` calls of ``act``: (steps, P, batch, A), a stream a member."""
-        shape = (steps, batch, self.action.size)
-        if self.action.discrete:
-            drawn = [gumbel(torch.rand(shape, generator=g)) for g in generators]
-        else:
-            drawn = [torch.randn(shape, generator=g) for g in generators]
-        return torch.stack(drawn, dim=1)
-
-    def act(
-        self, actor: Actor, obs: Tensor, mask: Tensor | None, noise: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Actions in policy units, and the head they came from.
-
-        Args:
-            obs: (P, B, *obs_shape), raw.
-            mask: (P, B, A) bool or None.
-            noise: (P, B, A), or None to act greedily.
-
-        Returns:
-            Actions (P, B) int64 or (P, B, A) float; head (P, B, A).
-        """
-        head = mlp(actor.views, "actor", self.config.network, self._inputs(obs, actor))
-        if self.action.discrete:
-            head = mask_logits(head, mask)
-            action = head.argmax(-1) if noise is None else categorical_sample(head, noise)
-            return action, head
-        if noise is None:
-            return head, head
-        return torch.addcmul(head, actor.views["actor.log_std"].exp(), noise), head
-
     def value(self, state: State, obs: Tensor) -> Tensor:
         """V in reward units; raw observations (P, B, *obs_shape) to (P, B)."""
-        inputs = self._inputs(obs, self.actor(state))
+        inputs = self.net.inputs(self.actor(state), obs)
         return self._value(self.layout.views(state.params), state, inputs)
 
     def update(
@@ -246,7 +185,7 @@ class PPOAlgorithm:
         parts = max(1, size // self.config.batch_size)
         for epoch in range(self.config.update_epochs):
             order = [torch.randperm(size, generator=(s / epoch).torch()) for s in seeds]
-            shuffled = {k: _take(v, torch.stack(order)) for k, v in data.items()}
+            shuffled = {k: take_rows(v, torch.stack(order)) for k, v in data.items()}
             for part in range(parts):
                 cut = slice(part * size // parts, (part + 1) * size // parts)
                 yield {k: v[:, cut] for k, v in shuffled.items()}
@@ -256,7 +195,8 @@ class PPOAlgorithm:
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Policy, value and entropy loss of one minibatch, (P,), and detached metrics (P,)."""
         head = mlp(views, "actor", self.config.network, batch["inputs"])
-        log_prob, entropy = self._stats(head, views.get("actor.log_std"), batch)
+        log_std, mask = views.get("actor.log_std"), batch.get("mask")
+        log_prob, entropy = self.net.head.stats(head, log_std, mask, batch["action"])
         policy = ppo_policy_loss(log_prob, batch["log_prob"], batch["advantage"], state.clip_coef)
         raw = mlp(views, "critic", self.critic_net, batch["inputs"]).squeeze(-1)
         clip = self.config.clip_value
@@ -280,13 +220,14 @@ class PPOAlgorithm:
         if tr.mask is not None:
             batch["mask"] = tr.mask.flatten(1, 2)
         log_std = None if rollout.log_std is None else rollout.log_std.flatten(1, 2)
-        old_log_prob, _ = self._stats(batch.pop("head"), log_std, batch)
-        if self.normalize_obs:
-            encoded = self.obs.encode(tr.obs.flatten(1, 2))
+        head, mask = batch.pop("head"), batch.get("mask")
+        old_log_prob, _ = self.net.head.stats(head, log_std, mask, batch["action"])
+        if self.net.normalize_obs:
+            encoded = self.net.obs.encode(tr.obs.flatten(1, 2))
             moments = state.obs_mean, state.obs_var, state.obs_count
             state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, encoded)
         actor, views = self.actor(state), self.layout.views(state.params)
-        inputs = self._inputs(tr.obs.flatten(1, 2), actor)
+        inputs = self.net.inputs(actor, tr.obs.flatten(1, 2))
         value = self._value(views, state, inputs).view(lead)
         next_value = self._next_value(views, state, actor, value, tr)
         advantage = gae(tr.reward, tr.discount, value, next_value, tr.last, state.gae_lambda)
@@ -322,24 +263,9 @@ class PPOAlgorithm:
         # them all. Surplus rows get what the shift gave them, the value of their true successor.
         rows = last.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :widest]
         ends = self._value(
-            views, state, self._inputs(_take(tr.next_obs.flatten(1, 2), rows), actor)
+            views, state, self.net.inputs(actor, take_rows(tr.next_obs.flatten(1, 2), rows))
         )
         return next_value.flatten(1).scatter(1, rows, ends).view_as(value)
-
-    def _inputs(self, obs: Tensor, actor: Actor) -> Tensor:
-        x = self.obs.encode(obs)
-        if actor.shift is None or actor.scale is None:
-            return x
-        return ((x - actor.shift) * actor.scale).clamp(-10.0, 10.0)
-
-    def _stats(
-        self, head: Tensor, log_std: Tensor | None, batch: Mapping[str, Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Log-probability of the batch's actions and entropy, each (P, B)."""
-        if log_std is None:
-            logits = mask_logits(head, batch.get("mask"))
-            return categorical_stats(logits, batch["action"])
-        return normal_stats(head, log_std, batch["action"])
 
     def _value(self, views: Views, state: State, inputs: Tensor) -> Tensor:
         raw = mlp(views, "critic", self.critic_net, inputs).squeeze(-1)
@@ -347,10 +273,3 @@ class PPOAlgorithm:
 
     def _return_scale(self, state: State) -> Tensor:
         return (state.return_var + 1e-8).sqrt()
-
-
-def _take(x: Tensor, rows: Tensor) -> Tensor:
-    """Rows of each member: x (P, B, ...), rows (P, K) to (P, K, ...)."""
-    if x.shape[0] == 1:
-        return x[0].index_select(0, rows[0])[None]
-    return x[torch.arange(x.shape[0])[:, None], rows]

@@ -37,6 +37,8 @@ def run(command: commands.Command) -> int:
 
 
 def _train(command: commands.Train) -> None:
+    if command.evaluate < 0:
+        raise SkillweaveError(f"evaluate is {command.evaluate}; it must be at least 0")
     hierarchy = recipes.load(command.recipe)
     apply_settings(hierarchy, command.set)
     hierarchy.scale(command.scale)
@@ -52,7 +54,7 @@ def _train(command: commands.Train) -> None:
 
 
 def _resume(command: commands.Resume) -> None:
-    hierarchy = _hierarchy_of_run(command.run, command.recipe)
+    hierarchy = _hierarchy_of_run(command.run, command.recipe, "resume_needs_recipe")
     try:
         trained = hierarchy.resume(command.run, quiet=command.quiet)
     except KeyboardInterrupt:
@@ -151,10 +153,10 @@ def _target(command: commands.Watched) -> Run:
     raise SkillweaveError(f"{command.target} is neither a run nor a weights file{hint}")
 
 
-def _hierarchy_of_run(path: Path, recipe: str | None) -> Hierarchy:
+def _hierarchy_of_run(path: Path, recipe: str | None, needs: str = "needs_recipe") -> Hierarchy:
     """The hierarchy that a run was trained from; code never comes from inside the run."""
     manifest = RunDirectory.open(path).manifest
-    if recipe is None and not manifest["needs_recipe"]:
+    if recipe is None and not manifest.get(needs, True):
         return Hierarchy.from_manifest(manifest)
     return _declared(recipe or manifest.get("recipe"), recipe, path)
 
@@ -199,12 +201,16 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
     """The same interrupt, with what is saved and how to go on."""
     if not (path / "run.json").exists():
         return KeyboardInterrupt("nothing was trained yet")
+    manifest = RunDirectory.open(path).manifest
+    recipe, hint = manifest["recipe"], ""
+    if manifest["resume_needs_recipe"] and recipe not in recipes.names():
+        hint = f" --recipe {recipe or 'FILE.py'}"
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]
         saved = f"saved at {at['steps']:,} steps of {at['phase']}"
     except SkillweaveError:
         saved = "saved at the start"
-    return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}")
+    return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}{hint}")
 
 
 def _run_line(path: Path) -> dict[str, Any]:

@@ -14,7 +14,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     from skillweave.cli import commands
 
-    given = ["--no-deterministic" if a == "--stochastic" else a for a in arguments or sys.argv[1:]]
+    words = sys.argv[1:] if arguments is None else arguments
+    given = ["--no-deterministic" if word == "--stochastic" else word for word in words]
     parser: dict[str, Any] = {c.__name__.lower(): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         parser,

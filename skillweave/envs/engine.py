@@ -68,10 +68,12 @@ class Pausable(gym.Wrapper[Any, Any, Any, Any]):
         self._obs: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Start anew."""
         self._obs, info = self.env.reset(seed=seed, options=options)
         return self._obs, info
 
     def step(self, action: Any) -> Any:
+        """Step, or stand still."""
         go, inner = action
         if not go:
             return self._obs, 0.0, False, False, {}
@@ -100,11 +102,13 @@ class GymnasiumEngine:
         )
 
     def reset(self, seed: int) -> Array:
+        """Start all anew from one seed; observations (N, *obs_shape)."""
         seeds = np.random.SeedSequence(seed).generate_state(self.num_envs, np.uint32) >> 1
         obs, _ = self._vector.reset(seed=[int(s) for s in seeds])
         return np.asarray(obs)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
+        """Start some anew; observations (n, *obs_shape)."""
         mask = np.zeros(self.num_envs, bool)
         mask[ids] = True
         each: list[int | None] = [None] * self.num_envs
@@ -114,6 +118,7 @@ class GymnasiumEngine:
         return np.asarray(obs)[ids]
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
+        """Act in some environments; the others stand still."""
         go = np.ones(self.num_envs, np.int64)
         if ids is None:
             self._actions[:] = action
@@ -133,6 +138,7 @@ class GymnasiumEngine:
         return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
 
     def close(self) -> None:
+        """Release the environments."""
         self._vector.close()
 
 
@@ -185,18 +191,21 @@ class EnvPoolEngine:
             return pool
 
     def reset(self, seed: int) -> Array:
+        """Start all anew from one seed; observations (N, *obs_shape)."""
         # A pool takes its seed only when made; making one takes milliseconds.
         self._pool = self.make_pool(seed)
         obs, _ = self._pool.reset()
         return np.asarray(obs)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
+        """Start some anew; observations (n, *obs_shape)."""
         if seeds is not None:
             raise SkillweaveError("EnvPool cannot reset single environments to a seed")
         obs, _ = self._pool.reset(ids.astype(np.int32))
         return np.asarray(obs)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
+        """Act in some environments; the others stand still."""
         if self._discrete:
             action = action.astype(np.int32)
         ids = None if ids is None else ids.astype(np.int32)
@@ -206,6 +215,7 @@ class EnvPoolEngine:
         return RawStep(obs, reward, terminated, truncated, info)
 
     def close(self) -> None:
+        """Release the environments."""
         self._pool = None
 
 

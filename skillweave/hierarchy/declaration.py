@@ -124,6 +124,12 @@ class Declaration:
         ready = any(s.policy is not None for s in self.skills)
         return not code and not ready and not self.reflexes and self.spec.is_data
 
+    @property
+    def trains_from_data(self) -> bool:
+        """Whether training, too, needs none of the user's Python code."""
+        own = any(s.defines(m) for s in self.skills for m in s.methods)
+        return self.is_data and self.spec.engine == "auto" and not own
+
     def skill(self, name: str) -> Skill:
         """The skill of this name."""
         for skill in self.skills:

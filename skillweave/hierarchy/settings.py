@@ -8,12 +8,10 @@ import types
 import typing
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.types import SkillweaveError
-
-T = TypeVar("T")
 
 PLAIN = (
     "call_steps",
@@ -27,16 +25,36 @@ CONFIGS = ("algorithm", "selector", "flat")
 
 
 def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
-    """Change a declaration in place by ``name=value`` strings.
+    """Change a declaration in place by ``name=value`` strings; their order does not matter.
 
     Raises:
         SkillweaveError: no such setting (with close matches), or a value out of range.
     """
+    configs: dict[tuple[str, ...], dict[str, str]] = {}
     for setting in settings:
-        name, sign, text = setting.partition("=")
+        name, sign, text = (part.strip() for part in setting.partition("="))
         if not sign:
             raise SkillweaveError(f"--set {setting!r}: write name=value, for example call_steps=20")
-        _set(declaration, name.strip(), text.strip())
+        head, *rest = name.split(".")
+        if head in PLAIN and not rest:
+            hint = typing.get_type_hints(Declaration)[head]
+            setattr(declaration, head, _parse(name, text, hint))
+        elif head == "skills" and len(rest) == 2 and rest[1] == "steps":
+            declaration.skill(rest[0]).steps = _parse(name, text, int)
+        elif head == "skills" and len(rest) >= 2:
+            configs.setdefault((head, rest[0]), {})[name] = text
+        elif head in CONFIGS and rest:
+            configs.setdefault((head,), {})[name] = text
+        else:
+            known = [*list_settings(declaration), *(f"{c}." for c in CONFIGS)]
+            raise _unknown(name, known)
+    for owner, changes in configs.items():
+        # All of a config's changes at once: some fit only together (num_envs, batch_size).
+        by_path = {tuple(n.split(".")[len(owner) :]): (n, text) for n, text in changes.items()}
+        target: Any = declaration.skill(owner[1]) if owner[0] == "skills" else declaration
+        field = "algorithm" if owner[0] == "skills" else owner[0]
+        config = getattr(target, field) or declaration.algorithm
+        setattr(target, field, _replaced(config, by_path))
     declaration.__post_init__()
 
 
@@ -51,39 +69,28 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
     return found | _flatten("selector.", declaration.selector)
 
 
-def _set(declaration: Declaration, name: str, text: str) -> None:
-    head, *rest = name.split(".")
-    if head in PLAIN and not rest:
-        hint = typing.get_type_hints(Declaration)[head]
-        setattr(declaration, head, _parse(name, text, hint))
-    elif head in CONFIGS and rest:
-        config = getattr(declaration, head) or declaration.algorithm
-        setattr(declaration, head, _replaced(config, rest, name, text))
-    elif head == "skills" and len(rest) == 2 and rest[1] == "steps":
-        declaration.skill(rest[0]).steps = _parse(name, text, int)
-    elif head == "skills" and len(rest) >= 2:
-        skill = declaration.skill(rest[0])
-        skill.algorithm = _replaced(skill.algorithm or declaration.algorithm, rest[1:], name, text)
-    else:
-        known = [*list_settings(declaration), *(f"{c}." for c in CONFIGS)]
-        raise _unknown(name, known)
-
-
-def _replaced(config: T, path: list[str], name: str, text: str) -> T:
-    """``config`` with the field at ``path`` parsed from ``text``."""
-    field, *deeper = path
-    known = [f.name for f in fields(config)]  # type: ignore[arg-type]
-    if field not in known:
-        raise _unknown(name, [name.removesuffix(".".join(path)) + k for k in known])
-    hint = typing.get_type_hints(type(config))[field]
-    if deeper:
-        inner = getattr(config, field)
+def _replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
+    """``config`` with the fields at these paths parsed from (full name, text)."""
+    known, hints = [f.name for f in fields(config)], typing.get_type_hints(type(config))
+    values: dict[str, Any] = {}
+    deeper: dict[str, dict[tuple[str, ...], tuple[str, str]]] = {}
+    for (field, *rest), (name, text) in changes.items():
+        if field not in known:
+            prefix = name.removesuffix(".".join([field, *rest]))
+            raise _unknown(name, [prefix + k for k in known])
+        if rest:
+            deeper.setdefault(field, {})[tuple(rest)] = name, text
+        else:
+            values[field] = _parse(name, text, hints[field])
+    for field, inner_changes in deeper.items():
+        inner = values.get(field, getattr(config, field))
         if inner is None and field == "critic":
-            inner = getattr(config, "network", None)  # what it stands for
+            inner = values.get("network", getattr(config, "network", None))  # what it stands for
         if not is_dataclass(inner):
+            name = next(iter(inner_changes.values()))[0]
             raise SkillweaveError(f"--set {name}: {field} has no parts")
-        return replace(config, **{field: _replaced(inner, deeper, name, text)})  # type: ignore[type-var]
-    return replace(config, **{field: _parse(name, text, hint)})  # type: ignore[type-var]
+        values[field] = _replaced(inner, inner_changes)
+    return replace(config, **values)
 
 
 def _parse(name: str, text: str, hint: Any) -> Any:

@@ -31,6 +31,8 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "skills": [_skill_entry(s) for s in declaration.skills],
         "call_steps": declaration.call_steps,
         "greedy_skills": declaration.greedy_skills,
+        "reflexes_in_training": declaration.reflexes_in_training,
+        "resume_needs_recipe": not declaration.trains_from_data,
         "reflexes": [r.name for r in declaration.reflexes],
         "needs_recipe": not (declaration.spec.is_data if flat else declaration.is_data),
         "phases": [p.entry() for p in phases],

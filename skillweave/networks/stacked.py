@@ -100,3 +100,10 @@ def mlp(views: Views, prefix: str, net: MLP, x: Tensor) -> Tensor:
         x = activation(x)
     i = len(net.hidden)
     return torch.baddbmm(views[f"{prefix}.{i}.bias"], x, views[f"{prefix}.{i}.weight"])
+
+
+def take_rows(x: Tensor, rows: Tensor) -> Tensor:
+    """Rows of each member: x (P, B, ...), rows (P, K) to (P, K, ...)."""
+    if x.shape[0] == 1:
+        return x[0].index_select(0, rows[0])[None]
+    return x[torch.arange(x.shape[0])[:, None], rows]

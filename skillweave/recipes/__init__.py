@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skillweave.types import SkillweaveError
+from skillweave import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Hierarchy
@@ -39,8 +39,8 @@ def load(recipe: str) -> Hierarchy:
 
     path = Path(recipe)
     if recipe in names():
-        module = importlib.import_module(f"skillweave.recipes.{recipe.replace('-', '_')}")
-    elif path.suffix == ".py" and path.is_file():
+        path = source(recipe)
+    if path.suffix == ".py" and path.is_file():
         spec = importlib.util.spec_from_file_location(f"skillweave_recipe_{path.stem}", path)
         assert spec is not None
         assert spec.loader is not None

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skillweave import PPO, Hierarchy, Reflex, Skill
-from skillweave.types import Array, Step
+from skillweave import PPO, Array, Hierarchy, Reflex, Skill, Step
 
 X, Y, ANGLE, LEFT_LEG, RIGHT_LEG = 0, 1, 4, 6, 7
 

@@ -111,6 +111,8 @@ def evaluate(
     for name, value in (("episodes", episodes), ("num_envs", num_envs)):
         if value < 1:
             raise SkillweaveError(f"{name} is {value}; it must be at least 1")
+    if seed < 0:
+        raise SkillweaveError(f"seed is {seed}; it must be at least 0")
     n = min(num_envs, episodes)
     engine = make_engine(replaced(env, engine="sync"), n)
     try:

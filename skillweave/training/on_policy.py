@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.algorithms.ppo import Actor, PPOAlgorithm, Rollout, State
+from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.buffers.rollout import RolloutBuffer
+from skillweave.networks.actor import Actor
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError, VecEnv, VecStep
 
@@ -42,7 +43,8 @@ class Episodes:
             self._sums = np.zeros((3, n))
         # An options environment sums the undiscounted reward of a call apart.
         self._sums[0] += step.info.get("call_return", step.reward)
-        self._sums[1] += step.info.get("task_reward", self._sums[0] * 0)
+        if "task_reward" in step.info:
+            self._sums[1] += step.info["task_reward"]
         self._sums[2] += step.steps
         ended = step.terminated | step.truncated
         if ended.any():
@@ -108,54 +110,71 @@ def train_on_policy(
         SkillweaveError: parameters or losses are no longer finite.
     """
     loop = _Loop(algorithm, env, seeds, members=len(state.params))
-    started = time.perf_counter() - seconds
-    previous = torch.get_num_threads()
+    learner = _Learner(algorithm, state, loop, budget, on_tick, time.perf_counter() - seconds)
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    worker = ThreadPoolExecutor(
-        1, initializer=_learner_thread, initargs=(algorithm.config.threads,)
-    )
-    pending: Future[tuple[int, int, dict[str, float]]] | None = None
-    actor = algorithm.actor(state)
-    loop.restart(update)
-
-    def learn(
-        rollout: Rollout, number: int, before: int, after: int
-    ) -> tuple[int, int, dict[str, float]]:
-        progress = min(1.0, before / budget)
-        _, metrics = algorithm.update(state, rollout, progress, loop.member_seeds("learn", number))
-        return number, after, _to_numbers(metrics, number)
-
-    def finish(done: Future[tuple[int, int, dict[str, float]]], cut: bool) -> None:
-        number, spent, metrics = done.result()
-        if on_tick is not None:
-            metrics |= loop.episodes.summary()
-            elapsed = time.perf_counter() - started
-            on_tick(Tick(number + 1, spent, elapsed, metrics, state, cut))
-
     try:
+        actor = algorithm.actor(state)
+        loop.restart(update)
         while steps < budget:
-            before = steps
             rollout, taken = loop.collect(actor, state, update)
-            steps += taken
-            if pending is not None:
-                done, pending = pending, None
-                done.result()
-                actor = algorithm.actor(state)
-                finish(done, cut=False)
-            pending = worker.submit(learn, rollout, update, before, steps)
-            update += 1
-            cut = steps // cut_every > before // cut_every or steps >= budget
+            actor = learner.wait(actor)
+            learner.start(rollout, update, steps, steps + taken)
+            cut = (steps + taken) // cut_every > steps // cut_every or steps + taken >= budget
+            update, steps = update + 1, steps + taken
             if cut or not algorithm.config.overlap:
-                done, pending = pending, None
-                done.result()
-                actor = algorithm.actor(state)
+                actor = learner.wait(actor, cut)
                 if cut and steps < budget:
                     loop.restart(update)
-                finish(done, cut)
     finally:
-        worker.shutdown(wait=True)
-        torch.set_num_threads(previous)
+        learner.close()
+        torch.set_num_threads(threads)
     return state
+
+
+class _Learner:
+    """Learns from one rollout at a time, on a thread of its own."""
+
+    def __init__(
+        self,
+        algorithm: PPOAlgorithm,
+        state: State,
+        loop: _Loop,
+        budget: int,
+        on_tick: Callable[[Tick], None] | None,
+        started: float,
+    ) -> None:
+        self.algorithm, self.state, self.loop, self.budget = algorithm, state, loop, budget
+        self.on_tick, self.started = on_tick, started
+        set_threads = torch.set_num_threads  # torch counts threads for each thread
+        self._worker = ThreadPoolExecutor(1, "learner", set_threads, (algorithm.config.threads,))
+        self._pending: Future[dict[str, float]] | None = None
+        self._at = (0, 0)  # the pending update's number, and the steps when it is done
+
+    def start(self, rollout: Rollout, update: int, before: int, after: int) -> None:
+        """Begin to learn from a rollout that was collected from step ``before`` to ``after``."""
+        self._at = (update + 1, after)
+        self._pending = self._worker.submit(self._learn, rollout, update, before / self.budget)
+
+    def wait(self, actor: Actor, cut: bool = False) -> Actor:
+        """Let a pending update end, report it, and return what acts from now on."""
+        if self._pending is None:
+            return actor
+        metrics, self._pending = self._pending.result(), None
+        if self.on_tick is not None:
+            metrics |= self.loop.episodes.summary()
+            elapsed = time.perf_counter() - self.started
+            self.on_tick(Tick(*self._at, elapsed, metrics, self.state, cut))
+        return self.algorithm.actor(self.state)
+
+    def close(self) -> None:
+        """Stop; a pending update is finished first, as it changes the state in place."""
+        self._worker.shutdown(wait=True)
+
+    def _learn(self, rollout: Rollout, update: int, progress: float) -> dict[str, float]:
+        seeds = self.loop.member_seeds("learn", update)
+        _, metrics = self.algorithm.update(self.state, rollout, min(1.0, progress), seeds)
+        return _to_numbers(metrics, update)
 
 
 class _Loop:
@@ -182,14 +201,14 @@ class _Loop:
         t, n, p = algorithm.config.n_steps, env.num_envs, self.members
         buffer = RolloutBuffer(t, n, p, env.observation_space)
         generators = [s.torch() for s in self.member_seeds("act", update)]
-        noises = algorithm.noise(generators, t, n // p)
+        noises = algorithm.net.head.noise(generators, t, n // p)
         mask, spent = env.mask(), 0
         for noise in noises:
             obs = self._obs
             rows = torch.from_numpy(obs).unflatten(0, (p, n // p))
             allowed = None if mask is None else torch.from_numpy(mask).unflatten(0, (p, n // p))
-            action, head = algorithm.act(actor, rows, allowed, noise)
-            step = env.step(algorithm.action.to_env(action.flatten(0, 1).numpy()))
+            action, head = algorithm.net.act(actor, rows, allowed, noise)
+            step = env.step(algorithm.net.head.codec.to_env(action.flatten(0, 1).numpy()))
             buffer.add(obs, mask, action, head, step)
             self.episodes.add(step)
             self._obs, mask = step.obs, step.mask
@@ -197,10 +216,6 @@ class _Loop:
         transition, head = buffer.read(state.gamma)
         log_std = actor.views.get("actor.log_std")
         return Rollout(transition, head, None if log_std is None else log_std[:, None]), spent
-
-
-def _learner_thread(threads: int) -> None:
-    torch.set_num_threads(threads)
 
 
 def _to_numbers(metrics: dict[str, Any], update: int) -> dict[str, float]:

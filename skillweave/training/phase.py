@@ -14,6 +14,9 @@ from skillweave.seeding import Seeds
 from skillweave.training.on_policy import Tick, train_on_policy
 from skillweave.types import VecEnv
 
+START = {"update": 0, "steps": 0, "seconds": 0.0, "metrics": {}}
+"""Where a phase stands before its first update."""
+
 
 class Listener(Protocol):
     """Is told how training goes: a progress bar, TensorBoard, Weights & Biases."""
@@ -66,43 +69,42 @@ def train_phase(
     try:
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
         found = run.load_checkpoint(State, phase.name)
-        state = algorithm.init([seeds / "member" / 0]) if found is None else found[0]
-        at: dict[str, Any] = {"update": 0, "steps": 0, "seconds": 0.0}
-        if found is not None:
-            at = {k: found[1][k] for k in at}
-            run.rewind_metrics(found[1]["metrics_bytes"])
-        elif "metrics_bytes" in entry:
-            run.rewind_metrics(entry["metrics_bytes"])
-        else:
-            entry["metrics_bytes"] = run.metrics_size()
+        state, at = found or (algorithm.init([seeds / "member" / 0]), dict(START))
+        run.rewind_metrics(at.get("metrics_bytes", entry.get("metrics_bytes")))
+        entry.setdefault("metrics_bytes", run.metrics_size())
         entry["status"] = "training"
         run.save()
         for listener in listeners:
             listener.phase(phase.name, budget)
-        latest: dict[str, Any] = {"steps": at["steps"], "seconds": at["seconds"], "metrics": {}}
 
         def on_tick(tick: Tick) -> None:
-            latest.update(steps=tick.steps, seconds=tick.seconds, metrics=tick.metrics)
-            record = {"phase": phase.name, "update": tick.update, "steps": tick.steps}
-            run.log(record | {"seconds": round(tick.seconds, 4)} | tick.metrics)
+            at.update(update=tick.update, steps=tick.steps, seconds=tick.seconds)
+            at["metrics"] = tick.metrics
+            now = {"phase": phase.name, "update": tick.update, "steps": tick.steps}
+            run.log(now | {"seconds": round(tick.seconds, 4)} | tick.metrics)
             for listener in listeners:
                 listener.tick(phase.name, tick.steps, tick.seconds, tick.metrics)
             if tick.cut:
-                header = {"phase": phase.name, "update": tick.update, "steps": tick.steps}
-                run.save_checkpoint(tick.state, header | {"seconds": tick.seconds})
+                header = {"seconds": tick.seconds, "metrics": tick.metrics}
+                run.save_checkpoint(tick.state, now | header)
 
         train_on_policy(
-            algorithm, env, state, seeds, budget, cut_every=cut_every, on_tick=on_tick, **at
-        )
+            algorithm, env, state, seeds, budget, cut_every=cut_every, on_tick=on_tick,
+            update=at["update"], steps=at["steps"], seconds=at["seconds"],
+        )  # fmt: skip
     finally:
         env.close()
     policy = AgentPolicy.of(algorithm, state)
     run.save_policy(phase.name, policy)
-    seconds = latest["seconds"]
-    entry.update(status="done", steps=latest["steps"], seconds=round(seconds, 3))
-    entry.update(steps_per_second=round(latest["steps"] / max(seconds, 1e-9), 1))
-    entry["final"] = latest["metrics"]
-    run.save()
+    _finish(run, entry, at)
     for listener in listeners:
-        listener.done(phase.name, latest["steps"], seconds, latest["metrics"])
+        listener.done(phase.name, at["steps"], at["seconds"], at["metrics"])
     return policy
+
+
+def _finish(run: RunDirectory, entry: dict[str, Any], at: dict[str, Any]) -> None:
+    """Say in the manifest that a phase is done, and how it went."""
+    entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
+    entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
+    entry["final"] = at["metrics"]
+    run.save()

@@ -50,15 +50,15 @@ def greedy(algorithm: PPOAlgorithm, state: State, obs: np.ndarray, mask=None) ->
         torch.from_numpy(obs)[None],
         None if mask is None else torch.from_numpy(mask)[None],
     )
-    action, _ = algorithm.act(algorithm.actor(state), rows, allowed, None)
-    return algorithm.action.to_env(action[0].numpy())
+    action, _ = algorithm.net.act(algorithm.actor(state), rows, allowed, None)
+    return algorithm.net.head.codec.to_env(action[0].numpy())
 
 
 @pytest.mark.parametrize("overlap", [True, False])
 def test_ppo_learns_that_the_action_must_equal_the_observation(overlap):
     algorithm, state = train(Identity(16), 40, replace(CONFIG, overlap=overlap))
     assert greedy(algorithm, state, np.arange(4)).tolist() == [0, 1, 2, 3]
-    head = algorithm.act(algorithm.actor(state), torch.arange(4)[None], None, None)[1]
+    head = algorithm.net.act(algorithm.actor(state), torch.arange(4)[None], None, None)[1]
     assert head.softmax(-1)[0].diagonal().min() > 0.9
 
 
@@ -177,7 +177,7 @@ class Spy(PPOAlgorithm):
         self.versions.append(self.actor(state))
         obs, head = rollout.transition.obs.flatten(1, 2), rollout.head.flatten(1, 2)
         with torch.no_grad():
-            acted = [torch.allclose(self.act(a, obs, None, None)[1], head) for a in self.versions]
+            acted = [torch.allclose(self.net.act(a, obs, None, None)[1], head) for a in self.versions]
         self.lags.append(acted[::-1].index(True))
         return super().update(state, rollout, progress, seeds)
 

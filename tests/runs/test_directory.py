@@ -1,0 +1,367 @@
+"""The run directory: never overwritten, exact, and forgiving where it can be."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.config import PPO
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.networks.config import MLP
+from skillweave.runs.directory import RunDirectory, versions
+from skillweave.seeding import Seeds
+from skillweave.types import SkillweaveError
+
+PHASES = [
+    {"name": "landing", "status": "training", "budget": 10},
+    {"name": "selector", "status": "waiting", "budget": 10},
+]
+
+
+def manifest() -> dict[str, Any]:
+    return {
+        "kind": "hierarchy",
+        "env": "CartPole-v1",
+        "env_kwargs": {},
+        "seed": 7,
+        "cut_every": 100,
+        "skills": [{"name": "landing", "max_steps": None, "ready": False}],
+        "call_steps": 10,
+        "greedy_skills": True,
+        "reflexes": [],
+        "needs_recipe": False,
+        "phases": [dict(p) for p in PHASES],
+    }
+
+
+@dataclass
+class Learnt:
+    """A stand-in for an algorithm's state."""
+
+    weight: Tensor
+    count: Tensor
+
+
+def learnt(seed: int) -> Learnt:
+    noise = torch.randn(3, 5, generator=torch.Generator().manual_seed(seed))
+    return Learnt(noise, torch.tensor([seed], dtype=torch.int64))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[RunDirectory]:
+    run = RunDirectory.create(tmp_path / "run", manifest())
+    yield run
+    run.close()
+
+
+def damage(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+
+
+def save(run: RunDirectory, seed: int, phase: str = "landing") -> Learnt:
+    state = learnt(seed)
+    run.save_checkpoint(state, {"phase": phase, "update": seed, "steps": 10 * seed})
+    return state
+
+
+def assert_same(a: Learnt, b: Learnt) -> None:
+    assert a.weight.numpy().tobytes() == b.weight.numpy().tobytes()
+    assert torch.equal(a.count, b.count)
+    assert a.count.dtype == b.count.dtype
+
+
+# Making and opening
+
+
+def test_a_new_run_can_be_opened_and_says_what_made_it(run: RunDirectory) -> None:
+    found = RunDirectory.open(run.path).manifest
+    assert {k: found[k] for k in manifest()} == manifest()
+    assert found["schema"] == 1
+    assert found["created"]
+    assert found["versions"] == versions()
+
+
+def test_an_existing_run_is_never_overwritten(run: RunDirectory) -> None:
+    before = (run.path / "run.json").read_bytes()
+    with pytest.raises(SkillweaveError, match=r"already holds a run.*skillweave resume") as caught:
+        RunDirectory.create(run.path, manifest() | {"seed": 8})
+    assert str(run.path) in str(caught.value)
+    assert (run.path / "run.json").read_bytes() == before
+
+
+def test_a_directory_with_other_files_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(SkillweaveError, match="not an empty directory"):
+        RunDirectory.create(tmp_path, manifest())
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_file_is_refused_as_a_run(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("")
+    with pytest.raises(SkillweaveError, match="not an empty directory"):
+        RunDirectory.create(tmp_path / "run", manifest())
+
+
+def test_an_empty_directory_is_taken(tmp_path: Path) -> None:
+    RunDirectory.create(tmp_path, manifest())
+    assert (tmp_path / "run.json").exists()
+
+
+def test_opening_a_directory_without_a_run_says_which_file_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(SkillweaveError, match="holds no run") as caught:
+        RunDirectory.open(tmp_path)
+    assert str(tmp_path / "run.json") in str(caught.value)
+
+
+@pytest.mark.parametrize("field", sorted(set(manifest()) - {"reflexes"}))
+def test_a_run_without_one_of_its_fields_is_damaged_and_the_field_is_named(
+    run: RunDirectory, field: str
+) -> None:
+    path = run.path / "run.json"
+    data = json.loads(path.read_text())
+    del data[field]
+    path.write_text(json.dumps(data))
+    with pytest.raises(SkillweaveError, match=f"damaged.*'{field}'") as caught:
+        RunDirectory.open(run.path)
+    assert str(path) in str(caught.value)
+
+
+def test_an_unknown_phase_is_answered_with_those_there_are(run: RunDirectory) -> None:
+    with pytest.raises(SkillweaveError, match="'ladning'; it has: landing, selector"):
+        run.phase("ladning")
+
+
+def test_a_run_is_finished_when_every_phase_is_done(run: RunDirectory) -> None:
+    run.phase("landing")["status"] = "done"
+    assert not run.finished
+    run.phase("selector")["status"] = "done"
+    assert run.finished
+    run.save()
+    assert RunDirectory.open(run.path).finished
+
+
+def test_versions_name_python_torch_gymnasium_and_the_machine() -> None:
+    found = versions()
+    assert found["torch"] == torch.__version__
+    assert {"python", "platform", "torch", "gymnasium", "numpy"} <= set(found)
+    assert all(isinstance(v, str) and v for v in found.values())
+
+
+# Checkpoints
+
+
+def test_a_checkpoint_comes_back_exactly(run: RunDirectory) -> None:
+    run.log({"update": 1})
+    state = save(run, 3)
+    found = RunDirectory.open(run.path).load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert_same(found[0], state)
+    assert (found[1]["update"], found[1]["steps"]) == (3, 30)
+    assert found[1]["metrics_bytes"] == (run.path / "metrics.jsonl").stat().st_size > 0
+
+
+def test_there_is_no_checkpoint_at_first(run: RunDirectory) -> None:
+    assert run.load_checkpoint(Learnt, "landing") is None
+
+
+def test_the_latest_checkpoint_counts_and_no_other_files_stay(run: RunDirectory) -> None:
+    states = [save(run, seed) for seed in (1, 2, 3)]
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert_same(found[0], states[2])
+    names = {p.name for p in run.path.iterdir()}
+    assert names == {"run.json", "checkpoint.safetensors", "checkpoint.previous.safetensors"}
+
+
+@pytest.mark.parametrize("how", ["altered", "cut off", "emptied", "removed"])
+def test_a_bad_checkpoint_falls_back_to_the_one_before(run: RunDirectory, how: str) -> None:
+    before = save(run, 1)
+    save(run, 2)
+    path = run.path / "checkpoint.safetensors"
+    match how:
+        case "altered":
+            damage(path)
+        case "cut off":
+            os.truncate(path, path.stat().st_size // 2)
+        case "emptied":
+            os.truncate(path, 0)
+        case "removed":
+            path.unlink()
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert_same(found[0], before)
+    assert found[1]["update"] == 1
+
+
+def test_two_damaged_checkpoints_are_an_error_that_names_both(run: RunDirectory) -> None:
+    save(run, 1)
+    save(run, 2)
+    paths = [run.path / f"checkpoint{x}.safetensors" for x in ("", ".previous")]
+    for path in paths:
+        damage(path)
+    with pytest.raises(SkillweaveError, match="damaged") as caught:
+        run.load_checkpoint(Learnt, "landing")
+    assert all(str(p) in str(caught.value) for p in paths)
+
+
+def test_checkpoints_of_another_phase_are_ignored(run: RunDirectory) -> None:
+    mine = save(run, 1, "landing")
+    assert run.load_checkpoint(Learnt, "selector") is None
+    save(run, 2, "selector")
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert_same(found[0], mine)
+
+
+def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None:
+    @dataclass
+    class Other:
+        bias: Tensor
+
+    run.save_checkpoint(Other(torch.zeros(1)), {"phase": "landing"})
+    with pytest.raises(SkillweaveError, match="does not hold a Learnt"):
+        run.load_checkpoint(Learnt, "landing")
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_last_two(
+    run: RunDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(run, 1)
+    kept = save(run, 2)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(SkillweaveError, match="No space left"):
+        save(run, 3)
+    monkeypatch.undo()
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert_same(found[0], kept)
+    names = {p.name for p in run.path.iterdir()}
+    assert names == {"run.json", "checkpoint.safetensors", "checkpoint.previous.safetensors"}
+
+
+# Policies
+
+
+@pytest.fixture
+def policy() -> AgentPolicy:
+    import gymnasium as gym
+
+    env = gym.make("CartPole-v1")
+    config = PPO(num_envs=1, n_steps=4, batch_size=4, network=MLP(hidden=(3,)))
+    algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    env.close()
+    return AgentPolicy.of(algorithm, algorithm.init([Seeds(0)]))
+
+
+def test_a_finished_policy_comes_back_exactly(run: RunDirectory, policy: AgentPolicy) -> None:
+    run.save_policy("landing", policy)
+    run.phase("landing")["status"] = "done"
+    found = run.load_policy("landing")
+    assert found.weights.keys() == policy.weights.keys()
+    assert all(torch.equal(found.weights[k], v) for k, v in policy.weights.items())
+    obs = torch.randn(9, 4, generator=torch.Generator().manual_seed(0)).numpy()
+    assert (found.act({}, obs)[0] == policy.act({}, obs)[0]).all()
+
+
+def test_a_policy_of_an_unfinished_phase_says_how_to_finish_it(run: RunDirectory) -> None:
+    with pytest.raises(SkillweaveError, match="'landing' is not finished; skillweave resume"):
+        run.load_policy("landing")
+
+
+def test_a_damaged_policy_is_named(run: RunDirectory, policy: AgentPolicy) -> None:
+    run.save_policy("landing", policy)
+    run.phase("landing")["status"] = "done"
+    damage(run.policy_path("landing"))
+    with pytest.raises(SkillweaveError, match="damaged") as caught:
+        run.load_policy("landing")
+    assert str(run.policy_path("landing")) in str(caught.value)
+
+
+def test_a_checkpoint_in_the_place_of_a_policy_is_refused_by_name(run: RunDirectory) -> None:
+    save(run, 1)
+    run.policy_path("landing").parent.mkdir()
+    (run.path / "checkpoint.safetensors").rename(run.policy_path("landing"))
+    run.phase("landing")["status"] = "done"
+    with pytest.raises(SkillweaveError) as caught:
+        run.load_policy("landing")
+    assert str(run.policy_path("landing")) in str(caught.value)
+
+
+# Metrics
+
+
+def test_metrics_come_back_in_order(run: RunDirectory) -> None:
+    records = [{"phase": "landing", "update": i, "loss": i / 3} for i in range(5)]
+    for record in records:
+        run.log(record)
+    assert list(run.metrics()) == records
+    run.close()
+    run.log({"phase": "landing", "update": 5})
+    assert [r["update"] for r in RunDirectory.open(run.path).metrics()] == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_run_without_metrics_has_none(run: RunDirectory) -> None:
+    assert list(run.metrics()) == []
+    assert run.metrics_size() == 0
+    run.rewind_metrics(0)
+    assert not (run.path / "metrics.jsonl").exists()
+
+
+def test_rewinding_drops_what_came_after_the_checkpoint(run: RunDirectory) -> None:
+    for i in range(3):
+        run.log({"update": i})
+    save(run, 3)
+    for i in range(3, 6):
+        run.log({"update": i})
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    run.rewind_metrics(found[1]["metrics_bytes"])
+    assert [r["update"] for r in run.metrics()] == [0, 1, 2]
+    run.log({"update": 3})
+    assert [r["update"] for r in run.metrics()] == [0, 1, 2, 3]
+
+
+def test_rewinding_to_beyond_the_end_changes_nothing(run: RunDirectory) -> None:
+    run.log({"update": 0})
+    run.rewind_metrics(10_000)
+    assert [r["update"] for r in run.metrics()] == [0]
+
+
+@pytest.mark.parametrize("rest", ['{"update": 2', '{"update": 2}', "{"])
+def test_a_half_written_last_line_is_left_out(run: RunDirectory, rest: str) -> None:
+    run.log({"update": 1})
+    run.close()
+    with (run.path / "metrics.jsonl").open("a") as file:
+        file.write(rest)
+    assert [r["update"] for r in run.metrics()] == [1]
+
+
+def test_a_damaged_line_in_the_middle_is_an_error_that_names_the_file(run: RunDirectory) -> None:
+    (run.path / "metrics.jsonl").write_text('{"update": 1}\n{"upd\n{"update": 3}\n')
+    with pytest.raises(SkillweaveError) as caught:
+        list(run.metrics())
+    assert str(run.path / "metrics.jsonl") in str(caught.value)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+def test_metrics_on_a_full_disk_say_so_and_the_run_can_still_be_closed(tmp_path: Path) -> None:
+    run = RunDirectory.create(tmp_path / "run", manifest())
+    (run.path / "metrics.jsonl").symlink_to("/dev/full")
+    with pytest.raises(SkillweaveError, match="No space left") as caught:
+        run.log({"update": 1})
+    assert "skillweave resume" in str(caught.value)
+    run.close()

@@ -1,0 +1,118 @@
+"""Trackers: written where they should be, never asking for a login, missing extras named."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import TRACKERS, make_trackers
+from skillweave.types import MissingExtra, SkillweaveError
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunDirectory:
+    return RunDirectory.create(tmp_path / "run", {"env": "CartPole-v1", "seed": 0, "phases": []})
+
+
+def test_no_trackers_are_made_where_none_are_named(run: RunDirectory) -> None:
+    assert make_trackers((), run) == ()
+
+
+def test_an_unknown_tracker_is_answered_with_those_there_are(run: RunDirectory) -> None:
+    with pytest.raises(SkillweaveError, match="'tensorbored'; there are: tensorboard, wandb"):
+        make_trackers(("tensorbored",), run)
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_a_missing_package_names_its_extra(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = importlib.util.find_spec
+
+    def without(wanted: str, package: str | None = None) -> Any:
+        return None if wanted == name else real(wanted, package)
+
+    monkeypatch.setattr(importlib.util, "find_spec", without)
+    with pytest.raises(MissingExtra, match=rf"pip install 'skillweave\[{name}\]'"):
+        make_trackers((name,), None)
+    for other in set(TRACKERS) - {name}:
+        if real(other):
+            assert make_trackers((other,), None) == ()
+
+
+def test_a_missing_package_is_said_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from skillweave import Hierarchy, Skill
+
+    class Balance(Skill):
+        pass
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda *_: None)
+    with pytest.raises(MissingExtra):
+        Hierarchy("CartPole-v1", [Balance()]).train(tmp_path / "run", track=["wandb"])
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_tensorboard_gets_every_scalar_over_environment_steps(run: RunDirectory) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    (tracker,) = make_trackers(("tensorboard",), run)
+    tracker.phase("landing", 1000)
+    tracker.tick("landing", 128, 0.5, {"return": 1.5, "kl": 0.25})
+    tracker.tick("landing", 256, 1.0, {"return": 2.5, "kl": 0.5})
+    tracker.done("landing", 256, 1.0, {"return": 2.5})
+    tracker.close()
+    assert list((run.path / "tensorboard").glob("events.out.tfevents.*"))
+    events = EventAccumulator(str(run.path / "tensorboard")).Reload()
+    assert set(events.Tags()["scalars"]) == {"landing/return", "landing/kl"}
+    points = [(e.step, e.value) for e in events.Scalars("landing/return")]
+    assert points == [(128, 1.5), (256, 2.5)]
+
+
+OFFLINE = """
+import socket, sys
+from pathlib import Path
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import make_trackers
+
+run = RunDirectory.create(Path(sys.argv[1]), {"env": "CartPole-v1", "seed": 0, "phases": []})
+(tracker,) = make_trackers(("wandb",), run)
+tracker.phase("landing", 1000)
+tracker.tick("landing", 128, 0.5, {"return": 1.5})
+tracker.done("landing", 128, 0.5, {"return": 1.5})
+tracker.close()
+"""
+
+
+def test_wandb_without_a_login_works_offline_and_asks_for_nothing(tmp_path: Path) -> None:
+    if importlib.util.find_spec("wandb") is None:
+        pytest.skip("wandb is not installed")
+    env = {k: v for k, v in os.environ.items() if not k.startswith("WANDB") and k != "NETRC"}
+    home = tmp_path / "home"
+    home.mkdir()
+    nowhere = "http://127.0.0.1:9"  # a port at which nothing listens: no network
+    env |= {"HOME": str(home), "WANDB_BASE_URL": nowhere}
+    env |= {"HTTPS_PROXY": nowhere, "HTTP_PROXY": nowhere}
+    done = subprocess.run(
+        [sys.executable, "-c", OFFLINE, str(tmp_path / "run")],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        env=env,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert "log" not in done.stderr.lower(), "it talks of a login"
+    written = list((tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb"))
+    assert len(written) == 1
+    assert b"landing/return" in written[0].read_bytes()
