@@ -152,14 +152,14 @@ class PPOAlgorithm:
         )
         active = torch.ones(len(seeds), dtype=torch.bool)
         counted = torch.zeros(len(seeds))
-        sums = dict.fromkeys(REPORT, torch.zeros(len(seeds)))
+        sums = torch.zeros(len(REPORT), len(seeds))
         for batch in self._minibatches(data, seeds):
             loss, report = self.loss(leaves, state, batch, ent_coef)
             grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
             grad = torch.cat([g.flatten(1) for g in grads], dim=1)
             report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
             counted = counted + active
-            sums = {k: v + report[k] * active for k, v in sums.items()}
+            sums.addcmul_(torch.stack([report[k] for k in REPORT]), active.float())
             if limit is not None:
                 # As in Stable-Baselines3: a member stops before the step that oversteps.
                 active = active & (report["kl"] <= limit)
@@ -169,7 +169,7 @@ class PPOAlgorithm:
                 state.params, grad, state.mu, state.nu, state.count, rate,
                 eps=cfg.adam_eps, active=None if limit is None else active,
             )  # fmt: skip
-        metrics |= {k: v / counted for k, v in sums.items()}
+        metrics |= dict(zip(REPORT, sums / counted, strict=True))
         if cfg.learning_rate_schedule == "kl":
             target = torch.full_like(rate, cfg.target_kl or 0.0)
             state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)

@@ -21,8 +21,8 @@ Views = Mapping[str, Tensor]
 """Named parameters, each (P, *shape)."""
 
 ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
-    "tanh": torch.tanh,
-    "relu": torch.relu,
+    "tanh": torch.tanh_,
+    "relu": torch.relu_,  # in place: nothing else reads what goes in
     "elu": F.elu,
     "silu": F.silu,
     "gelu": F.gelu,

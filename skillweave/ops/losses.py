@@ -23,7 +23,7 @@ def ppo_policy_loss(
     """
     ratio = torch.exp(log_prob - old_log_prob)
     eps = clip_coef[:, None]
-    clipped = torch.minimum(torch.maximum(ratio, 1.0 - eps), 1.0 + eps)
+    clipped = torch.clamp(ratio, 1.0 - eps, 1.0 + eps)
     return -torch.minimum(ratio * advantage, clipped * advantage).mean(1)
 
 

@@ -177,7 +177,8 @@ class Spy(PPOAlgorithm):
         self.versions.append(self.actor(state))
         obs, head = rollout.transition.obs.flatten(1, 2), rollout.head.flatten(1, 2)
         with torch.no_grad():
-            acted = [torch.allclose(self.net.act(a, obs, None, None)[1], head) for a in self.versions]
+            heads = [self.net.act(a, obs, None, None)[1] for a in self.versions]
+            acted = [torch.allclose(h, head) for h in heads]
         self.lags.append(acted[::-1].index(True))
         return super().update(state, rollout, progress, seeds)
 
