@@ -71,7 +71,10 @@ def main() -> None:
         for seed in given.seeds:
             rows.append(child(given.recipe, seed, kind == "flat", given.set))
             shown = [k for k in rows[0] if k not in ("usage", "phases")]
-            print(f"{kind}:\n" + table(shown, [[_short(r[k]) for k in shown] for r in rows]), flush=True)
+            print(
+                f"{kind}:\n" + table(shown, [[_short(r[k]) for k in shown] for r in rows]),
+                flush=True,
+            )
         for key, worst in (("score", min), ("solved", min), ("seconds", max), ("peak_mb", max)):
             result[f"{kind}_{key}_median"] = median(r[key] for r in rows)
             result[f"{kind}_{key}_worst"] = worst(r[key] for r in rows)

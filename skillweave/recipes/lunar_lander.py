@@ -48,7 +48,6 @@ class Landing(Skill):
     # The tutorial's landing lasts as long as its episode. Cut here like the other two (its value
     # is bootstrapped, so what is optimal stays so), training sees more descents than hovering.
     max_steps = 300
-    steps = 2_200_000
 
     def reward(self, step: Step) -> Array:
         """1 less x², y² and the angle; at an episode's end the environment's own reward."""
@@ -65,12 +64,21 @@ def landed(obs: Array) -> Array:
 
 RELU = MLP(activation="relu")  # tanh costs more than all the rest of so small a network
 
-# Under γ the landing's +100 outweighs hovering's +1 a step for ever only below γ = 0.99, and the
-# less exploration there is at first, the longer a lander that hovers takes to find that out.
-SKILLS = PPO(
+HOLDING = PPO(
+    learning_rate=1e-3,
+    gamma=0.98,
+    batch_size=512,
+    update_epochs=6,
+    normalize_obs=True,
+    network=RELU,
+)
+# A landing is worth more than hovering for ever (+100 once against +1 a step) only where γ is
+# well below 0.99, and only to who has found out how to touch the ground without crashing: hence
+# much exploration at first, and a budget several times that of the other two.
+LANDING = PPO(
     learning_rate=2e-3,
     gamma=0.98,
-    ent_coef=0.02,
+    ent_coef=0.05,
     ent_coef_final=0.002,
     normalize_obs=True,
     network=RELU,
@@ -83,9 +91,11 @@ hierarchy = Hierarchy(
     skills=[Stabilize(), Center(), Landing()],
     call_steps=10,
     reflexes=[Reflex(landed, action=0, name="engines off")],
-    algorithm=SKILLS,
+    algorithm=HOLDING,
     selector=SELECTOR,
     flat=FLAT,
-    skill_steps=200_000,
-    selector_steps=800_000,
+    skill_steps=250_000,
+    selector_steps=600_000,
 )
+hierarchy.skill("landing").algorithm = LANDING
+hierarchy.skill("landing").steps = 2_800_000

@@ -65,9 +65,13 @@ class Brake(Skill):
 
 
 class Touchdown(Skill):
-    """Come to rest on the pad, soon and upright, whatever the fuel."""
+    """From low above the ground, come to rest on the pad, soon and upright, whatever the fuel."""
 
-    max_steps = 400
+    max_steps = 300
+
+    def initiation(self, obs: Array) -> Array:
+        """Low enough: what is above is for the others."""
+        return obs[:, Y] < 0.6
 
     def reward(self, step: Step) -> Array:
         """Progress towards the pad, 1 for each leg that touches it, ±10 for how it ends."""
