@@ -58,6 +58,7 @@ def main() -> None:
     parser.add_argument("--recipe", default="lunar-lander")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--no-flat", action="store_true")
+    parser.add_argument("--no-hierarchy", action="store_true")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--one", type=int)
     parser.add_argument("--flat-one", action="store_true")
@@ -66,7 +67,8 @@ def main() -> None:
         print(json.dumps(one(given.recipe, given.one, given.flat_one, given.set)))
         return
     result: dict[str, object] = {"recipe": given.recipe, "settings": given.set}
-    for kind in ("hierarchy",) if given.no_flat else ("hierarchy", "flat"):
+    kinds = ["hierarchy"] * (not given.no_hierarchy) + ["flat"] * (not given.no_flat)
+    for kind in kinds:
         rows = []
         for seed in given.seeds:
             rows.append(child(given.recipe, seed, kind == "flat", given.set))
@@ -79,7 +81,7 @@ def main() -> None:
             result[f"{kind}_{key}_median"] = median(r[key] for r in rows)
             result[f"{kind}_{key}_worst"] = worst(r[key] for r in rows)
         result[kind] = rows
-    report(f"hierarchy-{given.recipe}", result)
+    report("-".join([*kinds, given.recipe]), result)
 
 
 def _short(value: float) -> str:

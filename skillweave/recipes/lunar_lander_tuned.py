@@ -20,7 +20,8 @@ def nearness(obs: Array, height: float) -> Array:
     """Minus the distance to the point above the pad, the speed and the tilt, (N,)."""
     distance = np.hypot(obs[:, X], obs[:, Y] - height)
     speed = np.hypot(obs[:, VX], obs[:, VY])
-    return -10.0 * (distance + speed + np.abs(obs[:, ANGLE]))
+    score: Array = -10.0 * (distance + speed + np.abs(obs[:, ANGLE]))
+    return score
 
 
 def fuel(step: Step) -> Array:
