@@ -1,6 +1,6 @@
 """Figures 4 and 5: flat PPO, training time until an evaluation reaches 200, score after 30 s.
 
-    python -m benchmarks.flat [--seeds 0 1 2 3 4] [--steps 2000000]
+    python -m benchmarks.flat [--seeds 0 1 2 3 4] [--steps 2500000]
 
 The policy is copied once a second of training and scored afterwards, greedily, over 100 episodes
 of Gymnasium's environment with seeds that training never saw.
@@ -63,7 +63,7 @@ def learn(seed: int, steps: int, every: float) -> dict[str, object]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--steps", type=int, default=2_000_000)
+    parser.add_argument("--steps", type=int, default=2_500_000)
     parser.add_argument("--every", type=float, default=1.0)
     given = parser.parse_args()
     warm_up()

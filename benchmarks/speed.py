@@ -15,7 +15,7 @@ from pathlib import Path
 from unittest import mock
 
 from benchmarks.common import Recorder, engine_maker, median, report, table, warm_up
-from skillweave import recipes
+from skillweave import Hierarchy, recipes
 from skillweave.hierarchy import training
 
 
@@ -38,18 +38,29 @@ def stable_baselines3(steps: int, seed: int) -> float:
     return model.num_timesteps / seconds
 
 
-def trained(seed: int, flat: bool, flat_steps: int) -> tuple[dict[str, float], float]:
-    """Steps/s of each phase, and of EnvPool alone fed with the last phase's calls."""
-    record: list[Recorder] = []
+def flat(seed: int, steps: int) -> tuple[float, float]:
+    """Steps/s of the flat agent, and of EnvPool alone fed with its calls."""
     hierarchy = recipes.load("lunar-lander")
-    if flat:
-        hierarchy.scale(flat_steps / hierarchy.total_steps)
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        mock.patch.object(training, "make_engine", engine_maker(record)),
-    ):
+    hierarchy.scale(steps / hierarchy.total_steps)
+    return trained(hierarchy, seed, True)
+
+
+def selector(seed: int) -> tuple[float, float]:
+    """Steps/s of the selector over the shipped skills, and of EnvPool alone fed with its calls."""
+    run = Hierarchy.pretrained("lunar-lander")
+    hierarchy = run.hierarchy
+    for skill, policy in zip(hierarchy.skills, run.policy.skills.policies, strict=True):
+        skill.policy = policy
+    return trained(hierarchy, seed, False)
+
+
+def trained(hierarchy: Hierarchy, seed: int, flat: bool) -> tuple[float, float]:
+    record: list[Recorder] = []
+    patched = mock.patch.object(training, "make_engine", engine_maker(record))
+    with tempfile.TemporaryDirectory() as folder, patched:
         run = hierarchy.train(Path(folder) / "run", seed=seed, flat=flat, quiet=True)
-        speed = {p["name"]: p["steps_per_second"] for p in run.info()["phases"]}
+        speed = run.info()["phases"][-1]["steps_per_second"]
+    record[-1].replay()  # once to warm up
     steps, seconds = record[-1].replay()
     return speed, steps / seconds
 
@@ -57,26 +68,26 @@ def trained(seed: int, flat: bool, flat_steps: int) -> tuple[dict[str, float], f
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--flat-steps", type=int, default=1_800_000)
-    parser.add_argument("--sb3-steps", type=int, default=49_152)
+    parser.add_argument("--flat-steps", type=int, default=2_500_000)
+    parser.add_argument("--sb3-steps", type=int, default=32_768)
     given = parser.parse_args()
     warm_up()
     rows = []
     for seed in given.seeds:
         theirs = stable_baselines3(given.sb3_steps, seed)
-        flat, flat_pool = trained(seed, True, given.flat_steps)
-        parts, selector_pool = trained(seed, False, 0)
+        flat_speed, flat_pool = flat(seed, given.flat_steps)
+        selector_speed, selector_pool = selector(seed)
         rows.append(
             {
                 "seed": seed,
                 "sb3": theirs,
-                "flat": flat["flat"],
-                "flat_over_sb3": flat["flat"] / theirs,
+                "flat": flat_speed,
+                "flat_over_sb3": flat_speed / theirs,
                 "envpool_on_flat": flat_pool,
-                "flat_over_envpool": flat["flat"] / flat_pool,
-                "selector": parts["selector"],
+                "flat_over_envpool": flat_speed / flat_pool,
+                "selector": selector_speed,
                 "envpool_on_selector": selector_pool,
-                "selector_over_envpool": parts["selector"] / selector_pool,
+                "selector_over_envpool": selector_speed / selector_pool,
             }
         )
         print(

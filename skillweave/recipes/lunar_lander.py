@@ -83,8 +83,15 @@ LANDING = PPO(
     normalize_obs=True,
     network=RELU,
 )
-SELECTOR = PPO(gamma=0.999, gae_lambda=0.98, n_steps=16, batch_size=512, network=RELU)
-FLAT = PPO(gamma=0.999, gae_lambda=0.98, normalize_obs=True, network=RELU)
+SELECTOR = PPO(
+    num_envs=128,  # fewer, longer steps of the engine: acting costs nearly the same for all
+    n_steps=8,
+    batch_size=512,
+    gamma=0.999,
+    gae_lambda=0.98,
+    network=RELU,
+)
+FLAT = PPO(update_epochs=3, gamma=0.999, gae_lambda=0.98, normalize_obs=True, network=RELU)
 
 hierarchy = Hierarchy(
     env="LunarLander-v3",
