@@ -39,7 +39,7 @@ bench: .venv/dev
 	$(BIN)/python -m benchmarks
 
 figures: .venv/dev
-	$(BIN)/python -m benchmarks.figures
+	$(BIN)/python -m benchmarks --all
 
 weights: .venv/demo
 	$(foreach r,lunar-lander lunar-lander-tuned,rm -rf runs/weights-$(r) && \

@@ -88,10 +88,12 @@ class Hierarchy(Declaration):
         spec = EnvSpec(manifest["env"], kwargs=manifest["env_kwargs"])
         if not spec.is_data:
             raise SkillweaveError(f"the environment {spec.name!r} names code; give the recipe")
-        call_steps = 1 if manifest["kind"] == "flat" else manifest["call_steps"]
+        flat = manifest["kind"] == "flat"
+        call_steps = 1 if flat else manifest["call_steps"]
+        described = manifest.get("skills") or [{"name": "task", "max_steps": None}]
         skills = [
             type(s["name"], (Skill,), {"name": s["name"], "max_steps": s["max_steps"]})()
-            for s in manifest["skills"]
+            for s in described
         ]
         return cls(spec, skills, call_steps=call_steps)
 
@@ -184,8 +186,6 @@ class Run:
 
     def save_weights(self, path: str | Path) -> Path:
         """Write every policy into one file for ``Hierarchy.load_weights``."""
-        if not isinstance(self.policy, HierarchyPolicy):
-            raise SkillweaveError("a flat agent's weights are already one file, in policies/")
         write_weights(Path(path), self.hierarchy, self.policy, self.hierarchy.recipe)
         return Path(path)
 

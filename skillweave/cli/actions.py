@@ -145,7 +145,10 @@ def _target(command: commands.Watched) -> Run:
     if path.is_dir():
         return _hierarchy_of_run(path, command.recipe).load(path)
     if path.suffix == ".safetensors":
-        recipe = command.recipe or read_tensors(path)[1].get("recipe")
+        header = read_tensors(path)[1]
+        if header.get("kind") == "agent" and "env" in header:
+            return Hierarchy.from_manifest(header | {"kind": "flat"}).load_weights(path)
+        recipe = command.recipe or header.get("recipe")
         return _declared(recipe, command.recipe, path).load_weights(path)
     hint = (
         " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""

@@ -14,10 +14,14 @@ from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.types import Policy, SkillweaveError
 
 
-def write_weights(
-    path: Path, declaration: Declaration, policy: HierarchyPolicy, recipe: str | None
-) -> None:
-    """Write skills and selector; skills whose policies came ready are named, not saved."""
+def write_weights(path: Path, declaration: Declaration, policy: Policy, recipe: str | None) -> None:
+    """Write skills and selector, or a flat agent; policies that came ready are not saved."""
+    place = {"env": declaration.spec.name, "env_kwargs": declaration.spec.kwargs}
+    if isinstance(policy, AgentPolicy):
+        weights, description = policy.to_file()
+        write_tensors(path, weights, description | place)
+        return
+    assert isinstance(policy, HierarchyPolicy)
     tensors: dict[str, Tensor] = {}
     parts: dict[str, Any] = {}
     named: list[tuple[str, Policy]] = [("selector", policy.selector)]
@@ -31,7 +35,7 @@ def write_weights(
     header = {
         "kind": "hierarchy",
         "recipe": recipe,
-        "env": declaration.spec.name,
+        **place,
         "skills": [s.name for s in declaration.skills],
         "call_steps": declaration.call_steps,
         "greedy_skills": declaration.greedy_skills,
@@ -40,7 +44,7 @@ def write_weights(
     write_tensors(path, tensors, header)
 
 
-def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy:
+def read_weights(declaration: Declaration, path: Path) -> Policy:
     """The inverse of ``write_weights``; the declaration takes over the file's call length.
 
     Raises:
@@ -48,6 +52,8 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy:
     """
     tensors, header = read_tensors(path)
     names = [s.name for s in declaration.skills]
+    if header.get("kind") == "agent":
+        return AgentPolicy.from_file(tensors, header, str(path))
     if header.get("kind") != "hierarchy":
         raise SkillweaveError(f"{path} holds a {header.get('kind')}, not a hierarchy")
     if header["skills"] != names or header["env"] != declaration.spec.name:

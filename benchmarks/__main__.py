@@ -1,0 +1,27 @@
+"""``make bench``: the quick ones. ``make figures`` runs all of them on all seeds (an hour)."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+QUICK = (["startup"], ["updates"], ["speed", "--seeds", "0"], ["flat", "--seeds", "0"])
+ALL = (
+    ["startup"],
+    ["updates"],
+    ["speed"],
+    ["flat"],
+    ["hierarchy"],
+    ["hierarchy", "--recipe", "lunar-lander-tuned"],
+    ["ablation"],
+)
+
+
+def main() -> None:
+    for name, *arguments in ALL if "--all" in sys.argv else QUICK:
+        print(f"== {name}", flush=True)
+        subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *arguments], check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,27 @@
+"""Figure 9: how long ``skillweave --help`` takes, against ``python -c pass`` in the same run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+from benchmarks.common import median, report
+
+
+def seconds(*arguments: str) -> float:
+    times = []
+    for _ in range(10):
+        started = time.perf_counter()
+        subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+        times.append(time.perf_counter() - started)
+    return median(times)
+
+
+def main() -> None:
+    bare, ours = seconds("-c", "pass"), seconds("-m", "skillweave", "--help")
+    report("startup", {"help_seconds": ours, "bare_python_seconds": bare, "ratio": ours / bare})
+
+
+if __name__ == "__main__":
+    main()

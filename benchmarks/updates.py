@@ -1,0 +1,61 @@
+"""One PPO update of P members in a stack against the same updates one by one, in the same run."""
+
+from __future__ import annotations
+
+import time
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from benchmarks.common import report, table
+from skillweave import MLP, PPO
+from skillweave.algorithms.ppo import PPOAlgorithm, Rollout
+from skillweave.seeding import Seeds
+from skillweave.types import Transition
+
+
+def rollout(members: int, samples: int) -> Rollout:
+    g = torch.Generator().manual_seed(0)
+    lead = (members, samples, 1)
+    transition = Transition(
+        obs=torch.randn(*lead, 8, generator=g),
+        action=torch.randint(0, 4, lead, generator=g),
+        reward=torch.randn(lead, generator=g),
+        discount=torch.full(lead, 0.99),
+        next_obs=torch.randn(*lead, 8, generator=g),
+        last=torch.rand(lead, generator=g) < 0.05,
+    )
+    return Rollout(transition, torch.randn(*lead, 4, generator=g), None)
+
+
+def seconds(members: int, samples: int, repeats: int) -> float:
+    space = gym.spaces.Box(-np.inf, np.inf, (8,))
+    config = PPO(num_envs=1, n_steps=samples, batch_size=samples, network=MLP(activation="relu"))
+    algorithm = PPOAlgorithm(config, space, gym.spaces.Discrete(4))
+    seeds = [Seeds(0) / m for m in range(members)]
+    state, data = algorithm.init(seeds), rollout(members, samples)
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        algorithm.update(state, data, 0.0, seeds)
+        times.append(time.perf_counter() - started)
+    return float(np.median(times))
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    rows = []
+    for samples in (64, 256, 1024):
+        one = seconds(1, samples, 20)
+        for members in (1, 8, 16):
+            together = seconds(members, samples, 20)
+            ratio = together / (one * members)
+            rows.append([members, samples, f"{1e3 * together:.2f}", f"{ratio:.2f}"])
+    header = ["members", "samples", "ms a stacked update", "÷ one by one"]
+    print(table(header, rows))
+    report("updates", {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()
