@@ -3,8 +3,8 @@
     python -m benchmarks.ablation [--seeds 0 1 2]
 
 The skills are trained once a seed, as the recipe says; then only the selector is trained anew,
-with one thing changed at a time. ``landing alone`` has no selector. The last rows train the landing skill
-with other settings and score it alone, since the selector cannot be better than what it selects from.
+with one thing changed at a time. The last rows train the landing skill with other settings and
+score it alone, since the selector cannot be better than what it selects from.
 """
 
 from __future__ import annotations

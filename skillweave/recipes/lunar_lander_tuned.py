@@ -43,7 +43,8 @@ class Approach(Skill):
 
     def success(self, step: Step) -> Array:
         """Within 0.15 of the point, and slow."""
-        return nearness(step.next_obs, self.height) > -3.0
+        near: Array = nearness(step.next_obs, self.height) > -3.0
+        return near
 
     def termination(self, step: Step) -> Array:
         """There is nothing more to approach."""
@@ -75,11 +76,13 @@ class Touchdown(Skill):
         progress = nearness(step.next_obs, 0.0) - nearness(step.obs, 0.0)
         legs = (step.next_obs[:, 6:] - step.obs[:, 6:]).sum(axis=1)
         ending = np.where(step.terminated, np.where(step.reward > 0, 10.0, -10.0), 0.0)
-        return progress + legs + ending - 0.02
+        reward: Array = progress + legs + ending - 0.02
+        return reward
 
     def success(self, step: Step) -> Array:
         """At rest."""
-        return step.terminated & (step.reward > 0)
+        rested: Array = step.terminated & (step.reward > 0)
+        return rested
 
 
 LEARNER = PPO(
