@@ -252,7 +252,7 @@ def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stoppe
     def hierarchy() -> Hierarchy:
         found = recipes.load("lunar-lander")
         budgets = ["skills.stabilize.steps=1", "skills.center.steps=1", "selector_steps=1"]
-        apply_settings(found, [*budgets, "skill_steps=24000", "cut_every=1"])
+        apply_settings(found, [*budgets, "skills.landing.steps=24000", "cut_every=1"])
         return found
 
     hierarchy().train(tmp_path / "whole", seed=0, quiet=True)

@@ -86,6 +86,9 @@ class AgentPolicy:
         Raises:
             SkillweaveError: tensors are missing or have other shapes than the header says.
         """
+        missing = [k for k in ("algorithm", "observation_space", "action_space") if k not in header]
+        if missing:
+            raise SkillweaveError(f"{where} holds no agent: its header has no {', '.join(missing)}")
         spaces = (space_from_json(header[f"{k}_space"]) for k in ("observation", "action"))
         algorithm = make_algorithm(config_from_json(header["algorithm"]), *spaces)
         wanted = algorithm.weight_shapes()

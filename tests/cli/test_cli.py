@@ -284,8 +284,10 @@ def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
     call: Call, tmp_path: Path
 ) -> None:
     before = recipes.load("lunar-lander").total_steps
-    small = ("--set", "skill_steps=100", "--set", "selector_steps=100", "--scale", 0.5)
+    budgets = ("skill_steps=100", "skills.landing.steps=100", "selector_steps=100")
+    small = (*(part for b in budgets for part in ("--set", b)), "--scale", 0.5)
     tiny = [f"algorithm.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
+    tiny += [f"skills.landing.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
     tiny += [f"selector.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
     sets = [part for setting in tiny for part in ("--set", setting)]
     for number in range(2):
@@ -431,7 +433,7 @@ def test_list_shows_recipes_and_the_runs_here_even_a_damaged_one(
 # Mistakes
 
 MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
-    "recipe": (["train", "lunar-landr"], 1, ["'lunar-landr'", "Did you mean lunar-lander?"]),
+    "recipe": (["train", "lunar-landr"], 1, ["'lunar-landr'", "Did you mean lunar-lander"]),
     "recipe file": (["train", "nowhere.py"], 1, ["'nowhere.py'", "lunar-lander"]),
     "setting": (["train", "PLAIN", "--set", "selector.gama=0.9"], 1, ["selector.gamma"]),
     "plain setting": (["train", "PLAIN", "--set", "call_step=9"], 1, ["call_steps"]),
@@ -447,7 +449,6 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "final episodes": (["train", "PLAIN", "--evaluate", "-1"], 1, ["evaluate", "-1"]),
     "skill": (["evaluate", "RUN", "--skill", "lift"], 1, ["'lift'", "left, balance"]),
     "flat skill": (["evaluate", "FLAT", "--skill", "left"], 1, ["flat"]),
-    "flat weights": (["weights", "FLAT"], 1, ["flat"]),
     "target": (["evaluate", "nothing"], 1, ["nothing is neither a run nor a weights file"]),
     "target is a recipe": (["evaluate", "lunar-lander"], 1, ["--pretrained"]),
     "no run": (["info", "."], 1, ["holds no run"]),

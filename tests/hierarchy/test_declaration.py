@@ -445,11 +445,6 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
         read_weights(declare(), tmp_path / "nowhere")
 
 
-def test_a_flat_agent_has_no_weights_file_of_a_hierarchy(tmp_path):
-    with pytest.raises(SkillweaveError, match="flat"):
-        Run(declare(), tmp_path, agent(0)).save_weights(tmp_path / "w")
-
-
 # A hierarchy as a skill -----------------------------------------------------------------------
 
 
