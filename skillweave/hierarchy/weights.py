@@ -52,7 +52,7 @@ def read_weights(declaration: Declaration, path: Path) -> Policy:
     """
     tensors, header = read_tensors(path)
     names = [s.name for s in declaration.skills]
-    if header.get("kind") == "agent":
+    if header.get("kind") == "agent" and "algorithm" in header:
         return AgentPolicy.from_file(tensors, header, str(path))
     if header.get("kind") != "hierarchy":
         raise SkillweaveError(f"{path} holds a {header.get('kind')}, not a hierarchy")
