@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from skillweave import recipes
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -209,4 +208,4 @@ class Run:
         return self.policy.skills.policies[names.index(skill)]
 
 
-__all__ = ["AgentPolicy", "Hierarchy", "Run"]
+__all__ = ["Hierarchy", "Run"]

@@ -155,3 +155,21 @@ class Policy(Protocol):
     def acting(self, memory: Memory) -> Array | None:
         """(n,) int64, the skill that acts in each environment (a row of ``labels``), or None."""
         ...
+
+
+class Memoryless:
+    """The part of a ``Policy`` that is the same for all that remember nothing."""
+
+    labels: tuple[str, ...] = ()
+
+    def start(self, n: int) -> Memory:
+        """Nothing to remember."""
+        return {}
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """Nothing to notice."""
+        return memory
+
+    def acting(self, memory: Memory) -> Array | None:
+        """No skills below: None."""
+        return None

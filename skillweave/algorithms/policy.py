@@ -11,7 +11,7 @@ from torch import Tensor
 from skillweave.algorithms.config import PPO, config_from_json, config_to_json
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.spaces import space_from_json, space_to_json
-from skillweave.types import Array, Memory, SkillweaveError, Step
+from skillweave.types import Array, Memory, Memoryless, SkillweaveError
 
 
 def make_algorithm(config: PPO, observation_space: Any, action_space: Any) -> PPOAlgorithm:
@@ -19,10 +19,8 @@ def make_algorithm(config: PPO, observation_space: Any, action_space: Any) -> PP
     return PPOAlgorithm(config, observation_space, action_space)
 
 
-class AgentPolicy:
+class AgentPolicy(Memoryless):
     """One trained agent; a copy of what acting needs, independent of further learning."""
-
-    labels: tuple[str, ...] = ()
 
     def __init__(self, algorithm: PPOAlgorithm, weights: dict[str, Tensor]) -> None:
         self._algorithm, self.weights = algorithm, weights
@@ -34,10 +32,6 @@ class AgentPolicy:
     def of(cls, algorithm: PPOAlgorithm, state: State, member: int = 0) -> AgentPolicy:
         """The policy of one member of a state."""
         return cls(algorithm, algorithm.weights(state, member))
-
-    def start(self, n: int) -> Memory:
-        """Nothing to remember."""
-        return {}
 
     @torch.inference_mode()
     def act(
@@ -59,14 +53,6 @@ class AgentPolicy:
         rows = torch.from_numpy(np.ascontiguousarray(obs))[None]
         action, _ = self._algorithm.net.act(self._actor, rows, allowed, noise)
         return self._algorithm.net.head.codec.to_env(action[0].numpy()), memory
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Nothing to notice."""
-        return memory
-
-    def acting(self, memory: Memory) -> Array | None:
-        """No skills below: None."""
-        return None
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and the JSON that ``from_file`` needs."""

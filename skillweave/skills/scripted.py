@@ -8,13 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.types import Array, Memory, Step
+from skillweave.types import Array, Memory, Memoryless
 
 
-class ScriptedPolicy:
+class ScriptedPolicy(Memoryless):
     """A function from observations (n, *obs_shape) to actions (n, *action_shape) as a policy."""
-
-    labels: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -24,10 +22,6 @@ class ScriptedPolicy:
     ) -> None:
         self.function = function
         self.observation_space, self.action_space = observation_space, action_space
-
-    def start(self, n: int) -> Memory:
-        """Nothing to remember."""
-        return {}
 
     def act(
         self,
@@ -40,11 +34,3 @@ class ScriptedPolicy:
     ) -> tuple[Array, Memory]:
         """The function's actions."""
         return np.asarray(self.function(obs)), memory
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Nothing to notice."""
-        return memory
-
-    def acting(self, memory: Memory) -> Array | None:
-        """No skills below: None."""
-        return None

@@ -43,14 +43,13 @@ class Phase:
     budget: int
     make_env: Callable[[AlgorithmConfig], VecEnv]
 
-    def entry(self, **more: Any) -> dict[str, Any]:
+    def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
         return {
             "name": self.name,
             "budget": self.budget,
             "algorithm": config_to_json(self.config),
             "status": "waiting",
-            **more,
         }
 
 
