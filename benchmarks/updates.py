@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from benchmarks.common import report, table
-from skillweave import MLP, PPO
+from skillweave import PPO, Network
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout
 from skillweave.seeding import Seeds
 from skillweave.types import Transition
@@ -31,7 +31,7 @@ def rollout(members: int, samples: int) -> Rollout:
 
 def seconds(members: int, samples: int, repeats: int) -> float:
     space = gym.spaces.Box(-np.inf, np.inf, (8,))
-    config = PPO(num_envs=1, n_steps=samples, batch_size=samples, network=MLP(activation="relu"))
+    config = PPO(num_envs=1, n_steps=samples, batch_size=samples, network=Network(activation="relu"))
     algorithm = PPOAlgorithm(config, space, gym.spaces.Discrete(4))
     seeds = [Seeds(0) / m for m in range(members)]
     state, data = algorithm.init(seeds), rollout(members, samples)

@@ -6,12 +6,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skillweave.algorithms.config import PPO
+    from skillweave.algorithms.config import DQN, PPO, SAC, TD3
     from skillweave.api import Hierarchy, Run
     from skillweave.envs.make import EnvSpec
     from skillweave.hierarchy.options import OptionsEnv
-    from skillweave.networks.config import MLP
-    from skillweave.skills import Reflex, Skill
+    from skillweave.networks.config import CNN, RNN, Network
+    from skillweave.networks.encoders import Encoder, register_encoder
+    from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
     from skillweave.training.evaluation import Evaluation, evaluate
     from skillweave.types import Array, SkillweaveError, Step
 
@@ -19,27 +20,44 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Array": "types",
+    "CNN": "networks.config",
+    "DQN": "algorithms.config",
+    "Encoder": "networks.encoders",
     "EnvSpec": "envs.make",
     "Evaluation": "training.evaluation",
     "Hierarchy": "api",
-    "MLP": "networks.config",
+    "Network": "networks.config",
     "OptionsEnv": "hierarchy.options",
     "PPO": "algorithms.config",
+    "RNN": "networks.config",
     "Reflex": "skills",
     "Run": "api",
+    "SAC": "algorithms.config",
     "Skill": "skills",
     "SkillweaveError": "types",
     "Step": "types",
+    "TD3": "algorithms.config",
     "evaluate": "training.evaluation",
+    "from_function": "skills",
+    "from_onnx": "skills",
+    "from_sb3": "skills",
+    "from_torch": "skills",
+    "register_encoder": "networks.encoders",
 }
 
 __all__ = [
-    "MLP",
+    "CNN",
+    "DQN",
     "PPO",
+    "RNN",
+    "SAC",
+    "TD3",
     "Array",
+    "Encoder",
     "EnvSpec",
     "Evaluation",
     "Hierarchy",
+    "Network",
     "OptionsEnv",
     "Reflex",
     "Run",
@@ -47,6 +65,11 @@ __all__ = [
     "SkillweaveError",
     "Step",
     "evaluate",
+    "from_function",
+    "from_onnx",
+    "from_sb3",
+    "from_torch",
+    "register_encoder",
 ]
 
 

@@ -70,6 +70,9 @@ class VecStep:
     steps: Array  # (n,) int64
     mask: Array | None  # (n, A) bool, allowed actions in ``obs``; None: all
     info: dict[str, Any]
+    next_mask: Array | None = None
+    """(n, A) bool, allowed actions in ``next_obs``; None: as ``mask`` where the episode goes on,
+    all where it ended."""
 
     @property
     def ended(self) -> Array:
@@ -94,6 +97,25 @@ class Transition:
     next_obs: Tensor  # (P, T, B, *obs_shape)
     last: Tensor  # (P, T, B) bool
     mask: Tensor | None = None  # (P, T, B, A) bool
+
+
+@dataclass(slots=True)
+class Sample:
+    """A batch from a replay buffer: P members, B transitions of up to n steps each.
+
+    ``reward`` is the discounted sum over the n steps, ``discount`` what the value of
+    ``next_obs`` counts after them: 0 where the episode terminated, else γ^Στ.
+    """
+
+    obs: Tensor  # (P, B, *obs_shape)
+    action: Tensor  # (P, B) int64 or (P, B, A)
+    reward: Tensor  # (P, B) float32
+    discount: Tensor  # (P, B) float32
+    next_obs: Tensor  # (P, B, *obs_shape), the true successor
+    obs_mask: Tensor | None  # (P, B, A) bool, allowed actions in ``obs``; None: all
+    mask: Tensor | None  # (P, B, A) bool, allowed actions in ``next_obs``; None: all
+    weight: Tensor | None  # (P, B) float32, importance weights; None where drawn uniformly
+    index: Array  # (P, B) int64, which transitions these are, to give them new priorities
 
 
 class VecEnv(Protocol):

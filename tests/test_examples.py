@@ -9,12 +9,21 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 1
+COUNT = 2
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
-SMALL = {"sb3_selector.py": ("--steps", "3000", "--episodes", "2")}
+SMALL = {
+    "foreign_skills.py": ("--steps", "3000"),
+    "sb3_selector.py": ("--steps", "3000", "--episodes", "2"),
+}
 """Small budgets, for those that take long."""
-NEEDS = {"sb3_selector.py": "stable_baselines3"}
-SAYS = {"sb3_selector.py": "woven by the selector: "}
+NEEDS = {
+    "foreign_skills.py": ("stable_baselines3", "onnx", "onnxruntime"),
+    "sb3_selector.py": ("stable_baselines3",),
+}
+SAYS = {
+    "foreign_skills.py": "woven by the selector: ",
+    "sb3_selector.py": "woven by the selector: ",
+}
 
 
 def run(path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -32,8 +41,8 @@ def test_there_are_as_many_examples_as_are_known():
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.name)
 def test_an_example_runs_to_its_end(path, tmp_path):
-    if path.name in NEEDS:
-        pytest.importorskip(NEEDS[path.name])
+    for module in NEEDS.get(path.name, ()):
+        pytest.importorskip(module)
     done = run(path, *SMALL.get(path.name, ()))
     assert done.returncode == 0, done.stderr
     assert SAYS[path.name] in done.stdout

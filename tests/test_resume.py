@@ -28,7 +28,7 @@ SCRIPT = Path(__file__).parents[1] / "scripts" / "kill_and_resume.py"
 RECIPE = '''
 """A small hierarchy on CartPole with a piece of everything that could keep state."""
 import numpy as np
-from skillweave import MLP, PPO, EnvSpec, Hierarchy, Reflex, Skill
+from skillweave import Network, PPO, EnvSpec, Hierarchy, Reflex, Skill
 
 class Left(Skill):
     max_steps = 15
@@ -41,10 +41,10 @@ class Balance(Skill):
     def termination(self, step):
         return np.abs(step.next_obs[:, 0]) > 0.5
 
-small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=MLP(hidden=(8,)))
+small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=Network(hidden=(8,)))
 moving = PPO(
-    num_envs=4, n_steps=8, batch_size=32, update_epochs=1, network=MLP(hidden=(6,)), overlap=False,
-    normalize_obs=True, learning_rate_schedule="kl", target_kl=0.01, critic=MLP(hidden=(5, 5)),
+    num_envs=4, n_steps=8, batch_size=32, update_epochs=1, network=Network((6,)), overlap=False,
+    normalize_obs=True, learning_rate_schedule="kl", target_kl=0.01, critic=Network(hidden=(5, 5)),
 )
 Left.algorithm = moving
 hierarchy = Hierarchy(

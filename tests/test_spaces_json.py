@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from skillweave.spaces import space_from_json, space_to_json
 
@@ -35,6 +35,24 @@ def test_a_box_without_axes_survives_json():
     back = space_from_json(json.loads(json.dumps(space_to_json(space))))
     assert back == space
     assert back.shape == ()
+
+
+def test_bounds_that_are_all_equal_are_one_number_and_lists_are_still_read():
+    pixels = Box(0, 255, (84, 84, 3), np.uint8)
+    text = json.dumps(space_to_json(pixels))
+    assert len(text) < 100
+    assert space_from_json(json.loads(text)) == pixels
+    old = {"type": "Box", "shape": [2], "dtype": "float32", "low": ["-inf"] * 2, "high": [1, 1]}
+    space = Box(-np.inf, 1, (2,), np.float32)
+    assert space_from_json(old) == space
+    assert space_to_json(space)["low"] == "-inf"
+
+
+def test_the_names_of_a_dict_keep_their_order():
+    space = Dict([("z", Discrete(2)), ("a", Discrete(3)), ("m", Tuple((Discrete(4),)))])
+    back = space_from_json(json.loads(json.dumps(space_to_json(space), sort_keys=True)))
+    assert list(back.spaces) == ["z", "a", "m"]
+    assert back == space
 
 
 def test_what_is_written_is_plain_json_without_numpys_numbers():

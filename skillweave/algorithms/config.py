@@ -7,18 +7,21 @@ does not import torch, so that ``--help`` and argument errors are instant.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
-from skillweave.networks.config import MLP
+import gymnasium as gym
+
+from skillweave.algorithms.config_off_policy import (
+    DQN,
+    SAC,
+    TD3,
+    OffPolicy,
+    check,
+    check_networks,
+    one_of,
+)
+from skillweave.networks.config import CNN, RNN, Network
 from skillweave.types import SkillweaveError
-
-
-def _check(config: object, field_name: str, ok: bool, asked: str) -> None:
-    if not ok:
-        value = getattr(config, field_name)
-        raise SkillweaveError(
-            f"{type(config).__name__}.{field_name} is {value!r}; it must be {asked}"
-        )
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,13 @@ class PPO:
     """The critic learns returns in units of their running deviation: no reward is too large."""
     action_std_init: float = 0.6
     """Initial standard deviation of continuous actions, where a bounded range spans [−1, 1]."""
-    network: MLP = field(default_factory=MLP)
+    action_std: Literal["parameter", "state"] = "parameter"
+    """The deviation is a parameter of its own, or depends on the state."""
+    squash_actions: bool = False
+    """Continuous actions go through tanh, else they are clipped to the bounds."""
+    network: Network = field(default_factory=Network)
     """The actor's network."""
-    critic: MLP | None = None
+    critic: Network | None = None
     """The critic's network; None: as the actor's."""
     overlap: bool = True
     """Collect the next rollout while learning from the last: the data is one update old."""
@@ -75,33 +82,54 @@ class PPO:
     """Torch threads while learning."""
 
     def __post_init__(self) -> None:
+        check_networks(self)
         for name in ("num_envs", "n_steps", "batch_size", "update_epochs", "threads"):
-            _check(self, name, getattr(self, name) >= 1, "at least 1")
+            check(self, name, getattr(self, name) >= 1, "at least 1")
         for name in ("gamma", "gae_lambda"):
-            _check(self, name, 0.0 <= getattr(self, name) <= 1.0, "between 0 and 1")
+            check(self, name, 0.0 <= getattr(self, name) <= 1.0, "between 0 and 1")
         for name in ("learning_rate", "clip_coef", "max_grad_norm", "action_std_init", "adam_eps"):
-            _check(self, name, 0.0 < getattr(self, name) < float("inf"), "positive and finite")
+            check(self, name, 0.0 < getattr(self, name) < float("inf"), "positive and finite")
         for name in ("ent_coef", "vf_coef"):
-            _check(self, name, 0.0 <= getattr(self, name) < float("inf"), "at least 0 and finite")
+            check(self, name, 0.0 <= getattr(self, name) < float("inf"), "at least 0 and finite")
         final = self.ent_coef_final
-        _check(self, "ent_coef_final", final is None or 0.0 <= final < float("inf"), "at least 0")
+        check(self, "ent_coef_final", final is None or 0.0 <= final < float("inf"), "at least 0")
         for name in ("target_kl", "clip_value"):
-            _check(self, name, getattr(self, name) is None or getattr(self, name) > 0, "positive")
+            check(self, name, getattr(self, name) is None or getattr(self, name) > 0, "positive")
+        one_of(self, "action_std", ("parameter", "state"))
         if self.learning_rate_schedule == "kl":
-            _check(self, "target_kl", self.target_kl is not None, "set for the schedule 'kl'")
-        schedules = ("constant", "linear", "kl")
-        ok = self.learning_rate_schedule in schedules
-        _check(self, "learning_rate_schedule", ok, f"one of {', '.join(schedules)}")
+            check(self, "target_kl", self.target_kl is not None, "set for the schedule 'kl'")
+        one_of(self, "learning_rate_schedule", ("constant", "linear", "kl"))
+        if self.network.rnn is not None:
+            check(self, "critic", self.critic is None, "None where network.rnn is set")
         rollout = self.num_envs * self.n_steps
-        _check(
+        check(
             self, "batch_size", self.batch_size <= rollout, f"at most num_envs·n_steps ({rollout})"
         )
 
 
-AlgorithmConfig = PPO
+AlgorithmConfig: TypeAlias = PPO | DQN | TD3 | SAC
 """Any algorithm's settings."""
 
-_KINDS = {"PPO": PPO}
+_KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "TD3": TD3, "SAC": SAC}
+_SPACES = gym.spaces
+_ACTS: dict[str, tuple[type, ...]] = {
+    "PPO": (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box),
+    "DQN": (_SPACES.Discrete,),
+    "TD3": (_SPACES.Box,),
+    "SAC": (_SPACES.Box, _SPACES.Discrete),
+}
+"""The action spaces that each algorithm can act in."""
+
+
+def check_spaces(config: AlgorithmConfig, action_space: gym.Space[Any], where: str = "") -> None:
+    """Raise a SkillweaveError where an algorithm cannot act in a space; it names those that can."""
+    kind = type(config).__name__
+    if not isinstance(action_space, _ACTS[kind]):
+        able = [name for name, spaces in _ACTS.items() if isinstance(action_space, spaces)]
+        raise SkillweaveError(
+            f"{where}{kind} cannot act in {action_space}; "
+            + (f"{' and '.join(able)} can" if able else "no algorithm here can")
+        )
 
 
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
@@ -119,21 +147,30 @@ def config_from_json(data: dict[str, Any]) -> AlgorithmConfig:
     kind = values.pop("algorithm", None)
     if kind not in _KINDS:
         raise SkillweaveError(f"unknown algorithm {kind!r}; known are: {', '.join(_KINDS)}")
-    _check_fields(values, _KINDS[kind], kind)
     for name in ("network", "critic"):
         if values.get(name) is not None:
-            values[name] = _mlp_from_json(values[name], f"{kind}.{name}")
-    return _KINDS[kind](**values)
+            values[name] = _network_from_json(values[name], f"{kind}.{name}")
+    config: AlgorithmConfig = _made(_KINDS[kind], values, kind)
+    return config
 
 
-def _mlp_from_json(data: dict[str, Any], where: str) -> MLP:
-    _check_fields(data, MLP, where)
-    return MLP(**{**data, "hidden": tuple(data["hidden"])})
+def _network_from_json(data: dict[str, Any], where: str) -> Network:
+    values = dict(data)
+    for name, kind in (("cnn", CNN), ("rnn", RNN)):
+        if values.get(name) is not None:
+            values[name] = _made(kind, values[name], f"{where}.{name}")
+    network: Network = _made(Network, values, where)
+    return network
 
 
-def _check_fields(values: dict[str, Any], kind: type, where: str) -> None:
+def _made(kind: Any, values: dict[str, Any], where: str) -> Any:
+    """``kind`` from plain JSON: lists are tuples."""
     unknown = sorted(set(values) - {f.name for f in fields(kind)})
     if unknown:
         raise SkillweaveError(
             f"{where} has no field {', '.join(unknown)}: made by a newer version?"
         )
+    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+__all__ = ["DQN", "PPO", "SAC", "TD3", "AlgorithmConfig", "OffPolicy"]

@@ -8,30 +8,58 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.config import PPO, config_from_json, config_to_json
-from skillweave.algorithms.ppo import PPOAlgorithm, State
-from skillweave.spaces import space_from_json, space_to_json
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.config import (
+    DQN,
+    PPO,
+    SAC,
+    TD3,
+    AlgorithmConfig,
+    config_from_json,
+    config_to_json,
+)
+from skillweave.algorithms.dqn import DQNAlgorithm
+from skillweave.algorithms.ppo import PPOAlgorithm
+from skillweave.algorithms.sac import SACAlgorithm
+from skillweave.algorithms.td3 import TD3Algorithm
+from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless, SkillweaveError
 
+_ALGORITHMS: dict[type, type[Algorithm]] = {
+    PPO: PPOAlgorithm,
+    DQN: DQNAlgorithm,
+    TD3: TD3Algorithm,
+    SAC: SACAlgorithm,
+}
 
-def make_algorithm(config: PPO, observation_space: Any, action_space: Any) -> PPOAlgorithm:
-    """The algorithm that these settings belong to, on one pair of spaces."""
-    return PPOAlgorithm(config, observation_space, action_space)
+
+def make_algorithm(config: AlgorithmConfig, observation_space: Any, action_space: Any) -> Algorithm:
+    """The algorithm that these settings belong to, on one pair of spaces.
+
+    Raises:
+        SkillweaveError: it cannot act in these spaces; the message names those that can.
+    """
+    return _ALGORITHMS[type(config)](config, observation_space, action_space)
 
 
 class AgentPolicy(Memoryless):
     """One trained agent; a copy of what acting needs, independent of further learning."""
 
-    def __init__(self, algorithm: PPOAlgorithm, weights: dict[str, Tensor]) -> None:
+    def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
         self._algorithm, self.weights = algorithm, weights
-        self._actor = algorithm.net.from_weights(weights)
+        self._actor = algorithm.actor_of(weights)
         self.observation_space = algorithm.observation_space
         self.action_space = algorithm.action_space
 
     @classmethod
-    def of(cls, algorithm: PPOAlgorithm, state: State, member: int = 0) -> AgentPolicy:
+    def of(cls, algorithm: Algorithm, state: Any, member: int = 0) -> AgentPolicy:
         """The policy of one member of a state."""
         return cls(algorithm, algorithm.weights(state, member))
+
+    def start(self, n: int) -> Memory:
+        """Zeros, (n, M), where the network has a memory."""
+        size = self._algorithm.memory
+        return {"rnn": np.zeros((n, size), np.float32)} if size else {}
 
     @torch.inference_mode()
     def act(
@@ -48,11 +76,13 @@ class AgentPolicy(Memoryless):
         if not deterministic:
             rng = rng or np.random.default_rng()
             generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-            noise = self._algorithm.net.head.noise([generator], 1, len(obs))[0]
+            noise = self._algorithm.noise([generator], 1, len(obs))[0]
         allowed = None if mask is None else torch.from_numpy(mask)[None]
-        rows = torch.from_numpy(np.ascontiguousarray(obs))[None]
-        action, _ = self._algorithm.net.act(self._actor, rows, allowed, noise)
-        return self._algorithm.net.head.codec.to_env(action[0].numpy()), memory
+        rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
+        before = torch.from_numpy(memory["rnn"])[None] if memory else None
+        action, _, after = self._algorithm.act(self._actor, rows, allowed, noise, before)
+        memory = {} if after is None else {"rnn": after[0].numpy()}
+        return self._algorithm.to_env(action[0].numpy()), memory
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and the JSON that ``from_file`` needs."""

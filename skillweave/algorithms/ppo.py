@@ -1,11 +1,11 @@
 """PPO (Schulman et al. 2017) for P members at once; a single agent is P = 1.
 
-Read down the page: State, Actor, init, act, loss, update. The settings are ``config.PPO``.
+Read down the page: State, init, act, update, loss. The settings are ``config.PPO``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,28 +13,22 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
+from skillweave.algorithms.base import Actor, Algorithm
 from skillweave.algorithms.config import PPO
-from skillweave.networks.actor import Actor, ActorNet
-from skillweave.networks.stacked import (
-    Layout,
-    Views,
-    mlp,
-    mlp_init_,
-    mlp_shapes,
-    take_rows,
-)
+from skillweave.algorithms.minibatches import minibatches
+from skillweave.networks.encoders import Inputs
+from skillweave.networks.heads import ActionHead
+from skillweave.networks.net import Net
+from skillweave.networks.stacked import Layout, Views, take_rows
+from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate, merge_moments
 from skillweave.ops.returns import explained_variance, gae, normalise
 from skillweave.seeding import Seeds
-from skillweave.types import Transition
+from skillweave.types import Array, Transition
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""
-SETTINGS = (
-    "learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "vf_coef", "max_grad_norm",
-)  # fmt: skip
-"""Settings that each member has a value of its own of; all others shape the computation."""
 _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
 
@@ -68,67 +62,89 @@ class Rollout:
     transition: Transition
     head: Tensor  # (P, T, B, A)
     log_std: Tensor | None  # (P, 1, 1, A), continuous actions
+    memory: Tensor | None = None  # (P, B, M), before the first step
+    start: Tensor | None = None  # (P, T, B) bool, an episode begins within the rollout
 
 
-class PPOAlgorithm:
+class PPOAlgorithm(Algorithm):
     """PPO on one pair of spaces. Holds no learnt state: that is in ``State``."""
+
+    state_type = State
+    settings = (
+        "learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "vf_coef",
+        "max_grad_norm",
+    )  # fmt: skip
 
     def __init__(
         self, config: PPO, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
+        super().__init__(config, observation_space, action_space)
         self.config = config
-        self.observation_space, self.action_space = observation_space, action_space
-        self.net = ActorNet(observation_space, action_space, config.network, config.normalize_obs)
-        self.critic_net = config.critic or config.network
-        critic = mlp_shapes("critic", self.net.obs.size, self.critic_net, 1)
-        self.layout = Layout(self.net.layout.shapes | critic)
+        self.head = ActionHead(self.codec, config.action_std, config.squash_actions)
+        self.actor_net = Net("actor", self.obs, config.network, self.head.width)
+        self.critic_net = Net("critic", self.obs, config.critic or config.network, 1)
+        acting = dict(self.actor_net.shapes)
+        if not self.head.discrete and not self.head.std_in_head:
+            acting["actor.log_std"] = (1, self.codec.size)
+        self.layout = Layout(acting | self.critic_net.shapes)
+        self.memory = self.actor_net.memory + self.critic_net.memory
+        # With memory the critic runs along while acting: its memory must be known, too.
+        self.acting = self.layout if self.memory else Layout(acting)
 
     def init(self, seeds: list[Seeds]) -> State:
         """Fresh members, one for each seed; a member does not depend on its neighbours."""
         members, cfg = len(seeds), self.config
         params = torch.zeros(members, self.layout.size)
         views = self.layout.views(params)
-        generators = [(s / "init").torch() for s in seeds]
-        mlp_init_(views, "actor", cfg.network, 0.01, generators)
-        mlp_init_(views, "critic", self.critic_net, 1.0, generators)
-        if not self.net.head.discrete:
+        generators = self.member_generators(seeds)
+        self.actor_net.init_(views, 0.01, generators)
+        self.critic_net.init_(views, 1.0, generators)
+        if self.head.std_in_head:
+            bias = views[f"{self.actor_net.head}.bias"]
+            bias[..., self.codec.size :].fill_(cfg.action_std_init).log_()
+        elif not self.head.discrete:
             views["actor.log_std"].fill_(cfg.action_std_init).log_()
-
         return State(
             params=params,
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
             count=torch.zeros(members),
-            obs_mean=torch.zeros(members, self.net.obs.size),
-            obs_var=torch.ones(members, self.net.obs.size),
-            obs_count=torch.full((members,), 1e-4),
-            return_mean=torch.zeros(members, 1),
-            return_var=torch.ones(members, 1),
-            return_count=torch.full((members,), 1e-4),
-            **{name: torch.full((members,), float(getattr(cfg, name))) for name in SETTINGS},
+            **self.fresh(cfg, members),
         )
 
-    def actor(self, state: State) -> Actor:
-        """A copy of what acting needs."""
-        return self.net.copy(state.params, state.obs_mean, state.obs_var)
+    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
+        """Noise for ``steps`` calls of ``act``, first axis the steps."""
+        return self.head.noise(generators, steps, batch)
 
-    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of one member's ``weights``."""
-        scaling = {"obs_mean": (self.net.obs.size,), "obs_var": (self.net.obs.size,)}
-        return self.layout.shapes | (scaling if self.net.normalize_obs else {})
+    def act(
+        self,
+        actor: Actor,
+        obs: Tensor,
+        mask: Tensor | None,
+        noise: Tensor | None,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Actions in policy units, the head they came from, and the memory; `Algorithm.act`."""
+        inputs = self.inputs(actor, obs)
+        if memory is None:
+            head = self.actor_net(actor.views, inputs)
+        else:
+            cut = self.actor_net.memory
+            head, after = self.actor_net.step(actor.views, inputs, memory[..., :cut])
+            _, other = self.critic_net.step(actor.views, inputs, memory[..., cut:])
+            memory = torch.cat([after, other], dim=-1)
+        if self.head.discrete:
+            head = mask_logits(head, mask)
+        return self.head.act(head, actor.views.get("actor.log_std"), noise), head, memory
 
-    def weights(self, state: State, member: int = 0) -> dict[str, Tensor]:
-        """One member's policy by name: parameters and observation scaling, copied."""
-        named = {k: v[member].clone() for k, v in self.layout.views(state.params).items()}
-        if self.net.normalize_obs:
-            named |= {"obs_mean": state.obs_mean[member].clone()}
-            named |= {"obs_var": state.obs_var[member].clone()}
-        return named
+    def to_env(self, action: Array) -> Array:
+        """Policy units (n, …) to the environment's."""
+        return self.head.to_env(action)
 
     def value(self, state: State, obs: Tensor) -> Tensor:
-        """V in reward units; raw observations (P, B, *obs_shape) to (P, B)."""
-        inputs = self.net.inputs(self.actor(state), obs)
-        return self._value(self.layout.views(state.params), state, inputs)
+        """V in reward units; raw observations (P, B, *item) to (P, B). Not for memories."""
+        inputs = self.inputs(self.actor(state), obs)
+        return self._in_rewards(state, self.critic_net(self.layout.views(state.params), inputs))
 
     def update(
         self, state: State, rollout: Rollout, progress: float, seeds: list[Seeds]
@@ -153,10 +169,10 @@ class PPOAlgorithm:
         active = torch.ones(len(seeds), dtype=torch.bool)
         counted = torch.zeros(len(seeds))
         sums = torch.zeros(len(REPORT), len(seeds))
-        for batch in self._minibatches(data, seeds):
+        for batch in minibatches(data, seeds, cfg.update_epochs, cfg.batch_size):
             loss, report = self.loss(leaves, state, batch, ent_coef)
-            grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
-            grad = torch.cat([g.flatten(1) for g in grads], dim=1)
+            grads = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
+            grad = self.layout.gather(grads, len(seeds))
             report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
             counted = counted + active
             sums.addcmul_(torch.stack([report[k] for k in REPORT]), active.float())
@@ -177,28 +193,26 @@ class PPOAlgorithm:
         metrics["samples"] = torch.full_like(rate, float(tr.reward[0].numel()))
         return state, metrics
 
-    def _minibatches(
-        self, data: Mapping[str, Tensor], seeds: list[Seeds]
-    ) -> Iterator[dict[str, Tensor]]:
-        """Every epoch's minibatches, (P, b, ...), each member's in an order of its own."""
-        size = data["advantage"].shape[1]
-        parts = max(1, size // self.config.batch_size)
-        for epoch in range(self.config.update_epochs):
-            order = [torch.randperm(size, generator=(s / epoch).torch()) for s in seeds]
-            shuffled = {k: take_rows(v, torch.stack(order)) for k, v in data.items()}
-            for part in range(parts):
-                cut = slice(part * size // parts, (part + 1) * size // parts)
-                yield {k: v[:, cut] for k, v in shuffled.items()}
+    def _run(self, net: Net, views: Views, batch: Mapping[str, Tensor]) -> Tensor:
+        """A network's outputs for a batch, (P, N, out); sequences are laid end to end."""
+        if "memory" not in batch:
+            return net(views, _inputs(batch))
+        cut = self.actor_net.memory
+        memory = batch["memory"]
+        memory = memory[..., :cut] if net is self.actor_net else memory[..., cut:]
+        return net.sequence(views, _inputs(batch), memory, batch["start"])[0].flatten(1, 2)
 
     def loss(
         self, views: Views, state: State, batch: Mapping[str, Tensor], ent_coef: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Policy, value and entropy loss of one minibatch, (P,), and detached metrics (P,)."""
-        head = mlp(views, "actor", self.config.network, batch["inputs"])
+        head = self._run(self.actor_net, views, batch)
+        raw = self._run(self.critic_net, views, batch).squeeze(-1)
+        if "memory" in batch:
+            batch = {k: v.flatten(1, 2) for k, v in batch.items() if k != "memory"}
         log_std, mask = views.get("actor.log_std"), batch.get("mask")
-        log_prob, entropy = self.net.head.stats(head, log_std, mask, batch["action"])
+        log_prob, entropy = self.head.stats(head, log_std, mask, batch["action"])
         policy = ppo_policy_loss(log_prob, batch["log_prob"], batch["advantage"], state.clip_coef)
-        raw = mlp(views, "critic", self.critic_net, batch["inputs"]).squeeze(-1)
         clip = self.config.clip_value
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
         value = value_loss(raw, batch["target"], batch.get("old_value"), bound)
@@ -213,48 +227,52 @@ class PPOAlgorithm:
     def _prepare(
         self, state: State, rollout: Rollout
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The rollout as flat (P, T·B) tensors: inputs, action, log-prob, advantage, target."""
+        """The rollout as (P, T, B, ...) tensors: inputs, action, log-prob, advantage, target."""
         cfg, tr = self.config, rollout.transition
-        members, lead = tr.reward.shape[0], tr.reward.shape
-        batch = {"action": tr.action.flatten(1, 2), "head": rollout.head.flatten(1, 2)}
-        if tr.mask is not None:
-            batch["mask"] = tr.mask.flatten(1, 2)
-        log_std = None if rollout.log_std is None else rollout.log_std.flatten(1, 2)
-        head, mask = batch.pop("head"), batch.get("mask")
-        old_log_prob, _ = self.net.head.stats(head, log_std, mask, batch["action"])
-        if self.net.normalize_obs:
-            encoded = self.net.obs.encode(tr.obs.flatten(1, 2))
-            moments = state.obs_mean, state.obs_var, state.obs_count
-            state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, encoded)
+        lead = tr.reward.shape
+        old_log_prob, _ = self.head.stats(rollout.head, rollout.log_std, tr.mask, tr.action)
+        self.see(state, tr.obs.flatten(1, 2))
         actor, views = self.actor(state), self.layout.views(state.params)
-        inputs = self.net.inputs(actor, tr.obs.flatten(1, 2))
-        value = self._value(views, state, inputs).view(lead)
-        next_value = self._next_value(views, state, actor, value, tr)
+        inputs = self.inputs(actor, tr.obs.flatten(1, 2))
+        data = {k: v.unflatten(1, lead[1:]) for k, v in inputs.items()}
+        if rollout.memory is not None and rollout.start is not None:
+            data |= {"memory": rollout.memory, "start": rollout.start}
+        value, next_value = self._values(views, state, actor, data, tr)
         advantage = gae(tr.reward, tr.discount, value, next_value, tr.last, state.gae_lambda)
-        returns = (advantage + value).flatten(1)
-        metrics = {"explained_variance": explained_variance(value.flatten(1), returns)}
+        returns = advantage + value
+        metrics = {"explained_variance": explained_variance(value.flatten(1), returns.flatten(1))}
         if cfg.normalize_returns:
             moments = state.return_mean, state.return_var, state.return_count
             state.return_mean, state.return_var, state.return_count = merge_moments(
-                *moments, returns[..., None]
+                *moments, returns.flatten(1)[..., None]
             )
         if cfg.normalize_advantage:
             advantage = normalise(advantage)
-        batch |= {
-            "inputs": inputs,
+        mean, scale = state.return_mean[..., None], self._return_scale(state)[..., None]
+        data |= {
+            "action": tr.action,
             "log_prob": old_log_prob,
-            "advantage": advantage.reshape(members, -1),
-            "target": (returns - state.return_mean) / self._return_scale(state),
+            "advantage": advantage,
+            "target": (returns - mean) / scale,
         }
+        if tr.mask is not None:
+            data["mask"] = tr.mask
         if cfg.clip_value is not None:
-            old = value.flatten(1) - state.return_mean
-            batch["old_value"] = old / self._return_scale(state)
-        return batch, metrics
+            data["old_value"] = (value - mean) / scale
+        return data, metrics
 
-    def _next_value(
-        self, views: Views, state: State, actor: Actor, value: Tensor, tr: Transition
-    ) -> Tensor:
-        """V(next_obs), (P, T, B): shifted values, computed anew only where trajectories end."""
+    def _values(
+        self, views: Views, state: State, actor: Actor, data: Mapping[str, Tensor], tr: Transition
+    ) -> tuple[Tensor, Tensor]:
+        """V(obs) and V(next_obs), (P, T, B): the latter are the former, shifted, except at ends."""
+        lead, after = tr.reward.shape, None
+        if "memory" in data:
+            own = data["memory"][..., self.actor_net.memory :]
+            raw, after = self.critic_net.sequence(views, _inputs(data), own, data["start"])
+            raw = raw.flatten(1, 2)
+        else:
+            raw = self.critic_net(views, {k: v.flatten(1, 2) for k, v in _inputs(data).items()})
+        value = self._in_rewards(state, raw).view(lead)
         next_value = torch.zeros_like(value)
         next_value[:, :-1] = value[:, 1:]
         last = tr.last.flatten(1)
@@ -262,14 +280,20 @@ class PPOAlgorithm:
         # Members may have different numbers of ends: the first `widest` of a stable sort holds
         # them all. Surplus rows get what the shift gave them, the value of their true successor.
         rows = last.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :widest]
-        ends = self._value(
-            views, state, self.net.inputs(actor, take_rows(tr.next_obs.flatten(1, 2), rows))
-        )
-        return next_value.flatten(1).scatter(1, rows, ends).view_as(value)
+        inputs = self.inputs(actor, take_rows(tr.next_obs.flatten(1, 2), rows))
+        if after is None:
+            ends = self.critic_net(views, inputs)
+        else:
+            ends, _ = self.critic_net.step(views, inputs, take_rows(after.flatten(1, 2), rows))
+        ends = self._in_rewards(state, ends)
+        return value, next_value.flatten(1).scatter(1, rows, ends).view(lead)
 
-    def _value(self, views: Views, state: State, inputs: Tensor) -> Tensor:
-        raw = mlp(views, "critic", self.critic_net, inputs).squeeze(-1)
-        return raw * self._return_scale(state) + state.return_mean
+    def _in_rewards(self, state: State, raw: Tensor) -> Tensor:
+        return raw.squeeze(-1) * self._return_scale(state) + state.return_mean
 
     def _return_scale(self, state: State) -> Tensor:
         return (state.return_var + 1e-8).sqrt()
+
+
+def _inputs(batch: Mapping[str, Tensor]) -> Inputs:
+    return {k: v for k, v in batch.items() if k == "vector" or k.startswith("image.")}

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array, Transition, VecStep
 
 
@@ -22,9 +23,9 @@ class RolloutBuffer:
         self, n_steps: int, num_envs: int, members: int, observation_space: gym.Space[Any]
     ) -> None:
         self._members, self._at = members, 0
-        lead, shape = (n_steps, num_envs), observation_space.shape or ()
-        self._obs = np.empty((*lead, *shape), observation_space.dtype)
-        self._next_obs = np.empty((*lead, *shape), observation_space.dtype)
+        lead, shape = (n_steps, num_envs), obs_shape(observation_space)
+        self._obs = np.empty((*lead, *shape), obs_dtype(observation_space))
+        self._next_obs = np.empty_like(self._obs)
         self._reward = np.empty(lead, np.float32)
         self._steps = np.empty(lead, np.float32)
         self._terminated = np.empty(lead, bool)
@@ -73,4 +74,4 @@ class RolloutBuffer:
     def _by_member(self, x: Array) -> Tensor:
         """(T, P·B, ...) to (P, T, B, ...)."""
         split = x.reshape(x.shape[0], self._members, -1, *x.shape[2:])
-        return torch.from_numpy(split).transpose(0, 1).contiguous()
+        return to_tensor(split).transpose(0, 1).contiguous()

@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from skillweave.spaces import pack
 from skillweave.types import Array, MissingExtra, SkillweaveError
 
 
@@ -77,8 +78,9 @@ class Pausable(gym.Wrapper[Any, Any, Any, Any]):
         go, inner = action
         if not go:
             return self._obs, 0.0, False, False, {}
-        if isinstance(self.env.action_space, gym.spaces.Discrete):
-            inner = int(inner)
+        # A row of a batch that has no axes is a number of numpy's, which a Box does not contain.
+        one = isinstance(self.env.action_space, gym.spaces.Discrete)
+        inner = int(inner) if one else np.asarray(inner)
         self._obs, reward, terminated, truncated, info = self.env.step(inner)
         return self._obs, float(reward), terminated, truncated, info
 
@@ -105,7 +107,7 @@ class GymnasiumEngine:
         """Start all anew from one seed; observations (N, *obs_shape)."""
         seeds = np.random.SeedSequence(seed).generate_state(self.num_envs, np.uint32) >> 1
         obs, _ = self._vector.reset(seed=[int(s) for s in seeds])
-        return np.asarray(obs)
+        return pack(self.observation_space, obs)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
         """Start some anew; observations (n, *obs_shape)."""
@@ -115,7 +117,7 @@ class GymnasiumEngine:
         for i, seed in zip(ids, seeds or (), strict=False):
             each[int(i)] = int(seed)
         obs, _ = self._vector.reset(seed=each, options={"reset_mask": mask})
-        return np.asarray(obs)[ids]
+        return pack(self.observation_space, obs)[ids]
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
         """Act in some environments; the others stand still."""
@@ -129,6 +131,7 @@ class GymnasiumEngine:
         # A copy: environments get views of it, and may keep them.
         acted = go, self._actions.copy()
         obs, reward, terminated, truncated, info = self._vector.step(acted)
+        obs = pack(self.observation_space, obs)
         if ids is not None:
             obs, reward, terminated, truncated = (
                 x[ids] for x in (obs, reward, terminated, truncated)
@@ -161,6 +164,8 @@ class EnvPoolEngine:
         except MissingExtra:
             return False
         if env_id not in envpool.list_all_envs():
+            return False
+        if reference.observation_space.shape is None:  # Dict, Tuple: EnvPool nests in its own way
             return False
         with _no_precision_warnings():
             spec = envpool.make_spec(env_id)

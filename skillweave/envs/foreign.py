@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from skillweave.seeding import Seeds
+from skillweave.spaces import pack
 from skillweave.types import Array, SkillweaveError, VecStep
 
 
@@ -15,7 +16,8 @@ class FromVectorEnv:
     """A ``VecEnv`` over a Gymnasium vector with ``AutoresetMode.SAME_STEP``.
 
     Reads from ``info`` what semi-MDPs need, where it is there: ``steps`` (τ), ``action_mask``,
-    ``next_obs``; else every action is one step, all are allowed, and ``final_obs`` counts.
+    ``next_action_mask``, ``next_obs``; else every action is one step, all are allowed, and
+    ``final_obs`` counts.
 
     Raises:
         SkillweaveError: the vector resets in another way; the message says how to make it.
@@ -40,7 +42,7 @@ class FromVectorEnv:
         """Start all anew; observations (N, *obs_shape)."""
         obs, info = self.env.reset(seed=seeds.integer())
         self._mask = info.get("action_mask")
-        return np.asarray(obs)
+        return pack(self.observation_space, obs)
 
     def mask(self) -> Array | None:
         """(N, A) bool, the actions allowed now, or None."""
@@ -50,14 +52,18 @@ class FromVectorEnv:
         """One action in each environment."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._mask = info.get("action_mask")
-        next_obs = info.get("next_obs")
-        if next_obs is None:
-            next_obs = np.array(obs)
+        space = self.observation_space
+        obs = pack(space, obs)
+        if "next_obs" in info:
+            next_obs = pack(space, info["next_obs"])
+        else:
+            next_obs = obs.copy()
             for i in np.flatnonzero(terminated | truncated):
-                next_obs[i] = info["final_obs"][i]
+                next_obs[i] = pack(space, info["final_obs"][i])
         return VecStep(
-            next_obs, np.asarray(obs), np.asarray(reward, np.float32), terminated,
+            next_obs, obs, np.asarray(reward, np.float32), terminated,
             truncated & ~terminated, info.get("steps", self._ones), self._mask, info,
+            info.get("next_action_mask"),
         )  # fmt: skip
 
     def close(self) -> None:

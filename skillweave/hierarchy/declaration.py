@@ -8,11 +8,12 @@ from typing import Any
 
 import gymnasium as gym
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.calls import SkillSet
-from skillweave.skills import Reflex, Skill
-from skillweave.spaces import action_codec, obs_codec, same_space
+from skillweave.skills import Reflex, Skill, ready_policy
+from skillweave.skills.foreign import fitted
+from skillweave.spaces import action_codec, obs_codec
 from skillweave.types import Policy, SkillweaveError
 
 RESERVED = ("selector", "flat")
@@ -98,11 +99,7 @@ class Declaration:
                 raise SkillweaveError(f"skills holds {skill!r}, which is not a Skill{hint}")
             skill.validate()
             _check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
-            if isinstance(skill.policy, type):
-                raise SkillweaveError(
-                    f"skill {skill.name!r}: policy is the class {skill.policy.__name__}, "
-                    "not a policy"
-                )
+            ready_policy(skill)  # says so where it cannot act
         names = [s.name for s in self.skills]
         for name in names:
             if names.count(name) > 1:
@@ -174,18 +171,38 @@ class Declaration:
         try:
             obs_codec(env.observation_space)
             action_codec(env.action_space)
-            for skill in self.skills:
-                if skill.policy is None:
-                    continue
-                for kind in ("observation_space", "action_space"):
-                    mine, theirs = getattr(skill.policy, kind), getattr(env, kind)
-                    if not same_space(mine, theirs):
-                        raise SkillweaveError(
-                            f"skill {skill.name!r}: its policy has {kind} {mine}, but the "
-                            f"environment {self.spec.name} has {theirs}"
-                        )
+            self._check_algorithms(env.action_space)
+            self._fitted(env)
         finally:
             env.close()
+
+    def _check_algorithms(self, space: gym.Space[Any]) -> None:
+        """Whether every algorithm can act where it is to act."""
+        for skill in self.skills:
+            if skill.policy is None:
+                config = skill.algorithm or self.algorithm
+                check_spaces(config, space, f"skill {skill.name!r}: ")
+        check_spaces(self.selector, gym.spaces.Discrete(len(self.skills)), "selector: ")
+        if self.flat is not None:
+            check_spaces(self.flat, space, "flat: ")
+
+    def ready_policies(self) -> dict[str, Policy]:
+        """By skill, the policies that are not trained, on the environment's spaces."""
+        if all(s.policy is None for s in self.skills):
+            return {}
+        env = self.spec.make()
+        try:
+            return self._fitted(env)
+        finally:
+            env.close()
+
+    def _fitted(self, env: gym.Env[Any, Any]) -> dict[str, Policy]:
+        spaces = env.observation_space, env.action_space
+        return {
+            s.name: fitted(policy, *spaces, f"skill {s.name!r}", self.spec.name)
+            for s in self.skills
+            if (policy := ready_policy(s)) is not None
+        }
 
 
 def _check_algorithm(value: object, where: str, *, optional: bool) -> None:

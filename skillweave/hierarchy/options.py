@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +12,8 @@ from gymnasium.vector.utils import batch_space
 
 from skillweave.envs.engine import Engine
 from skillweave.hierarchy.calls import SkillSet
+from skillweave.skills import Skill
+from skillweave.spaces import unpack
 from skillweave.types import Array, SkillweaveError, Step
 
 
@@ -23,8 +26,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     same step.
 
     ``info`` of a step, arrays over N environments: ``steps`` (τ), ``discount`` (γ^τ, or 0 where
-    terminated), ``call_return`` (Σ rₖ), ``next_obs`` (the true successors), ``action_mask``
-    (N, S) where initiation sets exist, and Gymnasium's ``final_obs``.
+    terminated), ``call_return`` (Σ rₖ), ``next_obs`` (the true successors, one array whatever the
+    space: see ``spaces.pack``), and Gymnasium's ``final_obs``. Where initiation sets exist:
+    ``action_mask`` (N, S), and ``next_action_mask``, that of ``next_obs`` (all True where the
+    episode terminated, or no skill may start).
 
     Args:
         engine: the environments; stepped in part where calls differ in length.
@@ -46,13 +51,15 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = np.broadcast_to(np.asarray(gamma, np.float64), (self.num_envs,))
         self._watches = skills.watches
+        # With a skill that may start everywhere beside the others, a mask is never an error.
+        self._never_stuck = replace(skills, skills=(*skills.skills, Skill()))
         self._seed = seed
         self._obs: Array = np.empty(0)
         self._mask: Array | None = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start every episode anew; one seed for all."""
         if isinstance(seed, list):
             raise SkillweaveError("OptionsEnv.reset takes one seed for all environments")
@@ -60,9 +67,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._rng = np.random.default_rng(self._seed)
         self._memory = self.skills.start(self.num_envs)
         self._obs = self.engine.reset(self._seed)
-        return self._obs, self._with_mask({})
+        self._mask = self.skills.mask(self._obs)
+        info = {} if self._mask is None else {"action_mask": self._mask}
+        return unpack(self.single_observation_space, self._obs), info
 
-    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Run one call in each environment, whichever skills and however long."""
         n = self.num_envs
         skill = np.asarray(actions).reshape(n)
@@ -102,29 +111,43 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 over = over | ended
             if over.any():
                 rows = rows[~over]
-        self._obs = obs
+        self._obs, self._mask = obs, self.skills.mask(obs)
         info = {
             "steps": steps,
             "discount": (discount * ~terminated).astype(np.float32),
             "call_return": plain,
             "next_obs": next_obs,
             "skill": skill,
+            **self._masks(next_obs, terminated, truncated),
+            **self._final(next_obs, terminated | truncated),
         }
-        ended = terminated | truncated
-        if ended.any():
-            final = np.full(n, None, dtype=object)
-            for i in np.flatnonzero(ended):
-                final[i] = next_obs[i]
-            info |= {"final_obs": final, "_final_obs": ended}
-        return obs, reward.astype(np.float32), terminated, truncated, self._with_mask(info)
+        seen_obs = unpack(self.single_observation_space, obs)
+        return seen_obs, reward.astype(np.float32), terminated, truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the engine."""
         self.engine.close()
 
-    def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
-        self._mask = self.skills.mask(self._obs)
-        return info if self._mask is None else info | {"action_mask": self._mask}
+    def _masks(self, next_obs: Array, terminated: Array, truncated: Array) -> dict[str, Any]:
+        """Where skills may start, in what to act on next and in the true successors."""
+        if self._mask is None:
+            return {}
+        mask = self._mask.copy()
+        mask[terminated] = True
+        cut = np.flatnonzero(truncated & ~terminated)
+        if len(cut):
+            found = np.asarray(self._never_stuck.mask(next_obs[cut]))[:, :-1]
+            mask[cut] = found | ~found.any(axis=1, keepdims=True)
+        return {"action_mask": self._mask, "next_action_mask": mask}
+
+    def _final(self, next_obs: Array, ended: Array) -> dict[str, Any]:
+        """The last observations of the episodes that ended, as Gymnasium gives them."""
+        if not ended.any():
+            return {}
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(ended):
+            final[i] = unpack(self.single_observation_space, next_obs[i])
+        return {"final_obs": final, "_final_obs": ended}
 
     def _check(self, skill: Array) -> None:
         count = len(self.skills.skills)

@@ -14,7 +14,8 @@ from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
-from skillweave.skills import Skill
+from skillweave.skills import Skill, ready_policy
+from skillweave.skills.foreign import source_of
 from skillweave.training.phase import Listener, Phase, train_phase
 from skillweave.types import Policy, VecEnv
 
@@ -74,11 +75,13 @@ def train(
     seeds, cut_every = Seeds(int(run.manifest["seed"])), int(run.manifest["cut_every"])
     if run.manifest["kind"] == "flat":
         return train_phase(flat_phase(declaration), run, seeds / "flat", listeners, cut_every)
-    trained: dict[str, Policy] = {}
+    policies = _ready(declaration, run)
+    for name, ready in policies.items():
+        run.keep_policy(name, ready)
     *skill_phases, selector = phases_of(declaration)
     for phase in skill_phases:
-        trained[phase.name] = train_phase(phase, run, seeds / phase.name, listeners, cut_every)
-    skills = declaration.skill_set([s.policy or trained[s.name] for s in declaration.skills])
+        policies[phase.name] = train_phase(phase, run, seeds / phase.name, listeners, cut_every)
+    skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
 
     def make_env(config: AlgorithmConfig) -> VecEnv:
         engine = make_engine(declaration.spec, config.num_envs)
@@ -93,8 +96,16 @@ def load(declaration: Declaration, run: RunDirectory) -> Policy:
     """The policy of a finished run."""
     if run.manifest["kind"] == "flat":
         return run.load_policy("flat")
-    policies = [s.policy or run.load_policy(s.name) for s in declaration.skills]
+    ready = _ready(declaration, run)
+    names = [s.name for s in declaration.skills]
+    policies = [ready[n] if n in ready else run.load_policy(n) for n in names]
     return HierarchyPolicy(run.load_policy("selector"), declaration.skill_set(policies))
+
+
+def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
+    """The ready policies as they were when the run began."""
+    ready = declaration.ready_policies()
+    return {name: run.ready_policy(name, policy) for name, policy in ready.items()}
 
 
 def _skill_env(
@@ -111,4 +122,6 @@ def _skill_env(
 
 
 def _skill_entry(skill: Skill) -> dict[str, Any]:
-    return {"name": skill.name, "max_steps": skill.max_steps, "ready": skill.policy is not None}
+    policy = ready_policy(skill)
+    entry = {"name": skill.name, "max_steps": skill.max_steps, "ready": policy is not None}
+    return entry if policy is None else entry | {"policy": source_of(policy)}

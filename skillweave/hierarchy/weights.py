@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.skills.foreign import Foreign, as_recorded, source_of
 from skillweave.types import Policy, SkillweaveError
 
 
 def write_weights(path: Path, declaration: Declaration, policy: Policy, recipe: str | None) -> None:
-    """Write skills and selector, or a flat agent; policies that came ready are not saved."""
+    """Write skills and selector, or a flat agent; of ready policies what a run copies too."""
     place = {"env": declaration.spec.name, "env_kwargs": declaration.spec.kwargs}
     if isinstance(policy, AgentPolicy):
         weights, description = policy.to_file()
@@ -25,9 +29,14 @@ def write_weights(path: Path, declaration: Declaration, policy: Policy, recipe: 
     tensors: dict[str, Tensor] = {}
     parts: dict[str, Any] = {}
     named: list[tuple[str, Policy]] = [("selector", policy.selector)]
+    ready: dict[str, Any] = {}
     for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
         if skill.policy is None:
             named.append((skill.name, own))
+            continue
+        ready[skill.name] = source_of(own)
+        if isinstance(own, Foreign) and (content := own.content()) is not None:
+            tensors[f"{skill.name}/content"] = torch.tensor(np.frombuffer(content, np.uint8))
     for name, own in named:
         assert isinstance(own, AgentPolicy)
         weights, parts[name] = own.to_file()
@@ -40,6 +49,7 @@ def write_weights(path: Path, declaration: Declaration, policy: Policy, recipe: 
         "call_steps": declaration.call_steps,
         "greedy_skills": declaration.greedy_skills,
         "parts": parts,
+        "ready": ready,
     }
     write_tensors(path, tensors, header)
 
@@ -72,5 +82,16 @@ def read_weights(declaration: Declaration, path: Path) -> Policy:
             raise SkillweaveError(f"{path} holds no weights of {name!r}")
         return AgentPolicy.from_file(own, header["parts"][name], f"{path} ({name})")
 
-    policies = [s.policy or part(s.name) for s in declaration.skills]
+    def copied(name: str) -> bytes | None:
+        content = tensors.get(f"{name}/content")
+        return None if content is None else content.numpy().tobytes()
+
+    policies: list[Policy] = []
+    ready, recorded = declaration.ready_policies(), header.get("ready", {})
+    for name in names:
+        if name in ready:
+            read, where = partial(copied, name), f"{path}: skill {name!r}"
+            policies.append(as_recorded(ready[name], recorded.get(name), read, where))
+        else:
+            policies.append(part(name))
     return HierarchyPolicy(part("selector"), declaration.skill_set(policies))

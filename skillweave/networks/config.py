@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from skillweave.types import SkillweaveError
 
@@ -11,21 +11,101 @@ Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
 
 
 @dataclass(frozen=True)
-class MLP:
-    """A multi-layer perceptron."""
+class CNN:
+    """How images become features; ``CNN()`` is Nature's (Mnih et al. 2015)."""
+
+    kind: Literal["plain", "impala"] = "plain"
+    """plain: convolutions in a row; impala: residual stages, each halving the image."""
+    channels: tuple[int, ...] = (32, 64, 64)
+    """Channels of each convolution, or of each residual stage."""
+    kernels: tuple[int, ...] = (8, 4, 3)
+    """Kernel size of each convolution, in pixels; impala's are always 3."""
+    strides: tuple[int, ...] = (4, 2, 1)
+    """Stride of each convolution, in pixels."""
+
+    def __post_init__(self) -> None:
+        _choice(self, "kind", ("plain", "impala"))
+        for name in ("channels", "kernels", "strides"):
+            _widths(self, name)
+        if not self.channels:
+            raise SkillweaveError("CNN.channels is (); it needs at least one layer")
+        sizes = {len(self.channels), len(self.kernels), len(self.strides)}
+        if self.kind == "plain" and len(sizes) > 1:
+            raise SkillweaveError(
+                f"CNN.channels, kernels and strides have {len(self.channels)}, "
+                f"{len(self.kernels)} and {len(self.strides)} entries; they must be as many"
+            )
+
+    @classmethod
+    def impala(cls, channels: tuple[int, ...] = (16, 32, 32)) -> CNN:
+        """The residual network of IMPALA (Espeholt et al. 2018, fig. 3)."""
+        return cls("impala", channels, (), ())
+
+    @classmethod
+    def small(cls) -> CNN:
+        """One 3×3 layer of 16 channels, for images of about ten pixels (Young & Tian 2019)."""
+        return cls("plain", (16,), (3,), (1,))
+
+
+@dataclass(frozen=True)
+class RNN:
+    """A memory after the hidden layers."""
+
+    kind: Literal["lstm", "gru"] = "lstm"
+    """lstm (Hochreiter & Schmidhuber 1997) or gru (Cho et al. 2014)."""
+    size: int = 64
+    """Numbers that it outputs."""
+
+    def __post_init__(self) -> None:
+        _choice(self, "kind", ("lstm", "gru"))
+        if type(self.size) is not int or self.size < 1:
+            raise SkillweaveError(f"RNN.size is {self.size!r}; it must be at least 1")
+
+
+@dataclass(frozen=True)
+class Network:
+    """Images through a CNN, everything else as it is, then hidden layers, then a memory.
+
+    Dict and Tuple observations need nothing more: their parts are joined before the hidden
+    layers.
+    """
 
     hidden: tuple[int, ...] = (64, 64)
     """Width of each hidden layer."""
     activation: Activation = "tanh"
-    """Nonlinearity after each hidden layer."""
+    """Nonlinearity after each hidden layer, and after each convolution."""
     layer_norm: bool = False
     """Normalise each hidden layer before its nonlinearity."""
+    cnn: CNN | None = None
+    """How images are encoded; None: CNN() from 36 pixels upwards, CNN.small() below."""
+    rnn: RNN | None = None
+    """A memory, for PPO; None: the policy sees one observation at a time."""
+    encoder: str | None = None
+    """A custom encoder by the name it was registered under; see ``register_encoder``."""
 
     def __post_init__(self) -> None:
-        if any(not isinstance(width, int) or width < 1 for width in self.hidden):
-            raise SkillweaveError(f"MLP.hidden is {self.hidden}; every width must be at least 1")
-        if self.activation not in get_args(Activation):
-            known = ", ".join(get_args(Activation))
-            raise SkillweaveError(
-                f"MLP.activation is {self.activation!r}; it must be one of {known}"
-            )
+        _widths(self, "hidden")
+        _choice(self, "activation", get_args(Activation))
+        for name, kind in (("cnn", CNN), ("rnn", RNN)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise SkillweaveError(
+                    f"Network.{name} is {value!r}; it must be a {kind.__name__}() or None"
+                )
+
+
+def _widths(config: object, field: str) -> None:
+    value = getattr(config, field)
+    ok = isinstance(value, tuple) and all(type(x) is int and x >= 1 for x in value)
+    if not ok:
+        raise SkillweaveError(
+            f"{type(config).__name__}.{field} is {value}; every entry must be at least 1"
+        )
+
+
+def _choice(config: object, field: str, known: tuple[Any, ...]) -> None:
+    if getattr(config, field) not in known:
+        raise SkillweaveError(
+            f"{type(config).__name__}.{field} is {getattr(config, field)!r}; "
+            f"it must be one of {', '.join(known)}"
+        )

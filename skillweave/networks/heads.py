@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -13,23 +13,40 @@ from skillweave.ops.distributions import (
     gumbel,
     mask_logits,
     normal_stats,
+    tanh_log_det,
 )
 from skillweave.spaces import ActionCodec
+from skillweave.types import Array
+
+LOG_STD = (-5.0, 2.0)
+"""Range of a log deviation that depends on the state."""
 
 
-@dataclass(frozen=True)
 class ActionHead:
-    """Discrete: the head is logits. Box: it is the mean, beside a ``log_std`` of its own.
+    """Choices: the head is logits. Box: it is the mean, and perhaps the log deviation after it.
 
-    ``head`` is (..., A), actions are (...) int64 or (..., A) float, in policy units.
+    ``head`` is (..., width); actions are (...) int64 for Discrete, (..., K) int64 for several
+    choices, (..., A) float in policy units for a Box. A squashed Box action is kept as it was
+    before tanh, whose log-probability is exact; ``to_env`` applies it.
     """
 
-    codec: ActionCodec
-
-    @property
-    def size(self) -> int:
-        """A, the width of the head."""
-        return self.codec.size
+    def __init__(
+        self,
+        codec: ActionCodec,
+        std: Literal["parameter", "state"] = "parameter",
+        squash: bool = False,
+    ) -> None:
+        self.codec, self.squash = codec, squash and not codec.discrete
+        self.std_in_head = std == "state" and not codec.discrete
+        self.width = codec.size * (2 if self.std_in_head else 1)
+        widest = max(codec.parts, default=0)
+        # Where the parts' logits stand in a row (K, widest): parts of different sizes are padded.
+        rows, start = [], 0
+        for n in codec.parts:
+            rows.append([start + min(i, n - 1) for i in range(widest)])
+            start += n
+        self._columns = torch.tensor(rows)
+        self._exists = torch.tensor([[i < n for i in range(widest)] for n in codec.parts])
 
     @property
     def discrete(self) -> bool:
@@ -38,7 +55,7 @@ class ActionHead:
 
     def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
         """Noise for ``steps`` calls of ``act``: (steps, P, batch, A), a stream a member."""
-        shape = (steps, batch, self.size)
+        shape = (steps, batch, self.codec.size)
         if self.discrete:
             drawn = [gumbel(torch.rand(shape, generator=g)) for g in generators]
         else:
@@ -47,14 +64,44 @@ class ActionHead:
 
     def act(self, head: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
         """Actions; greedy where ``noise`` is None. Logits come masked."""
-        if log_std is None:
-            return head.argmax(-1) if noise is None else categorical_sample(head, noise)
-        return head if noise is None else torch.addcmul(head, log_std.exp(), noise)
+        if not self.discrete:
+            mean, log_std = self.moments(head, log_std)
+            return mean if noise is None else torch.addcmul(mean, log_std.exp(), noise)
+        if self.codec.multi:
+            head, noise = self._parts(head), None if noise is None else noise[..., self._columns]
+        return head.argmax(-1) if noise is None else categorical_sample(head, noise)
 
     def stats(
         self, head: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Log-probability of the actions, and entropy; each (...)."""
-        if log_std is None:
-            return categorical_stats(mask_logits(head, mask), action)
-        return normal_stats(head, log_std, action)
+        if self.discrete:
+            head = mask_logits(head, mask)
+            if not self.codec.multi:
+                return categorical_stats(head, action)
+            log_prob, entropy = categorical_stats(self._parts(head), action)
+            return log_prob.sum(-1), entropy.sum(-1)
+        mean, log_std = self.moments(head, log_std)
+        log_prob, entropy = normal_stats(mean, log_std, action)
+        if self.squash:
+            log_prob = log_prob - tanh_log_det(action).sum(-1)
+            # No closed form: one sample, the action, moved along with mean and deviation.
+            z = ((action - mean) * (-log_std).exp()).detach()
+            entropy = entropy + tanh_log_det(mean + log_std.exp() * z).sum(-1)
+        return log_prob, entropy
+
+    def moments(self, head: Tensor, log_std: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Mean and log deviation of a Box's normal, each (..., A) or broadcast to it."""
+        if not self.std_in_head:
+            assert log_std is not None
+            return head, log_std
+        mean, raw = head.chunk(2, dim=-1)
+        return mean, raw.clamp(*LOG_STD)
+
+    def to_env(self, action: Array) -> Array:
+        """Policy units to the environment's."""
+        return self.codec.to_env(torch.from_numpy(action).tanh().numpy() if self.squash else action)
+
+    def _parts(self, logits: Tensor) -> Tensor:
+        """(..., ΣN) to (..., K, widest), what does not exist at the smallest finite number."""
+        return mask_logits(logits[..., self._columns], self._exists)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from skillweave.networks.config import MLP, Activation
+from skillweave.networks.config import Activation, Network
 
 Views = Mapping[str, Tensor]
 """Named parameters, each (P, *shape)."""
@@ -50,15 +50,29 @@ class Layout:
         """Like ``views``, each a leaf that can be differentiated by."""
         return {k: v.detach().requires_grad_() for k, v in self.views(flat).items()}
 
+    def gather(self, grads: Sequence[Tensor | None], members: int) -> Tensor:
+        """Gradients by the leaves, in order, as one (P, D); what was not used has gradient 0."""
+        shapes = self.shapes.values()
+        flat = [
+            torch.zeros(members, math.prod(s)) if g is None else g.flatten(1)
+            for g, s in zip(grads, shapes, strict=True)
+        ]
+        return torch.cat(flat, dim=1)
+
     def flatten(self, named: Mapping[str, Tensor]) -> Tensor:
         """The inverse of ``views``: (P, D) from tensors (P, *shape), copied."""
         return torch.cat([named[name].flatten(1) for name in self.shapes], dim=1)
 
 
-def mlp_shapes(prefix: str, inputs: int, net: MLP, outputs: int) -> dict[str, tuple[int, ...]]:
-    """Parameter names and shapes of an MLP; weights are (in, out), biases (1, out)."""
+def mlp_shapes(
+    prefix: str, inputs: int, net: Network, outputs: int | None
+) -> dict[str, tuple[int, ...]]:
+    """Parameter names and shapes of hidden layers and head; weights (in, out), biases (1, out).
+
+    ``outputs`` None: there is no head.
+    """
     shapes: dict[str, tuple[int, ...]] = {}
-    widths = (inputs, *net.hidden, outputs)
+    widths = (inputs, *net.hidden) if outputs is None else (inputs, *net.hidden, outputs)
     for i, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
         shapes[f"{prefix}.{i}.weight"] = (n_in, n_out)
         shapes[f"{prefix}.{i}.bias"] = (1, n_out)
@@ -68,28 +82,32 @@ def mlp_shapes(prefix: str, inputs: int, net: MLP, outputs: int) -> dict[str, tu
     return shapes
 
 
-def mlp_init_(
-    views: Views, prefix: str, net: MLP, head_gain: float, generators: list[torch.Generator]
-) -> None:
-    """Orthogonal weights in place, gain √2 (``head_gain`` for the last layer), biases zero.
+def orthogonal_(weight: Tensor, gain: float, generators: list[torch.Generator]) -> None:
+    """Orthogonal matrices in place, (P, in, ...), one generator a member.
 
-    One generator a member, so a member's weights do not depend on its neighbours.
+    So a member's weights do not depend on its neighbours. Saxe et al. 2014.
     """
-    for i in range(len(net.hidden) + 1):
+    for member, generator in enumerate(generators):
+        fresh = torch.empty(weight.shape[1:])
+        torch.nn.init.orthogonal_(fresh, gain, generator=generator)
+        weight[member].copy_(fresh)
+
+
+def mlp_init_(
+    views: Views, prefix: str, net: Network, head_gain: float, generators: list[torch.Generator]
+) -> None:
+    """Orthogonal weights in place, gain √2 (``head_gain`` for the head), biases zero."""
+    for i in range(_depth(views, prefix)):
         gain = head_gain if i == len(net.hidden) else math.sqrt(2.0)
-        weight = views[f"{prefix}.{i}.weight"]
-        for member, generator in enumerate(generators):
-            fresh = torch.empty(weight.shape[1:])
-            torch.nn.init.orthogonal_(fresh, gain, generator=generator)
-            weight[member].copy_(fresh)
+        orthogonal_(views[f"{prefix}.{i}.weight"], gain, generators)
         views[f"{prefix}.{i}.bias"].zero_()
-        if net.layer_norm and i < len(net.hidden):
+        if f"{prefix}.{i}.norm_weight" in views:
             views[f"{prefix}.{i}.norm_weight"].fill_(1.0)
             views[f"{prefix}.{i}.norm_bias"].zero_()
 
 
-def mlp(views: Views, prefix: str, net: MLP, x: Tensor) -> Tensor:
-    """(P, B, in) to (P, B, out)."""
+def mlp(views: Views, prefix: str, net: Network, x: Tensor) -> Tensor:
+    """(P, B, in) to (P, B, out); without a head in the views, the last hidden layer."""
     activation = ACTIVATIONS[net.activation]
     for i in range(len(net.hidden)):
         x = torch.baddbmm(views[f"{prefix}.{i}.bias"], x, views[f"{prefix}.{i}.weight"])
@@ -98,8 +116,14 @@ def mlp(views: Views, prefix: str, net: MLP, x: Tensor) -> Tensor:
             norm_bias = views[f"{prefix}.{i}.norm_bias"]
             x = torch.addcmul(norm_bias, x, views[f"{prefix}.{i}.norm_weight"])
         x = activation(x)
-    i = len(net.hidden)
-    return torch.baddbmm(views[f"{prefix}.{i}.bias"], x, views[f"{prefix}.{i}.weight"])
+    head = f"{prefix}.{len(net.hidden)}"
+    if f"{head}.weight" not in views:
+        return x
+    return torch.baddbmm(views[f"{head}.bias"], x, views[f"{head}.weight"])
+
+
+def _depth(views: Views, prefix: str) -> int:
+    return next(i for i in itertools.count() if f"{prefix}.{i}.weight" not in views)
 
 
 def take_rows(x: Tensor, rows: Tensor) -> Tensor:

@@ -45,3 +45,11 @@ def normal_stats(mean: Tensor, log_std: Tensor, action: Tensor) -> tuple[Tensor,
     log_prob = (-0.5 * z.square() - log_std - _HALF_LOG_TWO_PI).sum(-1)
     entropy = (log_std + 0.5 + _HALF_LOG_TWO_PI).expand_as(mean).sum(-1)
     return log_prob, entropy
+
+
+def tanh_log_det(x: Tensor) -> Tensor:
+    """``log(1 − tanh²(x))``, the log-derivative of tanh, without cancellation; any shape.
+
+    ``2·(log 2 − x − softplus(−2x))``, as in the SAC authors' code (Haarnoja et al. 2018, app. C).
+    """
+    return 2.0 * (math.log(2.0) - x - torch.nn.functional.softplus(-2.0 * x))

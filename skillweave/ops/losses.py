@@ -56,3 +56,27 @@ def approximate_kl(log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
     """
     log_ratio = log_prob - old_log_prob
     return (torch.expm1(log_ratio) - log_ratio).mean(1)
+
+
+def td_loss(value: Tensor, target: Tensor, kind: str) -> Tensor:
+    """Huber (threshold 1; Mnih et al. 2015) or half squared error of each sample; any shape."""
+    if kind == "huber":
+        return torch.nn.functional.smooth_l1_loss(value, target, reduction="none")
+    return 0.5 * (value - target).square()
+
+
+def categorical_projection(p: Tensor, atoms: Tensor, reward: Tensor, discount: Tensor) -> Tensor:
+    """The distribution of ``r + discount·Z`` on the atoms of Z (Bellemare et al. 2017, eq. 7).
+
+    Args:
+        p: (P, B, N), probabilities of ``atoms`` (N,), which are evenly spaced.
+        reward, discount: (P, B).
+
+    Returns:
+        (P, B, N).
+    """
+    low, high, width = atoms[0], atoms[-1], atoms[1] - atoms[0]
+    moved = (reward[..., None] + discount[..., None] * atoms).clamp(low, high)
+    # Atom j's mass falls on the two atoms next to where it moved: a triangle around each.
+    share = (1.0 - (moved[..., None, :] - atoms[:, None]).abs() / width).clamp_min(0.0)
+    return (share * p[..., None, :]).sum(-1)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skillweave import MLP, PPO, Array, Hierarchy, Reflex, Skill, Step
+from skillweave import PPO, Array, Hierarchy, Network, Reflex, Skill, Step
 
 X, Y, ANGLE, LEFT_LEG, RIGHT_LEG = 0, 1, 4, 6, 7
 
@@ -62,7 +62,7 @@ def landed(obs: Array) -> Array:
     return touching
 
 
-RELU = MLP(activation="relu")  # tanh costs more than all the rest of so small a network
+RELU = Network(activation="relu")  # tanh costs more than all the rest of so small a network
 
 HOLDING = PPO(
     learning_rate=1e-3,

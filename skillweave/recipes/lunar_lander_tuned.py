@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from skillweave import MLP, PPO, Array, Hierarchy, Skill, Step
+from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
 
 X, Y, VX, VY, ANGLE, SPIN = 0, 1, 2, 3, 4, 5
 MAIN_ENGINE = 2
@@ -90,7 +90,7 @@ LEARNER = PPO(
     gamma=0.995,
     gae_lambda=0.97,
     normalize_obs=True,
-    network=MLP(activation="relu"),
+    network=Network(activation="relu"),
 )
 
 hierarchy = Hierarchy(

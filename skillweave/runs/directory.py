@@ -4,6 +4,7 @@ run.json                     what is trained, with which settings, seeds and ver
 metrics.jsonl                a line for every update
 checkpoint.safetensors       the phase under way, at its latest clean cut (and the one before)
 policies/<phase>.safetensors finished phases
+policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights
 """
 
 from __future__ import annotations
@@ -12,21 +13,25 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torch import Tensor
+
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.files import (
     read_json,
     read_tensors,
+    write_bytes,
     write_json,
     write_tensors,
 )
-from skillweave.types import SkillweaveError
+from skillweave.skills.foreign import Foreign, as_recorded
+from skillweave.types import Policy, SkillweaveError
 
 S = TypeVar("S")
 
@@ -102,9 +107,15 @@ class RunDirectory:
         """Whether every phase is done."""
         return all(p["status"] == "done" for p in self.manifest["phases"])
 
-    def save_checkpoint(self, state: Any, header: dict[str, Any]) -> None:
-        """Write a dataclass of tensors as the latest clean cut; the one before stays beside it."""
+    def save_checkpoint(
+        self, state: Any, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
+    ) -> None:
+        """Write a dataclass of tensors as the latest clean cut; the one before stays beside it.
+
+        ``extra`` holds what else resuming needs: a replay buffer.
+        """
         tensors = {f.name: getattr(state, f.name) for f in fields(state)}
+        tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
         target = self.path / "checkpoint.safetensors"
         fresh = self.path / "checkpoint.new.safetensors"
         write_tensors(fresh, tensors, header | {"metrics_bytes": self.metrics_size()})
@@ -112,8 +123,10 @@ class RunDirectory:
             os.replace(target, self.path / "checkpoint.previous.safetensors")
         os.replace(fresh, target)
 
-    def load_checkpoint(self, kind: type[S], phase: str) -> tuple[S, dict[str, Any]] | None:
-        """The latest good clean cut of a phase, or None where there is none yet.
+    def load_checkpoint(
+        self, kind: type[S], phase: str
+    ) -> tuple[S, dict[str, Any], dict[str, Tensor]] | None:
+        """State, header and extra of a phase's latest good clean cut; None: there is none yet.
 
         Raises:
             SkillweaveError: checkpoints of this phase exist, but all are damaged.
@@ -130,10 +143,12 @@ class RunDirectory:
                 continue
             if header.get("phase") != phase:
                 continue
+            cut = len("extra.")
+            extra = {k[cut:]: tensors.pop(k) for k in list(tensors) if k.startswith("extra.")}
             names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
             if names != set(tensors):
                 raise SkillweaveError(f"{path} does not hold a {kind.__name__} of this Skillweave")
-            return kind(**tensors), header
+            return kind(**tensors), header, extra
         if problems:
             raise SkillweaveError(
                 "; ".join(problems) + f". Delete it to train the phase {phase!r} from its start"
@@ -160,6 +175,31 @@ class RunDirectory:
         if header.get("kind") != "agent":
             raise SkillweaveError(f"{path} holds no agent's policy")
         return AgentPolicy.from_file(tensors, header, str(path))
+
+    def keep_policy(self, skill: str, policy: Policy) -> None:
+        """Copy into the run what a skill's ready policy acts by, where it is to be copied."""
+        if isinstance(policy, Foreign) and (content := policy.content()) is not None:
+            path = self._copy_path(skill, policy)
+            if not path.exists():  # a run that goes on has it
+                write_bytes(path, content)
+
+    def ready_policy(self, skill: str, policy: Policy) -> Policy:
+        """A skill's ready policy as it was when the run began.
+
+        Raises:
+            SkillweaveError: the policy is another one, and the run holds no copy of its own.
+        """
+        entry: dict[str, Any] = next((s for s in self.manifest["skills"] if s["name"] == skill), {})
+
+        def read() -> bytes | None:
+            assert isinstance(policy, Foreign)
+            path = self._copy_path(skill, policy)
+            return path.read_bytes() if path.exists() else None
+
+        return as_recorded(policy, entry.get("policy"), read, f"{self.path}: skill {skill!r}")
+
+    def _copy_path(self, skill: str, policy: Foreign) -> Path:
+        return self.path / "policies" / f"{skill}{policy.suffix}"
 
     def policy_path(self, phase: str) -> Path:
         """Where a phase's policy lies."""

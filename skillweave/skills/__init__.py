@@ -1,5 +1,20 @@
 """Skills and reflexes: what a user declares."""
 
 from skillweave.skills.base import Reflex, Skill, apply_reflexes, checked
+from skillweave.skills.onnx_file import from_onnx
+from skillweave.skills.ready import ready_policy
+from skillweave.skills.sb3 import from_sb3
+from skillweave.skills.scripted import from_function
+from skillweave.skills.torch_module import from_torch
 
-__all__ = ["Reflex", "Skill", "apply_reflexes", "checked"]
+__all__ = [
+    "Reflex",
+    "Skill",
+    "apply_reflexes",
+    "checked",
+    "from_function",
+    "from_onnx",
+    "from_sb3",
+    "from_torch",
+    "ready_policy",
+]

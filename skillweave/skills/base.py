@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from skillweave.types import Array, Policy, SkillweaveError, Step
+from skillweave.types import Array, SkillweaveError, Step
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 
@@ -29,7 +29,9 @@ class Skill:
         steps: training budget in environment steps; None: the hierarchy's ``skill_steps``.
         algorithm: settings of the algorithm that trains it (its network is among them);
             None: the hierarchy's.
-        policy: a ready policy (scripted, foreign, or a hierarchy's); None: it is trained.
+        policy: what acts without being trained: a function of observations (n, *obs_shape), which
+            needs no ``staticmethod``, or a method ``policy(self, obs)``; a torch module;
+            ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained.
         color: RGB in captions and plots; None: chosen from a palette.
     """
 
@@ -37,7 +39,7 @@ class Skill:
     max_steps: int | None = None
     steps: int | None = None
     algorithm: Any = None
-    policy: Policy | None = None
+    policy: Any = None
     color: tuple[int, int, int] | None = None
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")

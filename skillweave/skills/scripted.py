@@ -5,23 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from skillweave.types import Array, Memory, Memoryless
+from skillweave.skills.actions import checked_actions
+from skillweave.skills.foreign import Foreign, qualified
+from skillweave.types import Array, Memory, SkillweaveError
 
 
-class ScriptedPolicy(Memoryless):
+class ScriptedPolicy(Foreign):
     """A function from observations (n, *obs_shape) to actions (n, *action_shape) as a policy."""
+
+    kind = "function"
 
     def __init__(
         self,
-        function: Callable[[Array], Array],
-        observation_space: gym.Space[Any],
-        action_space: gym.Space[Any],
+        function: Callable[[Array], Any],
+        observation_space: Any = None,
+        action_space: Any = None,
     ) -> None:
         self.function = function
-        self.observation_space, self.action_space = observation_space, action_space
+        name = getattr(function, "__name__", type(function).__name__)
+        super().__init__(f"function {name}()", observation_space, action_space)
 
     def act(
         self,
@@ -32,5 +36,28 @@ class ScriptedPolicy(Memoryless):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The function's actions."""
-        return np.asarray(self.function(obs)), memory
+        """The function's actions, checked where the action space is known."""
+        action = self.function(obs)
+        if self.action_space is None:
+            return np.asarray(action), memory
+        return checked_actions(action, len(obs), self.action_space, self._who), memory
+
+    def source(self) -> dict[str, Any]:
+        """The function's name."""
+        return {"kind": self.kind, "name": qualified(self.function)}
+
+
+def from_function(
+    function: Callable[[Array], Any], *, observation_space: Any = None, action_space: Any = None
+) -> ScriptedPolicy:
+    """A Python function as a skill's policy; a skill takes the bare function too.
+
+    Args:
+        function: observations (n, *obs_shape) to actions (n, *action_shape), of whole numbers where
+            the actions are; keep no state in it, it is called for any environments in any order.
+        observation_space: None: that of the environment it meets.
+        action_space: None: that of the environment it meets.
+    """
+    if not callable(function):
+        raise SkillweaveError(f"from_function takes a function of observations, not {function!r}")
+    return ScriptedPolicy(function, observation_space, action_space)

@@ -8,80 +8,19 @@ reproducible as without it.
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 
+from skillweave.algorithms.base import Actor
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.buffers.rollout import RolloutBuffer
-from skillweave.networks.actor import Actor
 from skillweave.seeding import Seeds
-from skillweave.types import Array, SkillweaveError, VecEnv, VecStep
-
-WINDOW = 100  # episodes in the reported means
-
-
-@dataclass
-class Episodes:
-    """Returns, lengths and successes of the latest episodes, for people to watch."""
-
-    returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    task_returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    lengths: deque[int] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    successes: deque[bool] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    _sums: Array = field(default_factory=lambda: np.zeros((3, 0)))
-
-    def add(self, step: VecStep) -> None:
-        """Take one step of all environments into account."""
-        n = len(step.reward)
-        if self._sums.shape[1] != n:
-            self._sums = np.zeros((3, n))
-        # An options environment sums the undiscounted reward of a call apart.
-        self._sums[0] += step.info.get("call_return", step.reward)
-        if "task_reward" in step.info:
-            self._sums[1] += step.info["task_reward"]
-        self._sums[2] += step.steps
-        ended = step.terminated | step.truncated
-        if ended.any():
-            for i in np.flatnonzero(ended):
-                self.returns.append(float(self._sums[0, i]))
-                if "task_reward" in step.info:
-                    self.task_returns.append(float(self._sums[1, i]))
-                self.lengths.append(int(self._sums[2, i]))
-                if "success" in step.info:
-                    self.successes.append(bool(step.info["success"][i]))
-            self._sums[:, ended] = 0.0
-
-    def cut(self) -> None:
-        """Forget the episodes in flight."""
-        self._sums[:] = 0.0
-
-    def summary(self) -> dict[str, float]:
-        """Means over the window; empty before the first episode ended."""
-        named: dict[str, deque[Any]] = {
-            "return": self.returns,
-            "task_return": self.task_returns,
-            "length": self.lengths,
-            "success": self.successes,
-        }
-        return {k: float(np.mean(v)) for k, v in named.items() if v}
-
-
-@dataclass
-class Tick:
-    """What the loop reports after each update."""
-
-    update: int
-    steps: int
-    seconds: float  # of training, this process's part and those before it
-    metrics: dict[str, float]
-    state: State
-    cut: bool  # a clean cut: resuming from this state is exact
+from skillweave.spaces import to_tensor
+from skillweave.training.episodes import Episodes, Tick, to_numbers
+from skillweave.types import Array, VecEnv
 
 
 def train_on_policy(
@@ -174,7 +113,7 @@ class _Learner:
     def _learn(self, rollout: Rollout, update: int, progress: float) -> dict[str, float]:
         seeds = self.loop.member_seeds("learn", update)
         _, metrics = self.algorithm.update(self.state, rollout, min(1.0, progress), seeds)
-        return _to_numbers(metrics, update)
+        return to_numbers(metrics, update)
 
 
 class _Loop:
@@ -184,6 +123,7 @@ class _Loop:
         self.algorithm, self.env, self.seeds, self.members = algorithm, env, seeds, members
         self.episodes = Episodes()
         self._obs: Array = np.empty(0)
+        self._memory: torch.Tensor | None = None
 
     def member_seeds(self, name: str, update: int) -> list[Seeds]:
         """A node of the seed tree for each member."""
@@ -193,6 +133,9 @@ class _Loop:
         """Start every environment anew from a seed of this update's."""
         self._obs = self.env.reset(self.seeds / "restart" / update)
         self.episodes.cut()
+        if size := self.algorithm.memory:
+            p = self.members
+            self._memory = torch.zeros(p, self.env.num_envs // p, size)
 
     @torch.inference_mode()
     def collect(self, actor: Actor, state: State, update: int) -> tuple[Rollout, int]:
@@ -201,33 +144,25 @@ class _Loop:
         t, n, p = algorithm.config.n_steps, env.num_envs, self.members
         buffer = RolloutBuffer(t, n, p, env.observation_space)
         generators = [s.torch() for s in self.member_seeds("act", update)]
-        noises = algorithm.net.head.noise(generators, t, n // p)
-        mask, spent = env.mask(), 0
-        for noise in noises:
+        noises = algorithm.noise(generators, t, n // p)
+        mask, spent, before = env.mask(), 0, self._memory
+        starts = torch.zeros(p, t, n // p, dtype=torch.bool)
+        for i, noise in enumerate(noises):
             obs = self._obs
-            rows = torch.from_numpy(obs).unflatten(0, (p, n // p))
+            rows = to_tensor(obs).unflatten(0, (p, n // p))
             allowed = None if mask is None else torch.from_numpy(mask).unflatten(0, (p, n // p))
-            action, head = algorithm.net.act(actor, rows, allowed, noise)
-            step = env.step(algorithm.net.head.codec.to_env(action.flatten(0, 1).numpy()))
+            action, head, memory = algorithm.act(actor, rows, allowed, noise, self._memory)
+            step = env.step(algorithm.to_env(action.flatten(0, 1).numpy()))
             buffer.add(obs, mask, action, head, step)
             self.episodes.add(step)
             self._obs, mask = step.obs, step.mask
             spent += int(step.steps.sum())
+            if memory is not None:
+                ended = torch.from_numpy(step.ended).view(p, -1)
+                self._memory = memory * ~ended[..., None]
+                if i + 1 < t:
+                    starts[:, i + 1] = ended
         transition, head = buffer.read(state.gamma)
         log_std = actor.views.get("actor.log_std")
-        return Rollout(transition, head, None if log_std is None else log_std[:, None]), spent
-
-
-def _to_numbers(metrics: dict[str, Any], update: int) -> dict[str, float]:
-    """Member means; a value that is not finite stops the run, saying which and where."""
-    numbers = {}
-    for name, value in metrics.items():
-        finite = torch.isfinite(value)
-        if not bool(finite.all()):
-            member = int((~finite).nonzero()[0])
-            raise SkillweaveError(
-                f"{name} of member {member} is {float(value[member])} at update {update}: training "
-                "has diverged. Lower learning_rate or max_grad_norm; the last checkpoint is intact"
-            )
-        numbers[name] = float(value.mean())
-    return numbers
+        log_std = None if log_std is None else log_std[:, None]
+        return Rollout(transition, head, log_std, before, starts), spent

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
+from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.algorithms.ppo import State
+from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
-from skillweave.training.on_policy import Tick, train_on_policy
+from skillweave.training.episodes import Tick
+from skillweave.training.off_policy import train_off_policy
+from skillweave.training.on_policy import train_on_policy
 from skillweave.types import VecEnv
 
 START = {"update": 0, "steps": 0, "seconds": 0.0, "metrics": {}}
@@ -67,8 +70,8 @@ def train_phase(
     env = phase.make_env(config)
     try:
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
-        found = run.load_checkpoint(State, phase.name)
-        state, at = found or (algorithm.init([seeds / "member" / 0]), dict(START))
+        found = run.load_checkpoint(algorithm.state_type, phase.name)
+        state, at, extra = found or (algorithm.init([seeds / "member" / 0]), dict(START), {})
         run.rewind_metrics(at.get("metrics_bytes", entry.get("metrics_bytes")))
         entry.setdefault("metrics_bytes", run.metrics_size())
         entry["status"] = "training"
@@ -85,12 +88,14 @@ def train_phase(
                 listener.tick(phase.name, tick.steps, tick.seconds, tick.metrics)
             if tick.cut:
                 header = {"seconds": tick.seconds, "metrics": tick.metrics}
-                run.save_checkpoint(tick.state, now | header)
+                run.save_checkpoint(tick.state, now | header, tick.extra)
 
-        train_on_policy(
-            algorithm, env, state, seeds, budget, cut_every=cut_every, on_tick=on_tick,
-            update=at["update"], steps=at["steps"], seconds=at["seconds"],
-        )  # fmt: skip
+        where: dict[str, Any] = {k: at[k] for k in ("update", "steps", "seconds")}
+        where |= {"cut_every": cut_every, "on_tick": on_tick}
+        if isinstance(algorithm, PPOAlgorithm):
+            train_on_policy(algorithm, env, state, seeds, budget, **where)
+        elif isinstance(algorithm, OffPolicyAlgorithm):
+            train_off_policy(algorithm, env, state, seeds, budget, saved=extra, **where)
     finally:
         env.close()
     policy = AgentPolicy.of(algorithm, state)

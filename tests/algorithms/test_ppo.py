@@ -8,7 +8,7 @@ from torch import nn
 
 from skillweave.algorithms.config import PPO, config_from_json, config_to_json
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
-from skillweave.networks.config import MLP
+from skillweave.networks.config import Network
 from skillweave.ops.returns import gae, normalise
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError, Transition
@@ -16,7 +16,7 @@ from skillweave.types import SkillweaveError, Transition
 T, B = 8, 6
 OBS = Box(-np.inf, np.inf, (3,), np.float32)
 CONFIG = PPO(
-    num_envs=B, n_steps=T, batch_size=16, update_epochs=3, network=MLP((16,)),
+    num_envs=B, n_steps=T, batch_size=16, update_epochs=3, network=Network((16,)),
     learning_rate_schedule="constant",
 )  # fmt: skip
 
@@ -50,9 +50,9 @@ def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool =
         mask = torch.rand(p, T, B, 4, generator=g) < 0.5
         mask[..., 2] = True
     actor = algorithm.actor(state)
-    noise = algorithm.net.head.noise([torch.Generator().manual_seed(m) for m in range(p)], T * B, 1)
+    noise = algorithm.noise([torch.Generator().manual_seed(m) for m in range(p)], T * B, 1)
     flat_mask = None if mask is None else mask.flatten(1, 2)
-    action, head = algorithm.net.act(
+    action, head, _ = algorithm.act(
         actor, obs.flatten(1, 2), flat_mask, noise[:, :, 0].transpose(0, 1)
     )
     transition = Transition(
@@ -85,7 +85,7 @@ VARIANTS = {
     "rate by kl": {"target_kl": 0.01, "learning_rate_schedule": "kl"},
     "linear rate": {"learning_rate_schedule": "linear"},
     "raw": {"normalize_returns": False, "normalize_advantage": False},
-    "critic of its own": {"critic": MLP((8, 8), "relu", layer_norm=True)},
+    "critic of its own": {"critic": Network((8, 8), "relu", layer_norm=True)},
     "minibatches of unequal size": {"batch_size": 13},
 }
 
@@ -157,12 +157,12 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     actor, critic = (plain_network(algorithm, state, k) for k in ("actor", "critic"))
     log_std = nn.Parameter(torch.full((2,), cfg.action_std_init).log())
     parameters = [*actor.parameters(), *critic.parameters()]
-    parameters += [] if algorithm.net.head.discrete else [log_std]
+    parameters += [] if algorithm.head.discrete else [log_std]
     adam = torch.optim.Adam(parameters, cfg.learning_rate, eps=cfg.adam_eps)
 
     def policy() -> torch.distributions.Distribution:
         head = actor(tr.obs)
-        if algorithm.net.head.discrete:
+        if algorithm.head.discrete:
             head = head.masked_fill(~tr.mask, -1e9) if masked else head
             return torch.distributions.Categorical(logits=head)
         return torch.distributions.Independent(torch.distributions.Normal(head, log_std.exp()), 1)
@@ -189,7 +189,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
         stacked = plain_network(algorithm, state, prefix)
         for a, b in zip(stacked.parameters(), network.parameters(), strict=True):
             torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
-    if not algorithm.net.head.discrete:
+    if not algorithm.head.discrete:
         got = algorithm.layout.views(state.params)["actor.log_std"][0, 0]
         torch.testing.assert_close(got, log_std.data, rtol=1e-4, atol=1e-6)
     assert metrics["samples"].tolist() == [T * B]
@@ -202,23 +202,23 @@ def test_greedy_is_the_most_probable_action_and_the_mean():
         (Box(-1, 1, (2,)), lambda h: h),
     ):
         algorithm, state = make(space, members=2)
-        action, head = algorithm.net.act(algorithm.actor(state), obs, None, None)
+        action, head, _ = algorithm.act(algorithm.actor(state), obs, None, None)
         assert torch.equal(action, greedy(head))
 
 
 def test_sampling_follows_the_heads_distribution():
     algorithm, state = make()
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([0.0, 1.0, 2.0, 3.0])
-    noise = algorithm.net.head.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head = algorithm.net.act(algorithm.actor(state), torch.zeros(1, 50_000, 3), None, noise)
+    noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
+    action, head, _ = algorithm.act(algorithm.actor(state), torch.zeros(1, 50_000, 3), None, noise)
     frequency = action.flatten().bincount(minlength=4) / 50_000
     torch.testing.assert_close(frequency, head[0, 0].softmax(-1), atol=0.008, rtol=0)
 
 
 def test_continuous_sampling_has_the_initial_deviation():
     algorithm, state = make(Box(-1, 1, (2,)), action_std_init=0.3)
-    noise = algorithm.net.head.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head = algorithm.net.act(algorithm.actor(state), torch.ones(1, 50_000, 3), None, noise)
+    noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
+    action, head, _ = algorithm.act(algorithm.actor(state), torch.ones(1, 50_000, 3), None, noise)
     torch.testing.assert_close(action[0].std(0), torch.full((2,), 0.3), rtol=0.02, atol=0)
     torch.testing.assert_close(action[0].mean(0), head[0, 0], rtol=0, atol=0.01)
 
@@ -228,8 +228,8 @@ def test_a_masked_action_is_never_taken_and_has_no_probability():
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([9.0, 0.0, 0.0, 9.0])
     mask = torch.tensor([False, True, True, False]).expand(1, 20_000, 4)
     actor, obs = algorithm.actor(state), torch.zeros(1, 20_000, 3)
-    for noise in (algorithm.net.head.noise([Seeds(0).torch()], 1, 20_000)[0], None):
-        action, head = algorithm.net.act(actor, obs, mask, noise)
+    for noise in (algorithm.noise([Seeds(0).torch()], 1, 20_000)[0], None):
+        action, head, _ = algorithm.act(actor, obs, mask, noise)
         assert mask.gather(-1, action[..., None]).all()
         assert (head.softmax(-1)[~mask] == 0).all()
 
@@ -237,10 +237,10 @@ def test_a_masked_action_is_never_taken_and_has_no_probability():
 def test_each_member_has_its_own_noise():
     algorithm, _ = make()
     seeds = [Seeds(0) / m for m in range(3)]
-    three = algorithm.net.head.noise([s.torch() for s in seeds], 5, 2)
+    three = algorithm.noise([s.torch() for s in seeds], 5, 2)
     assert three.shape == (5, 3, 2, 4)
     for m, s in enumerate(seeds):
-        assert torch.equal(algorithm.net.head.noise([s.torch()], 5, 2)[:, 0], three[:, m])
+        assert torch.equal(algorithm.noise([s.torch()], 5, 2)[:, 0], three[:, m])
     assert not torch.equal(three[:, 0], three[:, 1])
 
 
@@ -248,10 +248,10 @@ def test_each_member_has_its_own_noise():
 def test_an_actor_is_a_copy_that_learning_does_not_change(normalize_obs):
     algorithm, state = make(normalize_obs=normalize_obs)
     actor, obs = algorithm.actor(state), torch.randn(1, 5, 3)
-    before = algorithm.net.act(actor, obs, None, None)[1].clone()
+    before = algorithm.act(actor, obs, None, None)[1].clone()
     algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0)])
-    assert torch.equal(algorithm.net.act(actor, obs, None, None)[1], before)
-    assert not torch.equal(algorithm.net.act(algorithm.actor(state), obs, None, None)[1], before)
+    assert torch.equal(algorithm.act(actor, obs, None, None)[1], before)
+    assert not torch.equal(algorithm.act(algorithm.actor(state), obs, None, None)[1], before)
 
 
 def test_observations_are_normalised_by_all_that_were_seen():
@@ -340,11 +340,11 @@ def test_the_kl_schedule_asks_for_its_target():
 @pytest.mark.parametrize(("name", "value"), [("hidden", (64, 0)), ("activation", "sine")])
 def test_a_network_that_cannot_be_is_named(name, value):
     with pytest.raises(SkillweaveError, match=name):
-        make(network=MLP(**{name: value}))
+        make(network=Network(**{name: value}))
 
 
 def test_settings_survive_json():
-    config = replace(CONFIG, critic=MLP((8,), "relu", True), target_kl=0.1)
+    config = replace(CONFIG, critic=Network((8,), "relu", True), target_kl=0.1)
     assert config_from_json(config_to_json(config)) == config
     assert config_from_json(config_to_json(PPO())) == PPO()
 

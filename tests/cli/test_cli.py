@@ -21,7 +21,7 @@ COMMANDS = ("train", "resume", "evaluate", "render", "list", "info", "weights")
 # The same hierarchy twice: as plain data, and with a reflex, which only code can say.
 PLAIN = '''
 """Two skills on CartPole."""
-from skillweave import MLP, PPO, EnvSpec, Hierarchy, Reflex, Skill
+from skillweave import Network, PPO, EnvSpec, Hierarchy, Reflex, Skill
 
 class Left(Skill):
     max_steps = 10
@@ -31,7 +31,7 @@ class Left(Skill):
 class Balance(Skill):
     pass
 
-small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=MLP(hidden=(8,)))
+small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
 hierarchy = Hierarchy(
     env=EnvSpec("CartPole-v1", engine="sync"),
     skills=[Left(), Balance()],

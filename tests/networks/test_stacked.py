@@ -5,13 +5,18 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from skillweave.networks.config import MLP
+from skillweave.networks.config import Network
 from skillweave.networks.stacked import ACTIVATIONS, Layout, mlp, mlp_init_, mlp_shapes
 
-NETS = [MLP((8, 6)), MLP((7,), "relu", layer_norm=True), MLP(()), MLP((5, 5), "gelu", True)]
+NETS = [
+    Network((8, 6)),
+    Network((7,), "relu", layer_norm=True),
+    Network(()),
+    Network((5, 5), "gelu", True),
+]
 
 
-def network(net: MLP, seeds: list[int], inputs: int = 3, outputs: int = 2, gain: float = 1.0):
+def network(net: Network, seeds: list[int], inputs: int = 3, outputs: int = 2, gain: float = 1.0):
     layout = Layout(mlp_shapes("net", inputs, net, outputs))
     flat = torch.zeros(len(seeds), layout.size)
     generators = [torch.Generator().manual_seed(s) for s in seeds]
@@ -57,7 +62,7 @@ def test_a_member_does_not_depend_on_its_neighbours(net):
 
 
 def test_one_backward_pass_gives_each_member_its_own_gradient():
-    net = MLP((8,))
+    net = Network((8,))
     layout, flat = network(net, [0, 1])
     x = torch.randn(2, 5, 3, generator=torch.Generator().manual_seed(3))
 
@@ -76,7 +81,7 @@ def test_one_backward_pass_gives_each_member_its_own_gradient():
 
 
 def test_weights_are_orthogonal_with_their_gain_and_biases_zero():
-    layout, flat = network(MLP((8, 8)), [0, 1], inputs=8, outputs=4, gain=0.01)
+    layout, flat = network(Network((8, 8)), [0, 1], inputs=8, outputs=4, gain=0.01)
     views = layout.views(flat)
     for i, gain in enumerate([math.sqrt(2), math.sqrt(2), 0.01]):
         for weight in views[f"net.{i}.weight"]:
@@ -86,7 +91,7 @@ def test_weights_are_orthogonal_with_their_gain_and_biases_zero():
 
 
 def test_views_are_windows_and_flatten_is_their_inverse():
-    layout, flat = network(MLP((4,), layer_norm=True), [0, 1])
+    layout, flat = network(Network((4,), layer_norm=True), [0, 1])
     views = layout.views(flat)
     assert sum(v[0].numel() for v in views.values()) == layout.size == flat.shape[1]
     assert torch.equal(layout.flatten(views), flat)
@@ -101,7 +106,7 @@ def test_flatten_copies_in_the_layouts_order_whatever_the_mappings():
 
 
 def test_leaves_share_memory_with_the_flat_parameters():
-    layout, flat = network(MLP((4,)), [0])
+    layout, flat = network(Network((4,)), [0])
     leaves = layout.leaves(flat)
     flat.zero_()
     assert all(v.requires_grad and v.is_leaf and not v.any() for v in leaves.values())

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.networks.config import MLP
+from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory, versions
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
@@ -261,7 +261,7 @@ def policy() -> AgentPolicy:
     import gymnasium as gym
 
     env = gym.make("CartPole-v1")
-    config = PPO(num_envs=1, n_steps=4, batch_size=4, network=MLP(hidden=(3,)))
+    config = PPO(num_envs=1, n_steps=4, batch_size=4, network=Network(hidden=(3,)))
     algorithm = make_algorithm(config, env.observation_space, env.action_space)
     env.close()
     return AgentPolicy.of(algorithm, algorithm.init([Seeds(0)]))

@@ -20,14 +20,14 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.envs.skill_env import SkillEnv
-from skillweave.networks.config import MLP
+from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
 from skillweave.training.on_policy import Tick, train_on_policy
 from skillweave.types import SkillweaveError
 
 CONFIG = PPO(
     num_envs=16, n_steps=16, batch_size=64, learning_rate=5e-3, gamma=0.9, ent_coef=0.0,
-    network=MLP((32,)),
+    network=Network((32,)),
 )  # fmt: skip
 
 
@@ -50,15 +50,15 @@ def greedy(algorithm: PPOAlgorithm, state: State, obs: np.ndarray, mask=None) ->
         torch.from_numpy(obs)[None],
         None if mask is None else torch.from_numpy(mask)[None],
     )
-    action, _ = algorithm.net.act(algorithm.actor(state), rows, allowed, None)
-    return algorithm.net.head.codec.to_env(action[0].numpy())
+    action, *_ = algorithm.act(algorithm.actor(state), rows, allowed, None)
+    return algorithm.to_env(action[0].numpy())
 
 
 @pytest.mark.parametrize("overlap", [True, False])
 def test_ppo_learns_that_the_action_must_equal_the_observation(overlap):
     algorithm, state = train(Identity(16), 40, replace(CONFIG, overlap=overlap))
     assert greedy(algorithm, state, np.arange(4)).tolist() == [0, 1, 2, 3]
-    head = algorithm.net.act(algorithm.actor(state), torch.arange(4)[None], None, None)[1]
+    head = algorithm.act(algorithm.actor(state), torch.arange(4)[None], None, None)[1]
     assert head.softmax(-1)[0].diagonal().min() > 0.9
 
 
@@ -177,7 +177,7 @@ class Spy(PPOAlgorithm):
         self.versions.append(self.actor(state))
         obs, head = rollout.transition.obs.flatten(1, 2), rollout.head.flatten(1, 2)
         with torch.no_grad():
-            heads = [self.net.act(a, obs, None, None)[1] for a in self.versions]
+            heads = [self.act(a, obs, None, None)[1] for a in self.versions]
             acted = [torch.allclose(h, head) for h in heads]
         self.lags.append(acted[::-1].index(True))
         return super().update(state, rollout, progress, seeds)

@@ -1,0 +1,200 @@
+"""Settings of the algorithms that learn from a replay buffer, and the checks of all settings.
+
+This module does not import torch; see ``config``, which has the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from skillweave.networks.config import Network
+from skillweave.types import SkillweaveError
+
+Schedule = Literal["constant", "linear"]
+
+
+def check(config: object, field_name: str, ok: bool, asked: str) -> None:
+    """Raise a SkillweaveError that names a field and what it must be."""
+    if not ok:
+        value = getattr(config, field_name)
+        raise SkillweaveError(
+            f"{type(config).__name__}.{field_name} is {value!r}; it must be {asked}"
+        )
+
+
+def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
+    """Raise where a field is none of the known words."""
+    check(config, field_name, getattr(config, field_name) in known, f"one of {', '.join(known)}")
+
+
+def check_networks(config: Any) -> None:
+    """Raise where ``network`` or ``critic`` is no architecture."""
+    check(config, "network", isinstance(config.network, Network), "a Network()")
+    none_or_network = isinstance(getattr(config, "critic", None), Network | None)
+    check(config, "critic", none_or_network, "a Network() or None")
+
+
+@dataclass(frozen=True)
+class OffPolicy:
+    """What the algorithms that learn from a replay buffer have in common."""
+
+    num_envs: int = 8
+    """Environments stepped side by side."""
+    train_freq: int = 1
+    """Steps of each environment between updates."""
+    update_ratio: float = 1.0
+    """Gradient steps per transition collected (the update-to-data ratio)."""
+    buffer_size: int = 1_000_000
+    """Transitions that the replay buffer holds."""
+    learning_starts: int = 5_000
+    """Transitions collected by acting at random before the first gradient step."""
+    batch_size: int = 256
+    """Samples of one gradient step."""
+    n_step: int = 1
+    """Steps of reward in a target before it bootstraps (Sutton 1988)."""
+    prioritized: bool = False
+    """Sample by the size of the last error (Schaul et al. 2016)."""
+    priority_alpha: float = 0.6
+    """How strongly priorities count; 0: not at all."""
+    priority_beta: float = 0.4
+    """Correction of the bias that they bring, at the start; 1 at the end of the budget."""
+    learning_rate: float = 3e-4
+    """Adam's step size, at the start."""
+    learning_rate_schedule: Schedule = "constant"
+    """constant; linear: falls to 0 over the budget."""
+    adam_eps: float = 1e-8
+    """Adam's ε."""
+    gamma: float = 0.99
+    """Discount γ of one step."""
+    tau: float = 0.005
+    """Share of the new weights in the target's at each target update."""
+    max_grad_norm: float = 10.0
+    """Gradients are scaled down to this norm."""
+    normalize_obs: bool = False
+    """Running zero mean, unit deviation of observations; saved with the policy."""
+    normalize_rewards: bool = False
+    """Rewards are divided by the running deviation of returns."""
+    network: Network = field(default_factory=lambda: Network((256, 256), "relu"))
+    """The network that acts."""
+    save_buffer: bool = True
+    """Checkpoints hold the replay buffer, so that resuming is exact; else it fills anew."""
+    threads: int = 1
+    """Torch threads while learning."""
+
+    def __post_init__(self) -> None:
+        check_networks(self)
+        check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
+        for name in ("num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads"):
+            check(self, name, getattr(self, name) >= 1, "at least 1")
+        for name in ("gamma", "tau", "priority_alpha", "priority_beta"):
+            check(self, name, 0.0 <= getattr(self, name) <= 1.0, "between 0 and 1")
+        for name in ("learning_rate", "max_grad_norm", "adam_eps", "update_ratio"):
+            check(self, name, 0.0 < getattr(self, name) < float("inf"), "positive and finite")
+        check(self, "learning_starts", self.learning_starts >= 0, "at least 0")
+        one_of(self, "learning_rate_schedule", ("constant", "linear"))
+        least = self.num_envs * (self.n_step + 1)
+        check(
+            self,
+            "buffer_size",
+            self.buffer_size >= least,
+            f"at least {least} (num_envs·(n_step+1))",
+        )
+
+
+@dataclass(frozen=True)
+class DQN(OffPolicy):
+    """Deep Q-learning (Mnih et al. 2015) and its extensions; all of them are ``DQN.rainbow()``."""
+
+    double: bool = True
+    """The online network chooses the target's action (van Hasselt et al. 2016)."""
+    dueling: bool = False
+    """Value and advantage streams (Wang et al. 2016)."""
+    noisy: bool = False
+    """Exploration by learnt noise in the weights instead of ε (Fortunato et al. 2018)."""
+    distributional: bool = False
+    """C51: the distribution of returns on fixed atoms (Bellemare et al. 2017)."""
+    n_atoms: int = 51
+    """C51's atoms."""
+    v_min: float = -10.0
+    """C51's smallest return."""
+    v_max: float = 10.0
+    """C51's largest return."""
+    exploration_fraction: float = 0.1
+    """Share of the budget over which ε falls."""
+    exploration_initial_eps: float = 1.0
+    """ε at the start: the share of random actions."""
+    exploration_final_eps: float = 0.05
+    """ε afterwards."""
+    target_update_interval: int = 1
+    """Gradient steps between target updates."""
+    loss: Literal["huber", "mse"] = "huber"
+    """Of the temporal-difference error; C51 has its own."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"):
+            check(self, name, 0.0 <= getattr(self, name) <= 1.0, "between 0 and 1")
+        check(self, "target_update_interval", self.target_update_interval >= 1, "at least 1")
+        check(self, "n_atoms", self.n_atoms >= 2, "at least 2")
+        check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
+        one_of(self, "loss", ("huber", "mse"))
+
+    @classmethod
+    def rainbow(cls, **settings: Any) -> DQN:
+        """Every extension at once, as in Rainbow (Hessel et al. 2018); settings override."""
+        everything = {
+            "double": True, "dueling": True, "noisy": True, "distributional": True,
+            "prioritized": True, "n_step": 3, "priority_alpha": 0.5, "adam_eps": 1.5e-4,
+        }  # fmt: skip
+        return cls(**{**everything, **settings})
+
+
+@dataclass(frozen=True)
+class TD3(OffPolicy):
+    """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
+
+    critic: Network | None = None
+    """The critics' network; None: as the actor's."""
+    exploration_noise: float = 0.1
+    """Deviation of the noise on actions, where a bounded range spans [−1, 1]."""
+    policy_delay: int = 2
+    """Critic updates for each update of the actor and the targets."""
+    target_noise: float = 0.2
+    """Deviation of the noise on the target's actions."""
+    target_noise_clip: float = 0.5
+    """Largest noise on the target's actions."""
+    twin: bool = True
+    """The smaller of two critics is the target's; else there is one critic."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("exploration_noise", "target_noise", "target_noise_clip"):
+            check(self, name, 0.0 <= getattr(self, name) < float("inf"), "at least 0 and finite")
+        check(self, "policy_delay", self.policy_delay >= 1, "at least 1")
+
+    @classmethod
+    def ddpg(cls, **settings: Any) -> TD3:
+        """DDPG (Lillicrap et al. 2016): one critic, no delay, no noise on targets."""
+        return cls(**{"twin": False, "policy_delay": 1, "target_noise": 0.0, **settings})
+
+
+@dataclass(frozen=True)
+class SAC(OffPolicy):
+    """Soft actor-critic (Haarnoja et al. 2018b); of choices too (Christodoulou 2019)."""
+
+    critic: Network | None = None
+    """The critics' network; None: as the actor's."""
+    ent_coef: float = 1.0
+    """The temperature α, at the start."""
+    learn_ent_coef: bool = True
+    """α is learnt, so that the policy's entropy is ``target_entropy``."""
+    target_entropy: float | None = None
+    """Entropy aimed at, in nats; None: −A for A continuous actions, half of log A for choices."""
+    policy_delay: int = 1
+    """Critic updates for each update of the actor."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "ent_coef", 0.0 < self.ent_coef < float("inf"), "positive and finite")
+        check(self, "policy_delay", self.policy_delay >= 1, "at least 1")

@@ -1,0 +1,196 @@
+"""DQN for P members at once, with the six extensions of Rainbow (Hessel et al. 2018).
+
+Read down the page: State, init, act, update, loss. The settings are ``config.DQN``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Actor
+from skillweave.algorithms.config import DQN
+from skillweave.algorithms.off_policy import OffPolicyAlgorithm, weighted_mean
+from skillweave.networks.encoders import Inputs
+from skillweave.networks.net import QNet
+from skillweave.networks.stacked import Layout, Views
+from skillweave.ops.distributions import mask_logits
+from skillweave.ops.losses import categorical_projection, td_loss
+from skillweave.ops.optim import adam_, clip_grad_norm_
+from skillweave.seeding import Seeds
+from skillweave.types import Sample
+
+
+@dataclass
+class State:
+    """Everything DQN learns and counts; P members, D parameters, O observation numbers."""
+
+    params: Tensor  # (P, D)
+    target: Tensor  # (P, D), the slow copy
+    mu: Tensor  # (P, D), Adam's first moment
+    nu: Tensor  # (P, D), Adam's second moment
+    count: Tensor  # (P,), Adam's steps
+    obs_mean: Tensor  # (P, O)
+    obs_var: Tensor  # (P, O)
+    obs_count: Tensor  # (P,)
+    return_mean: Tensor  # (P, 1)
+    return_var: Tensor  # (P, 1)
+    return_count: Tensor  # (P,)
+    learning_rate: Tensor  # (P,); this and all below are settings, one a member
+    gamma: Tensor  # (P,)
+    tau: Tensor  # (P,)
+    max_grad_norm: Tensor  # (P,)
+
+
+class DQNAlgorithm(OffPolicyAlgorithm):
+    """DQN on one pair of spaces. Holds no learnt state: that is in ``State``."""
+
+    state_type = State
+    settings = ("learning_rate", "gamma", "tau", "max_grad_norm")
+
+    def __init__(
+        self, config: DQN, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+    ) -> None:
+        super().__init__(config, observation_space, action_space)
+        self.config = config
+        self.atoms = None
+        if config.distributional:
+            self.atoms = torch.linspace(config.v_min, config.v_max, config.n_atoms)
+        self.net = QNet(
+            self.obs, config.network, self.codec.size,
+            atoms=config.n_atoms if config.distributional else 1,
+            dueling=config.dueling, noisy=config.noisy,
+        )  # fmt: skip
+        self.layout = self.acting = Layout(self.net.shapes)
+
+    def init(self, seeds: list[Seeds]) -> State:
+        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+        params = torch.zeros(len(seeds), self.layout.size)
+        self.net.init_(self.layout.views(params), self.member_generators(seeds))
+        return State(
+            params=params,
+            target=params.clone(),
+            mu=torch.zeros_like(params),
+            nu=torch.zeros_like(params),
+            count=torch.zeros(len(seeds)),
+            **self.fresh(self.config, len(seeds)),
+        )
+
+    def actor(self, state: State, progress: float = 1.0) -> Actor:
+        """A copy of what acting needs, with ε."""
+        cfg, actor = self.config, super().actor(state, progress)
+        spent = min(1.0, progress / max(cfg.exploration_fraction, 1e-9))
+        start, final = cfg.exploration_initial_eps, cfg.exploration_final_eps
+        eps = start + spent * (final - start)
+        actor.extra["epsilon"] = torch.full((len(state.params), 1), 0.0 if cfg.noisy else eps)
+        return actor
+
+    def noise(
+        self, generators: list[torch.Generator], steps: int, batch: int
+    ) -> list[tuple[Tensor, Tensor | None]]:
+        """For each step, uniform numbers (P, batch, A + 1) and the weights' noise (P, K)."""
+        shape, inner = (steps, batch, self.codec.size + 1), self.net.noise_size
+        uniform = torch.stack([torch.rand(shape, generator=g) for g in generators], dim=1)
+        if not inner:
+            return [(u, None) for u in uniform]
+        normal = torch.stack([torch.randn(steps, inner, generator=g) for g in generators], dim=1)
+        return list(zip(uniform, normal, strict=True))
+
+    def act(
+        self,
+        actor: Actor,
+        obs: Tensor,
+        mask: Tensor | None,
+        noise: tuple[Tensor, Tensor | None] | None,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, None]:
+        """Actions (P, B), their values (P, B, A), and no memory; see ``Algorithm.act``."""
+        uniform, normal = noise or (None, None)
+        views = actor.views if normal is None else self.net.perturbed(actor.views, normal)
+        q = mask_logits(self._q(self.net(views, self.inputs(actor, obs))), mask)
+        action = q.argmax(-1)
+        if uniform is not None:
+            anything = mask_logits(uniform[..., 1:], mask).argmax(-1)
+            epsilon = actor.extra.get("epsilon")
+            final = self.config.exploration_final_eps * (not self.config.noisy)
+            explore = uniform[..., 0] < (final if epsilon is None else epsilon)
+            action = torch.where(explore, anything, action)
+        return action, q, None
+
+    def update(
+        self, state: State, sample: Sample, progress: float, generators: list[torch.Generator]
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """One gradient step, in place; metrics (P,) and errors (P, B)."""
+        leaves = self.layout.leaves(state.params)
+        noises: list[Tensor | None] = [None, None, None]  # online, target, choice of its action
+        if self.config.noisy:
+            size = self.net.noise_size
+            drawn = [torch.randn(3, size, generator=g) for g in generators]
+            noises = list(torch.stack(drawn, dim=1))
+        loss, error, q = self.loss(leaves, state, sample, noises)
+        grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
+        grad = self.layout.gather(grads, len(loss))
+        norm = clip_grad_norm_(grad, state.max_grad_norm)
+        rate = self.rate(state, progress)
+        moments = state.mu, state.nu, state.count
+        adam_(state.params, grad, *moments, rate, eps=self.config.adam_eps)
+        if int(state.count[0]) % self.config.target_update_interval == 0:
+            state.target.lerp_(state.params, state.tau[:, None])
+        metrics = {"loss": loss.detach(), "q": q, "grad_norm": norm, "learning_rate": rate}
+        return metrics, error
+
+    def loss(
+        self, views: Views, state: State, sample: Sample, noises: list[Tensor | None]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss (P,), error of each sample (P, B) and mean value (P,), the latter two detached."""
+        actor = Actor({}, *self.scaling(state))
+        out = self.net(self._noisy(views, noises[0]), self.inputs(actor, sample.obs))
+        chosen = sample.action[..., None, None].expand(*sample.action.shape, 1, out.shape[-1])
+        out = out.gather(2, chosen).squeeze(2)  # (P, B, atoms)
+        next_inputs = self.inputs(actor, sample.next_obs)
+        reward = self.rewards(state, sample)
+        with torch.no_grad():
+            target = self._target(views, state, sample, next_inputs, reward, noises)
+        if self.atoms is None:
+            value = out.squeeze(-1)
+            error = (value - target).detach().abs()
+            each = td_loss(value, target, self.config.loss)
+        else:
+            log_p = out.log_softmax(-1)
+            each = -(target * log_p).sum(-1)
+            value = (log_p.detach().exp() * self.atoms).sum(-1)
+            error = each.detach()
+        return weighted_mean(each, sample.weight), error, value.detach().mean(1)
+
+    def _target(
+        self,
+        views: Views,
+        state: State,
+        sample: Sample,
+        inputs: Inputs,
+        reward: Tensor,
+        noises: list[Tensor | None],
+    ) -> Tensor:
+        """r + discount·Q̄(s′, a′), (P, B); or its distribution over the atoms, (P, B, N)."""
+        slow = self.layout.views(state.target)
+        out = self.net(self._noisy(slow, noises[1]), inputs)
+        judge = self.net(self._noisy(views, noises[2]), inputs) if self.config.double else out
+        best = mask_logits(self._q(judge), sample.mask).argmax(-1)
+        chosen = out.gather(2, best[..., None, None].expand(*best.shape, 1, out.shape[-1]))
+        if self.atoms is None:
+            return self.target(reward, sample.discount, chosen.flatten(2).squeeze(-1))
+        p = chosen.squeeze(2).softmax(-1)
+        return categorical_projection(p, self.atoms, reward, sample.discount)
+
+    def _noisy(self, views: Views, noise: Tensor | None) -> Views:
+        return views if noise is None else self.net.perturbed(views, noise)
+
+    def _q(self, out: Tensor) -> Tensor:
+        """Network outputs (P, B, A, atoms) as values (P, B, A)."""
+        if self.atoms is None:
+            return out.squeeze(-1)
+        return (out.softmax(-1) * self.atoms).sum(-1)

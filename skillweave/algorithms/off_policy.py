@@ -1,0 +1,133 @@
+"""What the algorithms that learn from a replay buffer share: critics, reward scale, schedules."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.config import OffPolicy
+from skillweave.networks.config import Network
+from skillweave.networks.encoders import Inputs
+from skillweave.networks.net import Net
+from skillweave.networks.stacked import Layout, Views
+from skillweave.ops.distributions import mask_logits
+from skillweave.ops.optim import adam_, clip_grad_norm_, merge_moments
+from skillweave.spaces import ObsCodec
+from skillweave.types import Sample
+
+
+class OffPolicyAlgorithm(Algorithm):
+    """Learns from samples of a replay buffer, one gradient step at a time."""
+
+    config: Any
+
+    def __init__(
+        self, config: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+    ) -> None:
+        super().__init__(config, observation_space, action_space)
+        assert isinstance(config, OffPolicy)
+
+    def update(
+        self, state: Any, sample: Sample, progress: float, generators: list[torch.Generator]
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """One gradient step, in place.
+
+        Args:
+            progress: share of the budget that is spent, for the schedules.
+            generators: one a member, for the noise that learning needs.
+
+        Returns:
+            Metrics (P,), and the samples' errors (P, B), for their priorities.
+        """
+        raise NotImplementedError
+
+    def random_actions(
+        self, generators: list[torch.Generator], batch: int, mask: Tensor | None
+    ) -> Tensor:
+        """Actions (P, batch, ...) drawn uniformly from those allowed, a stream a member."""
+        drawn = [torch.rand(batch, self.codec.size, generator=g) for g in generators]
+        uniform = torch.stack(drawn)
+        if not self.codec.discrete:
+            return 2.0 * uniform - 1.0
+        return mask_logits(uniform, mask).argmax(-1)
+
+    def see_returns(self, state: Any, returns: Tensor) -> None:
+        """Take running discounted returns (P, B) into account in the scale of rewards."""
+        moments = state.return_mean, state.return_var, state.return_count
+        state.return_mean, state.return_var, state.return_count = merge_moments(
+            *moments, returns[..., None]
+        )
+
+    def rewards(self, state: Any, sample: Sample) -> Tensor:
+        """Rewards (P, B) in the units that critics learn in."""
+        if not self.config.normalize_rewards:
+            return sample.reward
+        scale: Tensor = (state.return_var + 1e-8).rsqrt()
+        return sample.reward * scale
+
+    def rate(self, state: Any, progress: float) -> Tensor:
+        """The learning rate now, (P,)."""
+        rate: Tensor = state.learning_rate
+        linear = self.config.learning_rate_schedule == "linear"
+        return rate * (1.0 - progress) if linear else rate
+
+    def target(self, reward: Tensor, discount: Tensor, value: Tensor) -> Tensor:
+        """``r + discount·V(s′)``, each (P, B)."""
+        # Not a product: what a terminal observation is worth may be anything, 0·NaN is NaN.
+        return reward + torch.where(discount == 0.0, 0.0, discount * value)
+
+
+class Critics:
+    """K critics of each member as one stack of P·K: their parameters are (P, K, D)."""
+
+    def __init__(
+        self, obs: ObsCodec, network: Network, outputs: int, extra: int = 0, count: int = 2
+    ) -> None:
+        self.count = count
+        self.net = Net("critic", obs, network, outputs, extra)
+        self.layout = Layout(self.net.shapes)
+
+    def init(self, generators: list[torch.Generator]) -> Tensor:
+        """Fresh parameters (P, K, D), one generator a member."""
+        flat = torch.zeros(len(generators), self.count, self.layout.size)
+        for member, generator in enumerate(generators):
+            self.net.init_(self.layout.views(flat[member]), 1.0, [generator] * self.count)
+        return flat
+
+    def __call__(self, views: Views, inputs: Inputs, action: Tensor | None = None) -> Tensor:
+        """Inputs (P, B, …) and actions (P, B, A) to values (P, K, B, out).
+
+        The views are of (P·K, D); of as many critics as they hold, if fewer.
+        """
+        members = next(iter(inputs.values())).shape[0]
+        count = next(iter(views.values())).shape[0] // members
+
+        def each(x: Tensor) -> Tensor:
+            return x if count == 1 else x.repeat_interleave(count, 0)
+
+        extra = None if action is None else each(action)
+        out = self.net(views, {k: each(v) for k, v in inputs.items()}, extra)
+        return out.view(members, count, *out.shape[1:])
+
+    def views(self, flat: Tensor) -> dict[str, Tensor]:
+        """Windows into (P, K, D), each (P·K, *shape)."""
+        return self.layout.views(flat.flatten(0, 1))
+
+    def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor, eps: float) -> Tensor:
+        """One gradient step on ``state.critic``; the gradient's norm before clipping, (P,)."""
+        grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
+        members = len(state.critic)
+        grad = self.layout.gather(grads, members * self.count).view(members, -1)
+        norm = clip_grad_norm_(grad, state.max_grad_norm)
+        flat = [x.flatten(1) for x in (state.critic, state.critic_mu, state.critic_nu)]
+        adam_(flat[0], grad, flat[1], flat[2], state.critic_count, rate, eps=eps)
+        return norm
+
+
+def weighted_mean(loss: Tensor, weight: Tensor | None) -> Tensor:
+    """Mean over the batch, (P, B) to (P,), with the weights of prioritised replay."""
+    return loss.mean(1) if weight is None else (loss * weight).mean(1)

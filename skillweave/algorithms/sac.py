@@ -1,0 +1,230 @@
+"""Soft actor-critic (Haarnoja et al. 2018b) for P members at once, of forces and of choices.
+
+Read down the page: State, init, act, update, losses. The settings are ``config.SAC``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Actor
+from skillweave.algorithms.config import SAC
+from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, weighted_mean
+from skillweave.networks.encoders import Inputs
+from skillweave.networks.heads import ActionHead
+from skillweave.networks.net import Net
+from skillweave.networks.stacked import Layout, Views
+from skillweave.ops.distributions import mask_logits, tanh_log_det
+from skillweave.ops.losses import td_loss
+from skillweave.ops.optim import adam_, clip_grad_norm_
+from skillweave.seeding import Seeds
+from skillweave.types import Sample
+
+_HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+@dataclass
+class State:
+    """Everything SAC learns and counts; P members, K = 2 critics, D parameters of a network."""
+
+    params: Tensor  # (P, D), the actor
+    mu: Tensor  # (P, D), Adam's first moment
+    nu: Tensor  # (P, D), Adam's second moment
+    count: Tensor  # (P,), Adam's steps
+    critic: Tensor  # (P, K, D)
+    critic_target: Tensor  # (P, K, D)
+    critic_mu: Tensor  # (P, K, D)
+    critic_nu: Tensor  # (P, K, D)
+    critic_count: Tensor  # (P,)
+    log_alpha: Tensor  # (P, 1), log of the temperature
+    alpha_mu: Tensor  # (P, 1)
+    alpha_nu: Tensor  # (P, 1)
+    alpha_count: Tensor  # (P,)
+    obs_mean: Tensor  # (P, O)
+    obs_var: Tensor  # (P, O)
+    obs_count: Tensor  # (P,)
+    return_mean: Tensor  # (P, 1)
+    return_var: Tensor  # (P, 1)
+    return_count: Tensor  # (P,)
+    policy_loss: Tensor  # (P,), the latest, for the metrics
+    entropy: Tensor  # (P,), the latest, nats
+    learning_rate: Tensor  # (P,); this and all below are settings, one a member
+    gamma: Tensor  # (P,)
+    tau: Tensor  # (P,)
+    max_grad_norm: Tensor  # (P,)
+
+
+class SACAlgorithm(OffPolicyAlgorithm):
+    """SAC on one pair of spaces. Holds no learnt state: that is in ``State``."""
+
+    state_type = State
+    settings = ("learning_rate", "gamma", "tau", "max_grad_norm")
+
+    def __init__(
+        self, config: SAC, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+    ) -> None:
+        super().__init__(config, observation_space, action_space)
+        self.config = config
+        self.head = ActionHead(self.codec, "state")
+        self.net = Net("actor", self.obs, config.network, self.head.width)
+        self.layout = self.acting = Layout(self.net.shapes)
+        size, discrete = self.codec.size, self.codec.discrete
+        critic = config.critic or config.network
+        self.critics = Critics(self.obs, critic, size if discrete else 1, 0 if discrete else size)
+        usual = 0.5 * math.log(size) if discrete else -float(size)
+        self.target_entropy = usual if config.target_entropy is None else config.target_entropy
+
+    def init(self, seeds: list[Seeds]) -> State:
+        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+        members = len(seeds)
+        params = torch.zeros(members, self.layout.size)
+        generators = self.member_generators(seeds)
+        self.net.init_(self.layout.views(params), 0.01, generators)
+        critic = self.critics.init(generators)
+        return State(
+            params=params,
+            mu=torch.zeros_like(params),
+            nu=torch.zeros_like(params),
+            count=torch.zeros(members),
+            critic=critic,
+            critic_target=critic.clone(),
+            critic_mu=torch.zeros_like(critic),
+            critic_nu=torch.zeros_like(critic),
+            critic_count=torch.zeros(members),
+            log_alpha=torch.full((members, 1), math.log(self.config.ent_coef)),
+            alpha_mu=torch.zeros(members, 1),
+            alpha_nu=torch.zeros(members, 1),
+            alpha_count=torch.zeros(members),
+            policy_loss=torch.zeros(members),
+            entropy=torch.zeros(members),
+            **self.fresh(self.config, members),
+        )
+
+    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
+        """Noise for ``steps`` calls of ``act``, first axis the steps."""
+        return self.head.noise(generators, steps, batch)
+
+    def act(
+        self,
+        actor: Actor,
+        obs: Tensor,
+        mask: Tensor | None,
+        noise: Tensor | None,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, None]:
+        """Choices (P, B), or forces (P, B, A) in [−1, 1]; see ``Algorithm.act``."""
+        head = self.net(actor.views, self.inputs(actor, obs))
+        if self.codec.discrete:
+            head = mask_logits(head, mask)
+            return self.head.act(head, None, noise), head, None
+        return self.head.act(head, None, noise).tanh(), head, None
+
+    def update(
+        self, state: State, sample: Sample, progress: float, generators: list[torch.Generator]
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """One gradient step of critics, actor and temperature, in place."""
+        actor, rate = Actor({}, *self.scaling(state)), self.rate(state, progress)
+        eps, alpha = self.config.adam_eps, state.log_alpha.exp()
+        inputs = self.inputs(actor, sample.obs)
+        leaves = self.critics.layout.leaves(state.critic.flatten(0, 1))
+        following = self.inputs(actor, sample.next_obs)
+        loss, error, q = self.critic_loss(
+            leaves, state, sample, inputs, following, alpha, generators
+        )
+        norm = self.critics.step_(state, loss, leaves, rate, eps)
+        if int(state.critic_count[0]) % self.config.policy_delay == 0:
+            policy = self.layout.leaves(state.params)
+            policy_loss, entropy = self.policy_loss(
+                policy, state, sample.obs_mask, inputs, alpha, generators
+            )
+            grads = torch.autograd.grad(policy_loss.sum(), list(policy.values()))
+            grad = self.layout.gather(grads, len(rate))
+            clip_grad_norm_(grad, state.max_grad_norm)
+            adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=eps)
+            state.policy_loss, state.entropy = policy_loss.detach(), entropy
+            if self.config.learn_ent_coef:
+                # d/d log α of −log α·(log π + H̄), as in the authors' code, not of −α·(…).
+                slope = (entropy - self.target_entropy)[:, None]
+                moments = state.alpha_mu, state.alpha_nu, state.alpha_count
+                adam_(state.log_alpha, slope, *moments, rate, eps=eps)
+        state.critic_target.lerp_(state.critic, state.tau[:, None, None])
+        metrics = {
+            "critic_loss": loss.detach(),
+            "policy_loss": state.policy_loss,
+            "entropy": state.entropy,
+            "ent_coef": alpha.squeeze(1),
+            "q": q,
+            "grad_norm": norm,
+            "learning_rate": rate,
+        }
+        return metrics, error
+
+    def critic_loss(
+        self,
+        views: Views,
+        state: State,
+        sample: Sample,
+        inputs: Inputs,
+        following: Inputs,
+        alpha: Tensor,
+        generators: list[torch.Generator],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss (P,), error of each sample (P, B) and mean value (P,)."""
+        with torch.no_grad():
+            slow = self.critics.views(state.critic_target)
+            head = self.net(self.layout.views(state.params), following)
+            if self.codec.discrete:
+                log_p = mask_logits(head, sample.mask).log_softmax(-1)
+                q = self.critics(slow, following).amin(1)
+                value = (log_p.exp() * (q - alpha[..., None] * log_p)).sum(-1)
+            else:
+                action, log_prob = self._sampled(head, generators)
+                q = self.critics(slow, following, action).squeeze(-1).amin(1)
+                value = q - alpha * log_prob
+            target = self.target(self.rewards(state, sample), sample.discount, value)[:, None]
+        if self.codec.discrete:
+            out = self.critics(views, inputs)  # (P, K, B, A)
+            chosen = sample.action[:, None, :, None].expand(*out.shape[:3], 1)
+            q = out.gather(-1, chosen).squeeze(-1)
+        else:
+            q = self.critics(views, inputs, sample.action).squeeze(-1)
+        loss = weighted_mean(td_loss(q, target, "mse").sum(1), sample.weight)
+        error = (q.detach() - target).abs().mean(1)
+        return loss, error, q.detach().mean((1, 2))
+
+    def policy_loss(
+        self,
+        views: Views,
+        state: State,
+        mask: Tensor | None,
+        inputs: Inputs,
+        alpha: Tensor,
+        generators: list[torch.Generator],
+    ) -> tuple[Tensor, Tensor]:
+        """``E[α·log π − min Q]`` (eq. 7) and the policy's entropy, detached; each (P,)."""
+        head, critics = self.net(views, inputs), self.critics.views(state.critic)
+        if self.codec.discrete:
+            log_p = mask_logits(head, mask).log_softmax(-1)
+            p = log_p.exp()
+            with torch.no_grad():
+                q = self.critics(critics, inputs).amin(1)
+            loss = (p * (alpha[..., None] * log_p - q)).sum(-1).mean(1)
+            return loss, -(p * log_p).detach().sum(-1).mean(1)
+        action, log_prob = self._sampled(head, generators)
+        q = self.critics(critics, inputs, action).squeeze(-1).amin(1)
+        return (alpha * log_prob - q).mean(1), -log_prob.detach().mean(1)
+
+    def _sampled(self, head: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, Tensor]:
+        """Squashed actions (P, B, A) and their log-probability (P, B); app. C."""
+        mean, log_std = self.head.moments(head, None)
+        shape = mean.shape[1:]
+        z = torch.stack([torch.randn(shape, generator=g) for g in generators])
+        u = torch.addcmul(mean, log_std.exp(), z)
+        log_prob = -0.5 * z.square() - log_std - _HALF_LOG_TWO_PI - tanh_log_det(u)
+        return u.tanh(), log_prob.sum(-1)

@@ -1,0 +1,126 @@
+"""Priorities of replayed transitions in sum trees (Schaul et al. 2016, appendix B.2.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from skillweave.spaces import to_tensor
+from skillweave.types import Array
+
+FAN_OUT = 32  # children of a node: four levels reach a million leaves
+FLOOR = 1e-6  # the smallest priority: what has no error left is still seen now and then
+
+
+class SumTrees:
+    """``trees`` sum trees of ``size`` non-negative numbers each, all walked at once.
+
+    A level is one flat array, tree after tree, padded with zeros to whole nodes; the first holds
+    the leaves, every further one the sums of the nodes below.
+    """
+
+    def __init__(self, trees: int, size: int) -> None:
+        self._trees, self._nodes = trees, []
+        self._levels: list[Array] = []
+        kind: type = np.float32
+        while not self._levels or size > 1:
+            size = -(-size // FAN_OUT)
+            self._nodes.append(size)  # of one tree at each level
+            self._levels.append(np.zeros(trees * size * FAN_OUT, kind))
+            kind = np.float64
+
+    @property
+    def leaves(self) -> Array:
+        """(trees, size and padding) float32, a view."""
+        return self._levels[0].reshape(self._trees, -1)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all levels."""
+        return sum(level.nbytes for level in self._levels)
+
+    def put(self, tree: Array, leaf: Array, value: Array) -> None:
+        """Set leaves, all arguments (K,); the last of repeated ones counts."""
+        for level, nodes in zip(self._levels, self._nodes, strict=True):
+            level[tree * (nodes * FAN_OUT) + leaf] = value
+            leaf = leaf // FAN_OUT
+            children = level.reshape(-1, FAN_OUT).take(tree * nodes + leaf, axis=0)
+            value = children.sum(1, dtype=np.float64)
+
+    def rebuild(self) -> None:
+        """Sum everything anew, after ``leaves`` was written to."""
+        for below, level in zip(self._levels, self._levels[1:], strict=False):
+            sums = below.reshape(self._trees, -1, FAN_OUT).sum(2, dtype=np.float64)
+            level.reshape(self._trees, -1)[:, : sums.shape[1]] = sums
+
+    def find(self, fraction: Array) -> tuple[Array, Array]:
+        """Where the running sum of a tree's leaves passes ``fraction`` (trees, B) of its total.
+
+        Fractions are in [0, 1). Returns the leaves and their values, both (trees, B); a leaf of
+        value 0 is never found.
+        """
+        tree = np.repeat(np.arange(self._trees), fraction.shape[1])
+        total = self._levels[-1].reshape(self._trees, -1).sum(1)
+        target = (fraction * total[:, None]).reshape(-1)
+        leaf, each = np.zeros_like(tree), np.arange(len(tree))
+        for level, nodes in zip(reversed(self._levels), reversed(self._nodes), strict=True):
+            children = level.reshape(-1, FAN_OUT).take(tree * nodes + leaf, axis=0)
+            running = children.cumsum(1, dtype=np.float64)
+            # Rounding must lead neither past the last child that is not 0, nor to one that is.
+            target = np.minimum(target, np.nextafter(running[:, -1], 0.0))
+            child = (running > target[:, None]).argmax(1)
+            value = children[each, child]
+            target = np.maximum(target - (running[each, child] - value), 0.0)
+            leaf = leaf * FAN_OUT + child
+        return leaf.reshape(fraction.shape), value.reshape(fraction.shape)
+
+
+class Priorities:
+    """Proportional prioritisation: a slot is drawn with a probability ∝ priority^alpha.
+
+    Every one of ``members`` has priorities of its own for ``slots`` slots, 0 at first.
+    """
+
+    def __init__(self, members: int, slots: int, alpha: float) -> None:
+        self._trees, self._alpha = SumTrees(members, slots), alpha
+        self._highest = np.ones(members, np.float32)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the trees."""
+        return self._trees.nbytes
+
+    def turn(self, new: Array, gone: Array) -> None:
+        """Give slots ``new`` the highest priority so far, and ``gone`` none."""
+        slot, members = np.concatenate([new, gone]), len(self._highest)
+        value = np.outer(self._highest**self._alpha, np.arange(len(slot)) < len(new))
+        tree = np.repeat(np.arange(members), len(slot))
+        self._trees.put(tree, np.tile(slot, members), value.reshape(-1))
+
+    def draw(self, uniform: Array, beta: float) -> tuple[Array, Array]:
+        """Slots and importance weights (P, B), one of each B-th of the mass (stratified).
+
+        The weights are (N·P(i))^−β over the batch's highest, in which N and the total cancel.
+        """
+        batch = uniform.shape[1]
+        slot, value = self._trees.find((np.arange(batch) + uniform) / batch)
+        return slot, (value.min(1, keepdims=True) / value) ** np.float32(beta)
+
+    def update(self, member: Array, slot: Array, priority: Array) -> None:
+        """New priorities after learning; all (K,)."""
+        priority = np.maximum(priority, np.float32(FLOOR))
+        np.maximum.at(self._highest, member, priority)
+        self._trees.put(member, slot, priority**self._alpha)
+
+    def state(self, used: int) -> dict[str, Tensor]:
+        """Copies of the first ``used`` slots' priorities, to go on exactly."""
+        arrays = {"priority": self._trees.leaves[:, :used], "highest_priority": self._highest}
+        return {name: to_tensor(array.copy()) for name, array in arrays.items()}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        kept = state["priority"].numpy()
+        self._trees.leaves[:] = 0.0
+        self._trees.leaves[:, : kept.shape[1]] = kept
+        self._trees.rebuild()
+        self._highest[:] = state["highest_priority"].numpy()

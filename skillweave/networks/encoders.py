@@ -1,0 +1,144 @@
+"""Images to features, for P members at once: a convolution with P groups is a stack of P."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from skillweave.networks.config import CNN, Activation
+from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
+from skillweave.spaces import ObsCodec
+from skillweave.types import SkillweaveError
+
+Inputs = Mapping[str, Tensor]
+"""What a network eats: ``vector`` (P, B, O) float and ``image.<i>`` (P, B, C, H, W), raw."""
+
+
+class Encoder(Protocol):
+    """A custom encoder: observations to features, with parameters of its own.
+
+    It is made once for an observation space by the function given to ``register_encoder``, and
+    holds no parameters: those arrive under the names that ``shapes`` gave, each with the member
+    axis P in front, as everything here does.
+    """
+
+    size: int
+    """F, the width of the features."""
+    shapes: dict[str, tuple[int, ...]]
+    """Names and shapes of one member's parameters."""
+
+    def init_(self, views: Views, generators: list[torch.Generator]) -> None:
+        """Fill fresh parameters in place, one generator a member."""
+        ...
+
+    def __call__(self, views: Views, inputs: Inputs) -> Tensor:
+        """Inputs to features (P, B, F)."""
+        ...
+
+
+_REGISTERED: dict[str, Callable[[ObsCodec], Encoder]] = {}
+
+
+def register_encoder(name: str, make: Callable[[ObsCodec], Encoder]) -> None:
+    """Make a custom encoder known, for ``Network(encoder=name)``."""
+    _REGISTERED[name] = make
+
+
+def make_encoder(name: str, obs: ObsCodec) -> Encoder:
+    """A registered encoder on one observation space.
+
+    Raises:
+        SkillweaveError: nobody registered it.
+    """
+    if name not in _REGISTERED:
+        raise SkillweaveError(
+            f"Network.encoder is {name!r}, which is not registered: call "
+            f"skillweave.register_encoder({name!r}, ...) before (registered: "
+            f"{', '.join(_REGISTERED) or 'none'})"
+        )
+    return _REGISTERED[name](obs)
+
+
+class ImageEncoder:
+    """One image of an observation through a CNN."""
+
+    def __init__(self, obs: ObsCodec, index: int, cnn: CNN | None, activation: Activation) -> None:
+        self._obs, self._index = obs, index
+        channels, height, width = obs.images[index]
+        self.cnn = cnn or (CNN() if min(height, width) >= 36 else CNN.small())
+        self._activation = ACTIVATIONS[activation]
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        if self.cnn.kind == "impala":
+            for stage, out in enumerate(self.cnn.channels):
+                for part in ("in", "0.0", "0.1", "1.0", "1.1"):
+                    self._layer(f"{stage}.{part}", channels if part == "in" else out, out, 3)
+                height, width, channels = (height + 1) // 2, (width + 1) // 2, out
+        else:
+            layers = zip(self.cnn.channels, self.cnn.kernels, self.cnn.strides, strict=True)
+            for i, (out, kernel, stride) in enumerate(layers):
+                if min(height, width) < kernel:
+                    raise SkillweaveError(
+                        f"Network.cnn does not fit images of {obs.images[index]} (channels, "
+                        f"height, width): layer {i} has a kernel of {kernel} pixels, but only "
+                        f"{height}×{width} are left; use CNN.small(), or fewer layers"
+                    )
+                self._layer(str(i), channels, out, kernel)
+                height, width = ((x - kernel) // stride + 1 for x in (height, width))
+                channels = out
+        self.size = channels * height * width
+
+    def _layer(self, name: str, n_in: int, n_out: int, kernel: int) -> None:
+        self.shapes |= {f"{name}.weight": (n_out, n_in, kernel, kernel), f"{name}.bias": (n_out,)}
+
+    def init_(self, views: Views, generators: list[torch.Generator]) -> None:
+        """Orthogonal filters, gain √2, biases zero."""
+        for name, view in views.items():
+            if name.endswith("weight"):
+                orthogonal_(view, math.sqrt(2.0), generators)
+            else:
+                view.zero_()
+
+    def __call__(self, views: Views, inputs: Inputs) -> Tensor:
+        """Pixels as they came, (P, B, C, H, W), to features (P, B, F)."""
+        image = inputs[f"image.{self._index}"]
+        members, batch = image.shape[:2]
+        x = self._obs.pixels(image, self._index)
+        # Members side by side in the channels: (B, P·C, H, W).
+        x = x[0] if members == 1 else x.transpose(0, 1).flatten(1, 2)
+        if self.cnn.kind == "impala":
+            for stage in range(len(self.cnn.channels)):
+                x = _conv(views, f"{stage}.in", x, padding=1)
+                x = F.max_pool2d(x, 3, 2, padding=1)
+                for block in range(2):
+                    y = _conv(views, f"{stage}.{block}.0", self._activation(x.clone()), padding=1)
+                    x = x + _conv(views, f"{stage}.{block}.1", self._activation(y), padding=1)
+            x = self._activation(x)
+        else:
+            for i, stride in enumerate(self.cnn.strides):
+                x = self._activation(_conv(views, str(i), x, stride=stride))
+        return x.reshape(batch, members, -1).transpose(0, 1)
+
+
+def _conv(views: Views, name: str, x: Tensor, stride: int = 1, padding: int = 0) -> Tensor:
+    weight, bias = views[f"{name}.weight"], views[f"{name}.bias"]
+    members = weight.shape[0]
+    return F.conv2d(x, weight.flatten(0, 1), bias.flatten(), stride, padding, groups=members)
+
+
+def part(views: Views, prefix: str) -> dict[str, Tensor]:
+    """The parameters under a prefix, by their names within it."""
+    cut = len(prefix) + 1
+    return {k[cut:]: v for k, v in views.items() if k.startswith(prefix + ".")}
+
+
+def under(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """The same names with a prefix before them."""
+    return {f"{prefix}.{k}": v for k, v in shapes.items()}
+
+
+__all__ = ["Encoder", "ImageEncoder", "Inputs", "make_encoder", "part", "register_encoder", "under"]

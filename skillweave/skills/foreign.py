@@ -1,0 +1,187 @@
+"""Policies made elsewhere: how they meet an environment, and how a run remembers them."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from collections.abc import Callable
+from typing import Any, Self
+
+import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Box, Dict, Tuple
+from gymnasium.vector.utils import batch_space
+
+from skillweave.types import Array, Memory, Memoryless, Policy, SkillweaveError
+
+
+class Foreign(Memoryless):
+    """A policy made elsewhere; its spaces may stay open until it meets an environment.
+
+    A run names its ``source``. What has ``content`` is copied into the run too, and then it is the
+    copy that acts when the run is loaded; what has none must still have the same checksum.
+    """
+
+    kind: str
+    """What ``run.json`` calls its sort."""
+    suffix: str = ""
+    """How the file of its ``content`` ends."""
+
+    def __init__(self, name: str, observation_space: Any = None, action_space: Any = None) -> None:
+        self.name = self._who = name
+        self.observation_space, self.action_space = observation_space, action_space
+        self._open = observation_space is None, action_space is None
+
+    def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
+        """A copy in which these spaces stand where it has none; ``who`` goes before messages."""
+        bound = copy.copy(self)
+        bound._who = f"{who}: {self.name}"
+        if self._open[0]:
+            bound.observation_space = observation_space
+        if self._open[1]:
+            bound.action_space = action_space
+        return bound
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Actions for a batch of observations."""
+        raise NotImplementedError
+
+    def source(self) -> dict[str, Any]:
+        """Where it comes from, as JSON for ``run.json``: at least its kind."""
+        content = self.content()
+        sha256 = {} if content is None else {"sha256": checksum(content)}
+        return {"kind": self.kind, "name": self.name, **sha256}
+
+    def content(self) -> bytes | None:
+        """What a run keeps a copy of; None: nothing, it is only named."""
+        return None
+
+    def restored(self, content: bytes) -> Self:
+        """This policy with the ``content`` that a run has kept."""
+        raise NotImplementedError
+
+    def try_out(self) -> None:
+        """Act once on two made-up observations, so that what does not fit is said before training.
+
+        Raises:
+            SkillweaveError: it failed; the message names who, and the space.
+        """
+        try:
+            self.act({}, _made_up(self.observation_space, 2))
+        except SkillweaveError:
+            raise
+        except Exception as error:
+            raise SkillweaveError(
+                f"{self._who} fails on observations of {self.observation_space}: "
+                f"{type(error).__name__}: {error}"
+            ) from error
+
+
+def fitted(
+    policy: Policy, observation_space: Space[Any], action_space: Space[Any], who: str, env: str
+) -> Policy:
+    """The policy, ready to act on the spaces of the environment named ``env``.
+
+    Raises:
+        SkillweaveError: it does not fit; the message names ``who`` and both spaces.
+    """
+    from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
+
+    if isinstance(policy, Foreign):
+        policy = policy.bind(observation_space, action_space, who)
+    for kind, mine, theirs in (
+        ("observation_space", policy.observation_space, observation_space),
+        ("action_space", policy.action_space, action_space),
+    ):
+        if not same_space(mine, theirs):
+            raise SkillweaveError(
+                f"{who}: its policy has {kind} {mine}, but the environment {env} has {theirs}"
+            )
+    if isinstance(policy, Foreign):
+        policy.try_out()
+    return policy
+
+
+def source_of(policy: Policy) -> dict[str, Any]:
+    """Where a ready policy comes from, as JSON."""
+    if isinstance(policy, Foreign):
+        return policy.source()
+    return {"kind": "policy", "name": qualified(type(policy))}
+
+
+def as_recorded(
+    policy: Policy,
+    recorded: dict[str, Any] | None,
+    read: Callable[[], bytes | None],
+    where: str,
+) -> Policy:
+    """The policy as it was when ``recorded`` was its source; ``read`` gets the copy kept then.
+
+    Raises:
+        SkillweaveError: it is of another kind, or another file that was only named; or the copy is
+            damaged, or fits no longer.
+    """
+    if recorded is None:  # written before sources were
+        return policy
+    now = source_of(policy)
+    if now["kind"] != recorded["kind"]:
+        raise SkillweaveError(
+            f"{where} had a policy of kind {_described(recorded)}, but now it is {_described(now)}"
+        )
+    if now.get("sha256") == recorded.get("sha256"):
+        return policy
+    assert isinstance(policy, Foreign)
+    content = read()
+    if content is None:
+        raise SkillweaveError(
+            f"{where} had the policy {_described(recorded)}, but now it is {_described(now)}: "
+            "another checksum. Put the file back that it was trained with, or train anew"
+        )
+    if checksum(content) != recorded.get("sha256"):
+        raise SkillweaveError(f"{where}: the copy of its policy is damaged: another checksum")
+    return policy.restored(content)
+
+
+def checksum(content: bytes) -> str:
+    """SHA-256, as hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def qualified(thing: Any) -> str:
+    """``module.qualname`` of a function or a class, or of an object's class."""
+    if not hasattr(thing, "__qualname__"):
+        thing = type(thing)
+    return f"{thing.__module__}.{thing.__qualname__}"
+
+
+def _described(source: dict[str, Any]) -> str:
+    sha256 = f" (sha256 {source['sha256'][:12]}…)" if "sha256" in source else ""
+    return f"{source['kind']} {source.get('file') or source.get('name')}{sha256}"
+
+
+def _made_up(space: Space[Any], n: int) -> Array:
+    """n members of a space as one batch."""
+    from skillweave.spaces import pack
+
+    batch = batch_space(space, n)
+    batch.seed(0)
+    return pack(space, _tamed(batch, batch.sample()))
+
+
+def _tamed(space: Space[Any], sample: Any) -> Any:
+    """Without huge numbers: a space's bounds may be the largest floats there are."""
+    if isinstance(space, Dict):
+        return {name: _tamed(part, sample[name]) for name, part in space.spaces.items()}
+    if isinstance(space, Tuple):
+        return tuple(_tamed(p, s) for p, s in zip(space.spaces, sample, strict=True))
+    if isinstance(space, Box) and np.issubdtype(space.dtype, np.floating):
+        return sample.clip(-10, 10).clip(space.low, space.high).astype(space.dtype)
+    return sample

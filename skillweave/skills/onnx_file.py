@@ -1,0 +1,168 @@
+"""ONNX files as policies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from gymnasium import Space
+
+from skillweave.skills.actions import decoded
+from skillweave.skills.foreign import Foreign, checksum
+from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
+
+NUMBERS = {
+    "tensor(float)": np.float32,
+    "tensor(double)": np.float64,
+    "tensor(float16)": np.float16,
+    "tensor(int64)": np.int64,
+    "tensor(int32)": np.int32,
+    "tensor(uint8)": np.uint8,
+}
+"""ONNX's names of the numbers that an input may take."""
+
+
+class OnnxPolicy(Foreign):
+    """A model in ONNX's format, run by onnxruntime on the CPU."""
+
+    kind = "onnx"
+    suffix = ".onnx"
+
+    def __init__(
+        self,
+        data: bytes,
+        file: Path,
+        output: str | None = None,
+        observation_space: Any = None,
+        action_space: Any = None,
+    ) -> None:
+        super().__init__(str(file), observation_space, action_space)
+        self.data, self.file = data, file
+        self._session = _session(data, file)
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if len(inputs) != 1 or not inputs[0].shape or inputs[0].type not in NUMBERS:
+            found = ", ".join(f"{i.name} {i.type}{i.shape}" for i in inputs)
+            raise SkillweaveError(
+                f"{file} takes {found or 'nothing'}; it must take one batch of observations"
+            )
+        names = [o.name for o in outputs]
+        if output is not None and output not in names:
+            raise SkillweaveError(f"{file} has no output {output!r}; it has: {', '.join(names)}")
+        self._input, self.output = inputs[0], output or names[0]
+        batch = self._input.shape[0]
+        if isinstance(batch, int) and batch != 1:
+            raise SkillweaveError(
+                f"{file} takes exactly {batch} observations at once; export it with a dynamic batch"
+            )
+
+    def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
+        """A copy for these spaces.
+
+        Raises:
+            SkillweaveError: its input has another shape; the message names both.
+        """
+        bound = super().bind(observation_space, action_space, who)
+        mine, theirs = self._input.shape[1:], bound.observation_space.shape or ()
+        fits = len(mine) == len(theirs) and all(
+            a == b for a, b in zip(mine, theirs, strict=True) if isinstance(a, int)
+        )
+        if not fits:
+            shape = f"({', '.join(map(str, mine))})"
+            raise SkillweaveError(
+                f"{bound._who} takes observations of shape {shape}, but the environment has "
+                f"{observation_space}"
+            )
+        return bound
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """The model's actions; logits are sampled with ``rng`` where not ``deterministic``."""
+        if self.action_space is None:
+            raise SkillweaveError(f"{self._who} has no spaces yet: bind() it to an environment's")
+        rows = np.ascontiguousarray(obs, NUMBERS[self._input.type])
+        if self._input.shape[0] == 1 and len(rows) != 1:
+            output = np.concatenate([self._run(row[None]) for row in rows])
+        else:
+            output = self._run(rows)
+        action = decoded(
+            output, len(obs), self.action_space, self._who,
+            mask=mask, deterministic=deterministic, rng=rng,
+        )  # fmt: skip
+        return action, memory
+
+    def _run(self, rows: Array) -> Array:
+        return np.asarray(self._session.run([self.output], {self._input.name: rows})[0])
+
+    def source(self) -> dict[str, Any]:
+        """The file, and the checksum of the copy that the run keeps."""
+        return {"kind": self.kind, "file": str(self.file), "sha256": checksum(self.data)}
+
+    def content(self) -> bytes:
+        """The whole model."""
+        return self.data
+
+    def restored(self, content: bytes) -> Self:
+        """A policy with the same spaces and this model."""
+        spaces = self.observation_space, self.action_space
+        found = type(self)(content, self.file, self.output, *spaces)
+        found._who = self._who
+        return found
+
+
+def from_onnx(
+    path: str | Path,
+    *,
+    output: str | None = None,
+    observation_space: Any = None,
+    action_space: Any = None,
+) -> OnnxPolicy:
+    """An ONNX file as a skill's policy; the run keeps a copy of it.
+
+    It takes a batch of observations, of any size or of one. Whole numbers that it returns are
+    actions; other numbers are logits for Discrete and MultiDiscrete, actions for Box.
+
+    Args:
+        path: the file; weights that lie in a second file beside it are taken too.
+        output: which of its outputs; None: the first.
+        observation_space: None: that of the environment it meets.
+        action_space: None: that of the environment it meets.
+
+    Raises:
+        SkillweaveError: there is no such file, or it is no model of one batch of observations.
+    """
+    try:
+        import onnx
+    except ImportError as error:
+        raise MissingExtra("an ONNX file", "onnx") from error
+    try:
+        model = onnx.load(str(path))
+    except OSError as error:
+        raise SkillweaveError(f"could not read {path}: {error.strerror or error}") from error
+    except Exception as error:  # protobuf's own errors have no common class
+        raise SkillweaveError(f"{path} is no ONNX model: {error}") from error
+    return OnnxPolicy(
+        model.SerializeToString(deterministic=True),
+        Path(path), output, observation_space, action_space,
+    )  # fmt: skip
+
+
+def _session(data: bytes, file: Path) -> Any:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise MissingExtra("an ONNX file", "onnx") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # small nets; and exact
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's own errors have no common class
+        raise SkillweaveError(f"{file} cannot be run by onnxruntime: {error}") from error

@@ -1,0 +1,50 @@
+"""What a user may write after ``policy =``."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from types import MethodType
+from typing import Any
+
+from skillweave.skills.base import Skill
+from skillweave.skills.scripted import from_function
+from skillweave.skills.torch_module import from_torch
+from skillweave.types import Policy, SkillweaveError
+
+
+def ready_policy(skill: Skill) -> Policy | None:
+    """A skill's ready policy, functions and modules made into policies; None: it is trained.
+
+    Raises:
+        SkillweaveError: the attribute ``policy`` is nothing that can act.
+    """
+    value: Any = skill.policy
+    if value is None:
+        return None
+    where = f"skill {skill.name!r}: policy is"
+    if isinstance(value, type):
+        raise SkillweaveError(f"{where} the class {value.__name__}, not a policy")
+    if hasattr(value, "act") and hasattr(value, "start"):
+        policy: Policy = value
+        return policy
+    torch = sys.modules.get("torch")  # whoever has a module has imported it
+    if torch is not None and isinstance(value, torch.nn.Module):
+        return from_torch(value)
+    # A function in a class body becomes a method when it is looked up. It is meant as one if it
+    # needs two arguments (``def policy(self, obs)``), and as a function of obs if it needs one.
+    if isinstance(value, MethodType) and value.__self__ is skill and _needs(value.__func__) < 2:
+        value = value.__func__
+    if callable(value):
+        return from_function(value)
+    raise SkillweaveError(
+        f"{where} {value!r}, which cannot act; give a function of observations, a torch module, "
+        "from_sb3(...), from_onnx(...), or a policy"
+    )
+
+
+def _needs(function: Any) -> int:
+    """How many arguments a function cannot do without."""
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    parameters = inspect.signature(function).parameters.values()
+    return sum(p.kind in positional and p.default is p.empty for p in parameters)

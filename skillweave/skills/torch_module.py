@@ -1,0 +1,149 @@
+"""PyTorch modules as policies."""
+
+from __future__ import annotations
+
+import copy
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from gymnasium import Space
+
+from skillweave.skills.actions import decoded
+from skillweave.skills.foreign import Foreign, checksum, qualified
+from skillweave.types import Array, Memory, SkillweaveError
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+class TorchPolicy(Foreign):
+    """A module whose forward takes observations and returns logits or actions."""
+
+    kind = "torch"
+    suffix = ".safetensors"
+
+    def __init__(
+        self, module: nn.Module, observation_space: Any = None, action_space: Any = None
+    ) -> None:
+        super().__init__(f"module {type(module).__name__}", observation_space, action_space)
+        self.module = module
+
+    def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
+        """A copy in evaluation mode: what the user does to the module later is no part of it."""
+        bound = super().bind(observation_space, action_space, who)
+        bound.module = copy.deepcopy(self.module).eval()
+        return bound
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """The module's actions; logits are sampled with ``rng`` where not ``deterministic``."""
+        import torch
+
+        from skillweave.spaces import unpack
+
+        if self.action_space is None:
+            raise SkillweaveError(f"{self._who} has no spaces yet: bind() it to an environment's")
+        some = next(chain(self.module.parameters(), self.module.buffers()), None)
+        device = None if some is None else some.device
+        with torch.inference_mode():
+            output = self.module(_tensors(unpack(self.observation_space, obs), device))
+        if not isinstance(output, torch.Tensor):
+            raise SkillweaveError(
+                f"{self._who} returned a {type(output).__name__}; forward must return one tensor"
+            )
+        output = output.float() if output.is_floating_point() else output
+        action = decoded(
+            output.cpu().numpy(), len(obs), self.action_space, self._who,
+            mask=mask, deterministic=deterministic, rng=rng,
+        )  # fmt: skip
+        return action, memory
+
+    def source(self) -> dict[str, Any]:
+        """The module's class, and the checksum of its weights."""
+        name = qualified(type(self.module))
+        return {"kind": self.kind, "name": name, "sha256": checksum(self.content())}
+
+    def content(self) -> bytes:
+        """Its weights."""
+        return weights_of(self.module, self._who)
+
+    def restored(self, content: bytes) -> Self:
+        """A copy with these weights."""
+        found = copy.copy(self)
+        found.module = with_weights(self.module, content, self._who)
+        return found
+
+
+def from_torch(
+    module: nn.Module, *, observation_space: Any = None, action_space: Any = None
+) -> TorchPolicy:
+    """A PyTorch module as a skill's policy; a skill takes the bare module too.
+
+    ``forward`` gets observations as float32 (n, *obs_shape), images unscaled, of a Dict or Tuple a
+    dict or tuple of such. It returns logits for Discrete (concatenated for MultiDiscrete, one for
+    each bit of MultiBinary), actions for Box (clipped to its bounds); whole numbers are actions
+    everywhere. Its weights are copied into the run; loading the run puts them into the recipe's
+    module, whatever that was initialised with.
+
+    Args:
+        module: acts in evaluation mode, as a copy of what it is when training starts.
+        observation_space: None: that of the environment it meets.
+        action_space: None: that of the environment it meets.
+    """
+    if isinstance(module, type) or not hasattr(module, "state_dict"):
+        raise SkillweaveError(f"from_torch takes a module made of its class, not {module!r}")
+    return TorchPolicy(module, observation_space, action_space)
+
+
+def _tensors(obs: Any, device: Any) -> Any:
+    import torch
+
+    if isinstance(obs, dict):
+        return {name: _tensors(part, device) for name, part in obs.items()}
+    if isinstance(obs, tuple):
+        return tuple(_tensors(part, device) for part in obs)
+    return torch.tensor(obs, dtype=torch.float32, device=device)
+
+
+def weights_of(module: nn.Module, who: str) -> bytes:
+    """The state of a module as a safetensors file.
+
+    Raises:
+        SkillweaveError: it has state that is not a tensor.
+    """
+    import safetensors.torch
+    from torch import Tensor
+
+    state = module.state_dict()
+    for name, value in state.items():
+        if not isinstance(value, Tensor):
+            raise SkillweaveError(
+                f"{who}: its state {name!r} is a {type(value).__name__}, no tensor"
+            )
+    # Clones: modules may share tensors, which the format does not know.
+    return safetensors.torch.save({k: v.detach().cpu().clone() for k, v in state.items()})
+
+
+def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
+    """A copy of a module with the weights of ``weights_of``.
+
+    Raises:
+        SkillweaveError: they have other names or shapes.
+    """
+    import safetensors
+    import safetensors.torch
+
+    found = copy.deepcopy(module)
+    try:
+        found.load_state_dict(safetensors.torch.load(content))
+    except (RuntimeError, safetensors.SafetensorError) as error:
+        raise SkillweaveError(f"{who}: the weights in the run do not fit it: {error}") from error
+    return found

@@ -1,0 +1,25 @@
+"""Gymnasium spaces to tensors and back.
+
+``pack`` makes one array of a batch of observations, ``ObsCodec`` turns it into what networks
+eat; ``ActionCodec`` turns what a policy head emits into what the environment takes.
+"""
+
+from skillweave.spaces.actions import ActionCodec, action_codec
+from skillweave.spaces.observations import ObsCodec, obs_codec, to_tensor
+from skillweave.spaces.packing import obs_dtype, obs_shape, pack, unpack
+from skillweave.spaces.saving import same_space, space_from_json, space_to_json
+
+__all__ = [
+    "ActionCodec",
+    "ObsCodec",
+    "action_codec",
+    "obs_codec",
+    "obs_dtype",
+    "obs_shape",
+    "pack",
+    "same_space",
+    "space_from_json",
+    "space_to_json",
+    "to_tensor",
+    "unpack",
+]

@@ -1,0 +1,103 @@
+"""Actions: from what a policy head emits to what the environment takes, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.types import Array, SkillweaveError
+
+ACTIONS = "Discrete, MultiDiscrete, MultiBinary, Box (of floats)"
+
+
+@dataclass(frozen=True)
+class ActionCodec:
+    """Actions of one space.
+
+    In policy units choices count from 0: (n,) int64, or (n, K) where ``multi``; a Box is (n, A),
+    and each dimension with two bounds spans [−1, 1].
+    """
+
+    space: gym.Space[Any]
+    parts: tuple[int, ...]  # number of choices of each part; () for a Box
+    low: Array | None = None  # (A,) of a Box; the first choices, where they are not all 0
+    high: Array | None = None  # (A,) of a Box
+
+    @property
+    def discrete(self) -> bool:
+        """Whether actions are choices."""
+        return bool(self.parts)
+
+    @property
+    def multi(self) -> bool:
+        """Whether an action is several choices at once."""
+        return isinstance(self.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
+
+    @cached_property
+    def size(self) -> int:
+        """The width of the policy's head."""
+        return sum(self.parts) or int(np.prod(self.space.shape or ()))
+
+    def to_env(self, action: Array) -> Array:
+        """Policy units to the environment's, (n, *shape)."""
+        if self.parts:
+            action = action if self.low is None else np.asarray(action + self.low)
+            return self._shaped(action) if self.multi else action
+        assert self.low is not None
+        low, span, bounded = self._span
+        scaled = action.astype(np.result_type(action, low))
+        scaled[:, bounded] = low[bounded] + 0.5 * (action[:, bounded] + 1.0) * span[bounded]
+        return self._shaped(scaled.astype(self.space.dtype).clip(self.low, self.high))
+
+    def from_env(self, action: Array) -> Array:
+        """The inverse of ``to_env``; what a Box does not hold is clipped."""
+        if self.parts:
+            units = np.asarray(action, np.int64)
+            units = units.reshape(len(units), -1) if self.multi else units
+            return units if self.low is None else np.asarray(units - self.low)
+        assert self.low is not None
+        low, span, bounded = self._span
+        units = action.reshape(len(action), -1).clip(self.low, self.high)
+        width = np.where(span[bounded] == 0.0, 1.0, span[bounded])  # one value: any unit is it
+        units[:, bounded] = (units[:, bounded] - low[bounded]) / width * 2.0 - 1.0
+        return units.astype(np.float32)
+
+    def _shaped(self, action: Array) -> Array:
+        shaped = action.reshape(len(action), *(self.space.shape or ()))
+        return shaped.astype(self.space.dtype, copy=False)
+
+    @cached_property
+    def _span(self) -> tuple[Array, Array, Array]:
+        """Of a Box: low, width, and which dimensions have one that is finite; (A,) each."""
+        assert self.low is not None
+        assert self.high is not None
+        with np.errstate(over="ignore"):  # bounds as wide as their type bound nothing
+            span = self.high - self.low
+        return self.low, span, np.isfinite(span)
+
+
+def action_codec(space: gym.Space[Any]) -> ActionCodec:
+    """The codec of an action space.
+
+    Raises:
+        SkillweaveError: the space is not supported; the message says which are.
+    """
+    if isinstance(space, gym.spaces.Discrete):
+        return ActionCodec(space, (int(space.n),), _first(space.start))
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return ActionCodec(space, tuple(space.nvec.reshape(-1).tolist()), _first(space.start))
+    if isinstance(space, gym.spaces.MultiBinary):
+        return ActionCodec(space, (2,) * int(np.prod(space.shape)))
+    if isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating):
+        return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
+    raise SkillweaveError(f"action space {space} is not supported; supported are: {ACTIONS}.")
+
+
+def _first(start: Any) -> Array | None:
+    """The first choices as an offset, None where they are all 0."""
+    first = np.asarray(start, np.int64)
+    return (first.reshape(-1) if first.ndim else first) if first.any() else None

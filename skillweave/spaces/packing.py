@@ -1,0 +1,104 @@
+"""A batch of observations as one numpy array, whatever the space.
+
+Dict and Tuple become structured arrays, so that ``obs[rows]``, ``obs[rows] = x`` and
+``obs.copy()`` mean the same for every space, and ``obs["position"]`` is a part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.types import Array, SkillweaveError
+
+OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these"
+
+
+def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
+    """The named parts of a Dict or Tuple, in order; None for any other space.
+
+    Raises:
+        SkillweaveError: there are none, or their names are not text.
+    """
+    if isinstance(space, gym.spaces.Dict):
+        found = dict(space.spaces)
+    elif isinstance(space, gym.spaces.Tuple):
+        found = {str(i): part for i, part in enumerate(space.spaces)}
+    else:
+        return None
+    if not found or not all(isinstance(name, str) and name for name in found):
+        raise SkillweaveError(f"space {space} needs at least one part, each with text as its name")
+    return found
+
+
+def obs_shape(space: gym.Space[Any]) -> tuple[int, ...]:
+    """The shape of one observation in a batch; () for Dict and Tuple."""
+    return tuple(space.shape or ())
+
+
+def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
+    """The dtype of observations; a structured one for Dict and Tuple.
+
+    Raises:
+        SkillweaveError: the space is not supported; the message says which are.
+    """
+    inner = parts(space)
+    if inner is None:
+        kinds = gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
+        if isinstance(space, gym.spaces.Box | gym.spaces.Discrete | kinds):
+            return np.dtype(space.dtype)
+        raise SkillweaveError(
+            f"observation space {space} is not supported; supported are: {OBSERVATIONS}. "
+            "A gymnasium wrapper (FlattenObservation, say) can turn other spaces into these."
+        )
+    fields = [(name, obs_dtype(part), obs_shape(part)) for name, part in inner.items()]
+    # Aligned, so that a part can be read out of the raw bytes without a copy.
+    return np.dtype(fields, align=True)
+
+
+def pack(space: gym.Space[Any], batched: Any) -> Array:
+    """A batch as Gymnasium has it (dicts and tuples of arrays) as one array (*lead, *obs_shape).
+
+    What is an array already is returned as it is.
+    """
+    if parts(space) is None or isinstance(batched, np.ndarray):
+        return np.asarray(batched)
+    packed = np.empty(_lead(space, batched), obs_dtype(space))
+    _fill(space, packed, batched)
+    return packed
+
+
+def unpack(space: gym.Space[Any], array: Array) -> Any:
+    """The inverse of ``pack``: dicts and tuples of views; a plain array is returned as it is."""
+    inner = parts(space)
+    if inner is None:
+        return array
+    values = {name: unpack(part, array[name]) for name, part in inner.items()}
+    return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
+
+
+def _values(space: gym.Space[Any], batched: Any) -> Iterable[Any]:
+    """The parts of a batch in the order of the space's, which a dict need not have."""
+    if isinstance(space, gym.spaces.Dict):
+        return [batched[name] for name in space.spaces]
+    return tuple(batched)
+
+
+def _lead(space: gym.Space[Any], batched: Any) -> tuple[int, ...]:
+    inner = parts(space)
+    if inner is None:
+        shape: tuple[int, ...] = np.shape(batched)
+        return shape[: len(shape) - len(obs_shape(space))]
+    return _lead(next(iter(inner.values())), next(iter(_values(space, batched))))
+
+
+def _fill(space: gym.Space[Any], out: Array, batched: Any) -> None:
+    inner = parts(space)
+    if inner is None:
+        out[...] = batched
+        return
+    for (name, part), value in zip(inner.items(), _values(space, batched), strict=True):
+        _fill(part, out[name], value)

@@ -1,0 +1,88 @@
+"""What every training loop tells: episodes as they end, and how an update went."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from skillweave.types import Array, SkillweaveError, VecStep
+
+WINDOW = 100  # episodes in the reported means
+
+
+@dataclass
+class Episodes:
+    """Returns, lengths and successes of the latest episodes, for people to watch."""
+
+    returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    task_returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    lengths: deque[int] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    successes: deque[bool] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    _sums: Array = field(default_factory=lambda: np.zeros((3, 0)))
+
+    def add(self, step: VecStep) -> None:
+        """Take one step of all environments into account."""
+        n = len(step.reward)
+        if self._sums.shape[1] != n:
+            self._sums = np.zeros((3, n))
+        # An options environment sums the undiscounted reward of a call apart.
+        self._sums[0] += step.info.get("call_return", step.reward)
+        if "task_reward" in step.info:
+            self._sums[1] += step.info["task_reward"]
+        self._sums[2] += step.steps
+        ended = step.terminated | step.truncated
+        if ended.any():
+            for i in np.flatnonzero(ended):
+                self.returns.append(float(self._sums[0, i]))
+                if "task_reward" in step.info:
+                    self.task_returns.append(float(self._sums[1, i]))
+                self.lengths.append(int(self._sums[2, i]))
+                if "success" in step.info:
+                    self.successes.append(bool(step.info["success"][i]))
+            self._sums[:, ended] = 0.0
+
+    def cut(self) -> None:
+        """Forget the episodes in flight."""
+        self._sums[:] = 0.0
+
+    def summary(self) -> dict[str, float]:
+        """Means over the window; empty before the first episode ended."""
+        named: dict[str, deque[Any]] = {
+            "return": self.returns,
+            "task_return": self.task_returns,
+            "length": self.lengths,
+            "success": self.successes,
+        }
+        return {k: float(np.mean(v)) for k, v in named.items() if v}
+
+
+@dataclass
+class Tick:
+    """What a loop reports after an update."""
+
+    update: int
+    steps: int
+    seconds: float  # of training, this process's part and those before it
+    metrics: dict[str, float]
+    state: Any
+    cut: bool  # a clean cut: resuming from this state is exact
+    extra: dict[str, torch.Tensor] | None = None  # what else resuming needs: a replay buffer
+
+
+def to_numbers(metrics: dict[str, Any], update: int) -> dict[str, float]:
+    """Member means; a value that is not finite stops the run, saying which and where."""
+    numbers = {}
+    for name, value in metrics.items():
+        finite = torch.isfinite(value)
+        if not bool(finite.all()):
+            member = int((~finite).nonzero()[0])
+            raise SkillweaveError(
+                f"{name} of member {member} is {float(value[member])} at update {update}: training "
+                "has diverged. Lower learning_rate or max_grad_norm; the last checkpoint is intact"
+            )
+        numbers[name] = float(value.mean())
+    return numbers

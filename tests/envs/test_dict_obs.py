@@ -1,0 +1,252 @@
+"""Observations of parts, and every kind of action, through engines, skills and options."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from skillweave.envs.engine import EnvPoolEngine
+from skillweave.envs.foreign import FromVectorEnv
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.hierarchy.calls import SkillSet
+from skillweave.hierarchy.options import OptionsEnv
+from skillweave.seeding import Seeds
+from skillweave.skills import Skill
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.spaces import action_codec, obs_dtype, pack, unpack
+
+GYMNASIUM = ["sync", "async"]
+ACTIONS = [
+    Discrete(3, start=-1),
+    MultiDiscrete([2, 3], start=[1, 0]),
+    MultiDiscrete([[2, 3], [2, 2]], dtype=np.int8),
+    MultiBinary(3),
+    MultiBinary([2, 2]),
+    Box(-1, 1, (2,)),
+    Box(-2, 2, (), np.float64),
+    Box(np.float32([0, -np.inf]), np.float32([1, np.inf])),
+]
+PLACES = Dict(
+    [
+        ("position", Box(-np.inf, np.inf, (2,), np.float32)),
+        ("inside", Tuple((Discrete(20), Box(0, 255, (4, 4, 3), np.uint8)))),
+    ]
+)
+
+
+class Places(gym.Env):
+    """Walks by what its action sums to; odd episodes terminate, even ones are truncated."""
+
+    def __init__(self, action_space=ACTIONS[0], space=PLACES) -> None:
+        self.action_space, self.observation_space = action_space, space
+        self.episode = 0
+
+    def _obs(self):
+        inside = self.t, np.full((4, 4, 3), self.t, np.uint8)
+        value = {"position": self.position.copy(), "inside": inside}
+        return value if self.observation_space is PLACES else (inside[0], self.position.copy())
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.episode = 0, self.episode + 1
+        self.position = self.np_random.normal(size=2).astype(np.float32)
+        return self._obs(), {}
+
+    def step(self, action):
+        single = isinstance(self.action_space, Discrete)
+        assert isinstance(action, int | np.integer if single else np.ndarray), type(action)
+        assert self.action_space.contains(action)
+        self.t += 1
+        self.position += np.float32([0.1 * np.sum(action), 0.5])
+        ended = self.t == 2 + self.episode % 3
+        info = {"t": self.t}
+        return self._obs(), self.t / 2, ended and self.episode % 2 == 1, ended, info
+
+
+def matches(obs, row, single) -> bool:
+    """Whether a row of a batch is one environment's observation."""
+    return np.array_equal(obs[row], pack(PLACES, single))
+
+
+@pytest.fixture
+def engine():
+    """Makes engines, and closes them in the end."""
+    made = []
+
+    def make(name="sync", env=Places, num_envs=3):
+        made.append(make_engine(EnvSpec(env, engine=name), num_envs))
+        return made[-1]
+
+    yield make
+    for e in made:
+        e.close()
+
+
+@pytest.mark.parametrize("name", GYMNASIUM)
+@pytest.mark.parametrize("actions", ACTIONS, ids=str)
+def test_an_engine_is_single_environments_side_by_side(engine, name, actions):
+    e = engine(name, lambda: Places(actions))
+    actions.seed(0)
+    e.reset(0)
+    seeds, singles = [5, 6, 7], [Places(actions) for _ in range(3)]
+    for single in singles:
+        single.reset()  # the engine's second episode begins too
+    obs = e.reset_some(np.arange(3), seeds)
+    firsts = [s.reset(seed=seed)[0] for s, seed in zip(singles, seeds, strict=True)]
+    assert obs.dtype == obs_dtype(PLACES)
+    assert all(matches(obs, i, first) for i, first in enumerate(firsts))
+    for ids in ([0, 1, 2], [2, 0], None):
+        rows = np.arange(3) if ids is None else np.array(ids)
+        chosen = np.stack([np.asarray(actions.sample()) for _ in rows])
+        raw = e.step(chosen, None if ids is None else rows)
+        for at, i in enumerate(rows):
+            action = int(chosen[at]) if isinstance(actions, Discrete) else np.asarray(chosen[at])
+            after, reward, terminated, _, info = singles[i].step(action)
+            assert matches(raw.next_obs, at, after)
+            assert (raw.reward[at], raw.terminated[at]) == (reward, terminated)
+            assert raw.info["t"][at] == info["t"]
+
+
+def test_steps_do_not_write_to_observations_of_before(engine):
+    e = engine()
+    first = e.reset(0)
+    kept = first.copy()
+    second = e.step(np.zeros(3, np.int64)).next_obs
+    assert np.array_equal(first, kept)
+    assert not np.array_equal(first, second)
+
+
+def test_envpool_takes_no_observations_of_parts():
+    pytest.importorskip("envpool")
+    env = gym.make("CartPole-v1")
+    assert EnvPoolEngine.supports("CartPole-v1", env)
+    assert not EnvPoolEngine.supports(
+        "CartPole-v1", gym.wrappers.TransformObservation(env, lambda x: {"a": x}, PLACES)
+    )
+
+
+@pytest.mark.parametrize("actions", ACTIONS, ids=str)
+def test_a_skill_starts_after_random_actions_of_any_kind_and_reads_parts(engine, actions):
+    class Onwards(Skill):
+        def initiation(self, obs):
+            return obs["inside"]["0"] >= 1
+
+        def reward(self, step):
+            return step.next_obs["position"][:, 1] - step.obs["position"][:, 1]
+
+    env = SkillEnv(engine(env=lambda: Places(actions)), Onwards())
+    obs = env.reset(Seeds(0))
+    codec = action_codec(actions)
+    units = np.zeros((3, codec.size), np.float32)
+    if codec.discrete:
+        units = np.zeros((3, len(codec.parts)) if codec.multi else 3, np.int64)
+    for _ in range(6):
+        assert (obs["inside"]["0"] >= 1).all()
+        step = env.step(codec.to_env(units))
+        np.testing.assert_allclose(step.reward, 0.5, atol=1e-5)
+        obs = step.obs
+
+
+class Ahead(Skill):
+    """May start everywhere but at time 4, at which an episode has ended."""
+
+    def initiation(self, obs):
+        return obs["inside"]["0"] < 4
+
+
+class Rest(Skill):
+    """May start at times 0 and 1."""
+
+    max_steps = 1
+
+    def initiation(self, obs):
+        return obs["inside"]["0"] <= 1
+
+
+@pytest.fixture
+def options(engine):
+    """An OptionsEnv of Places: skills of which none may start at time 4."""
+    made = engine()
+
+    def still(obs):
+        return np.zeros(len(obs["position"]), np.int64)
+
+    policy = ScriptedPolicy(still, made.observation_space, made.action_space)
+    return OptionsEnv(made, SkillSet((Ahead(), Rest()), (policy, policy), call_steps=1), 0.9)
+
+
+def test_options_are_an_ordinary_vector(options):
+    obs, info = options.reset(seed=0)
+    assert options.observation_space.contains(obs)
+    ends = 0
+    for _ in range(20):
+        action = info["action_mask"].argmax(axis=1)
+        obs, reward, terminated, truncated, info = options.step(action)
+        assert options.observation_space.contains(obs)
+        assert info["next_obs"].dtype == obs_dtype(PLACES)
+        ended = terminated | truncated
+        for i in np.flatnonzero(ended):
+            assert PLACES.contains(info["final_obs"][i])
+            assert matches(info["next_obs"], i, info["final_obs"][i])
+            assert obs["inside"][0][i] == 0
+        successors = unpack(PLACES, info["next_obs"])
+        assert np.array_equal(successors["position"][~ended], obs["position"][~ended])
+        ends += ended.sum()
+        assert reward.dtype == np.float32
+    assert ends > 5
+
+
+def test_the_next_mask_is_that_of_the_true_successor(options):
+    _, info = options.reset(seed=0)
+    seen = set()
+    for _ in range(40):
+        action = info["action_mask"].argmax(axis=1)
+        _, _, terminated, truncated, info = options.step(action)
+        mask, time = info["next_action_mask"], info["next_obs"]["inside"]["0"]
+        assert (mask.shape, mask.dtype) == ((3, 2), bool)
+        assert np.array_equal(
+            mask[~(terminated | truncated)], info["action_mask"][~(terminated | truncated)]
+        )
+        assert mask[terminated].all()
+        for i in np.flatnonzero(truncated & ~terminated):
+            stuck = time[i] == 4
+            assert mask[i].tolist() == [True, bool(stuck or time[i] <= 1)]
+            seen.add(bool(stuck))
+    assert seen == {True, False}
+
+
+def test_a_loop_that_trains_on_options_sees_packed_arrays_and_both_masks(options):
+    env = FromVectorEnv(options)
+    obs = env.reset(Seeds(0))
+    assert obs.dtype == obs_dtype(PLACES)
+    for _ in range(10):
+        step = env.step(env.mask().argmax(axis=1))
+        assert step.obs.dtype == step.next_obs.dtype == obs_dtype(PLACES)
+        assert step.mask is step.info["action_mask"]
+        assert step.next_mask is step.info["next_action_mask"]
+
+
+@pytest.mark.parametrize(
+    "space", [PLACES, Tuple((Discrete(20), PLACES["position"]))], ids=["dict", "tuple"]
+)
+def test_a_foreign_vector_of_parts_tells_true_successors(space):
+    makers = [lambda: Places(space=space)] * 2
+    env = FromVectorEnv(SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP))
+    obs, time = env.reset(Seeds(0)), "0"
+    assert obs.dtype == obs_dtype(space)
+    ends = 0
+    for _ in range(8):
+        step = env.step(np.zeros(2, np.int64))
+        before, after, now = (
+            x[time] if space is not PLACES else x["inside"][time]
+            for x in (obs, step.next_obs, step.obs)
+        )
+        assert np.array_equal(after, before + 1)
+        assert np.array_equal(now, np.where(step.ended, 0, after))
+        assert step.next_mask is None
+        ends += step.ended.sum()
+        obs = step.obs.copy()
+    assert ends
+    env.close()

@@ -1,0 +1,198 @@
+"""Foreign skills from declaration to training, loading and evaluation."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, MultiDiscrete
+from skills.foreign_models import WEIGHT, linear, onnx_file, sb3_zip
+
+from skillweave import PPO, Hierarchy, Skill, SkillweaveError, from_onnx, from_sb3, from_torch
+
+SMALL = PPO(num_envs=4, n_steps=16, batch_size=64)
+
+
+def upright(obs):
+    return (obs @ WEIGHT).argmax(1)
+
+
+def skill(name, policy, **attributes):
+    return type(name, (Skill,), {"name": name, "policy": policy, **attributes})()
+
+
+def declare(*skills, env="CartPole-v1", **more):
+    return Hierarchy(env, skills, selector=SMALL, selector_steps=500, call_steps=5, **more)
+
+
+def all_kinds(folder):
+    """A skill of each kind, from files that lie in ``folder``."""
+    return [
+        skill("function", upright),
+        skill("torch", linear()),
+        skill("sb3", from_sb3(folder / "ppo.zip", "ppo", trust=True)),
+        skill("onnx", from_onnx(folder / "skill.onnx")),
+    ]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with files, and a run of skills of each kind."""
+    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("onnxruntime")
+    folder = tmp_path_factory.mktemp("foreign")
+    sb3_zip(folder / "ppo.zip")
+    onnx_file(folder / "skill.onnx")
+    run = declare(*all_kinds(folder)).train(folder / "run", seed=0, quiet=True)
+    return folder, run
+
+
+def acts(policy, size=4, steps=40):
+    rng, memory, found = np.random.default_rng(0), policy.start(16), []
+    for _ in range(steps):
+        obs = rng.normal(size=(16, size)).astype(np.float32)
+        action, memory = policy.act(memory, obs)
+        found.append((action.tolist(), policy.acting(memory).tolist()))
+        memory["over"][:] = rng.random(16) < 0.5
+    return found
+
+
+def test_a_run_names_and_keeps_its_policies(made):
+    folder, run = made
+    manifest = json.loads((run.path / "run.json").read_text())
+    entries = {s["name"]: s["policy"] for s in manifest["skills"]}
+    assert {k: v["kind"] for k, v in entries.items()} == {k: k for k in entries}
+    assert entries["sb3"]["file"] == str(folder / "ppo.zip")
+    kept = {p.name for p in (run.path / "policies").iterdir()}
+    assert kept == {"torch.safetensors", "onnx.onnx", "selector.safetensors"}
+    assert (run.path / "policies" / "onnx.onnx").read_bytes()
+    assert manifest["needs_recipe"]
+
+
+def test_trained_and_loaded_act_the_same_also_from_a_weights_file(made, tmp_path):
+    folder, run = made
+    loaded = declare(*all_kinds(folder)).load(run.path)
+    assert acts(loaded.policy) == acts(run.policy)
+    assert loaded.evaluate(5) == run.evaluate(5)
+    assert sum(run.evaluate(5).skill_calls.values()) > 5
+    assert run.evaluate(3, skill="torch") == run.evaluate(3, skill="onnx")
+    path = run.save_weights(tmp_path / "weights.safetensors")
+    assert acts(declare(*all_kinds(folder)).load_weights(path).policy) == acts(run.policy)
+
+
+def test_what_a_run_keeps_is_what_acts_whatever_the_recipe_has_now(made, tmp_path):
+    folder, run = made
+    weights = run.save_weights(tmp_path / "weights.safetensors")
+    onnx_file(tmp_path / "other.onnx", -WEIGHT)
+    skills = all_kinds(folder)
+    skills[1] = skill("torch", linear(-WEIGHT))
+    skills[3] = skill("onnx", from_onnx(tmp_path / "other.onnx"))
+    for loaded in (declare(*skills).load(run.path), declare(*skills).load_weights(weights)):
+        for name in ("torch", "onnx"):
+            assert loaded.evaluate(3, skill=name) == run.evaluate(3, skill=name)
+
+
+def test_a_policy_that_is_only_named_must_be_the_same(made, tmp_path):
+    folder, run = made
+    weights = run.save_weights(tmp_path / "weights.safetensors")
+    skills = all_kinds(folder)
+    sb3_zip(tmp_path / "a.zip", "ppo", n_steps=64)
+    skills[2] = skill("sb3", from_sb3(tmp_path / "a.zip", "ppo", trust=True))
+    for load in (
+        lambda: declare(*skills).load(run.path),
+        lambda: declare(*skills).resume(run.path),
+        lambda: declare(*skills).load_weights(weights),
+    ):
+        with pytest.raises(SkillweaveError, match=r"'sb3'.*ppo\.zip.*a\.zip.*another checksum"):
+            load()
+
+
+def test_a_policy_of_another_kind_and_one_of_other_shapes_are_refused(made):
+    folder, run = made
+    skills = all_kinds(folder)
+    skills[1] = skill("torch", upright)
+    with pytest.raises(SkillweaveError, match=r"'torch'.*kind torch.*now it is function"):
+        declare(*skills).load(run.path)
+    skills[1] = skill("torch", torch.nn.Linear(4, 2))
+    with pytest.raises(SkillweaveError, match=r"skill 'torch'.*the weights.*do not fit"):
+        declare(*skills).load(run.path)
+
+
+def test_a_model_of_sb3_in_memory_is_kept_by_its_weights(tmp_path):
+    sb3 = pytest.importorskip("stable_baselines3")
+
+    def model(seed):
+        return sb3.A2C("MlpPolicy", "CartPole-v1", seed=seed, device="cpu")
+
+    run = declare(skill("one", from_sb3(model(0)))).train(tmp_path / "run", quiet=True)
+    assert (run.path / "policies" / "one.safetensors").exists()
+    loaded = declare(skill("one", from_sb3(model(1)))).load(run.path)
+    assert acts(loaded.policy) == acts(run.policy)
+
+
+def test_a_run_that_is_resumed_goes_on_with_what_it_has_kept(tmp_path, monkeypatch):
+    import skillweave.hierarchy.training as training
+
+    whole = declare(skill("a", linear())).train(tmp_path / "whole", quiet=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "train_phase", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            declare(skill("a", linear())).train(tmp_path / "cut", quiet=True)
+    resumed = declare(skill("a", linear(-WEIGHT))).resume(tmp_path / "cut", quiet=True)
+    assert acts(resumed.policy) == acts(whole.policy)
+
+
+def test_a_hierarchy_of_foreign_skills_is_a_skill_again(tmp_path):
+    inner = declare(skill("a", linear()), skill("b", upright)).train(tmp_path / "in", quiet=True)
+    whole = inner.as_skill("inner", max_steps=10)
+    run = declare(whole, skill("c", linear(-WEIGHT))).train(tmp_path / "out", quiet=True)
+    assert run.info()["skills"][0]["policy"]["kind"] == "policy"
+    loaded = declare(whole, skill("c", linear(-WEIGHT))).load(run.path)
+    assert acts(loaded.policy) == acts(run.policy)
+
+
+def test_the_flat_baseline_leaves_foreign_skills_alone(tmp_path):
+    run = declare(skill("a", linear())).train(tmp_path / "run", flat=True, quiet=True)
+    assert {p.name for p in (run.path / "policies").iterdir()} == {"flat.safetensors"}
+    declare(skill("a", linear(-WEIGHT))).load(run.path)
+
+
+def test_what_does_not_fit_is_said_before_anything_is_written(tmp_path):
+    for policy in (linear(np.zeros((8, 2))), lambda obs: obs, from_torch(linear(WEIGHT.T[:, :1]))):
+        with pytest.raises(SkillweaveError, match="skill 'wrong'"):
+            declare(skill("wrong", policy)).train(tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+class Point(gym.Env):
+    """Reward for acting as the observation says; whatever actions."""
+
+    observation_space = Box(-1.0, 1.0, (3,), np.float32)
+
+    def __init__(self, action_space):
+        self.action_space = action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.obs, self.t = self.np_random.uniform(-1, 1, 3).astype(np.float32), 0
+        return self.obs, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.t += 1
+        return self.obs, float(np.sum(action)), False, self.t == 5, {}
+
+
+@pytest.mark.parametrize("space", [Box(-0.5, 0.5, (2,), np.float32), MultiDiscrete([2, 3])])
+def test_other_actions_than_choices(tmp_path, space):
+    width = 2 if isinstance(space, Box) else 5
+    weight = np.random.default_rng(0).normal(size=(3, width))
+    choose = (lambda obs: obs[:, :2]) if isinstance(space, Box) else None
+    choose = choose or (lambda obs: (obs[:, :2] > 0).astype(int))
+    skills = [skill("net", linear(weight)), skill("function", choose)]
+    for greedy in (True, False):
+        h = declare(*skills, env=lambda: Point(space), greedy_skills=greedy)
+        run = h.train(tmp_path / str(greedy), quiet=True)
+        assert acts(h.load(run.path).policy, 3)[0][1] == acts(run.policy, 3)[0][1]
+        assert run.evaluate(3, skill="net") == h.load(run.path).evaluate(3, skill="net")

@@ -1,0 +1,85 @@
+"""Small models of every kind, for the tests of foreign skills."""
+
+from __future__ import annotations
+
+import base64
+import json
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+WEIGHT = np.array([[-0.1, 0.1], [-0.2, 0.2], [-2.0, 2.0], [-1.0, 1.0]], np.float32)
+"""Logits of CartPole's two actions: a controller that balances."""
+
+
+def linear(weight: Any = WEIGHT) -> torch.nn.Linear:
+    weight = torch.tensor(np.asarray(weight, np.float32))
+    module = torch.nn.Linear(*weight.shape, bias=False)
+    with torch.no_grad():
+        module.weight[:] = weight.T
+    return module
+
+
+def onnx_file(
+    path: Path, weight: Any = WEIGHT, batch: Any = "n", whole: bool = False, apart: bool = False
+) -> Path:
+    """obs · weight as an ONNX file; ``whole``: returns the largest one; ``apart``: two files."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    weight = np.asarray(weight, np.float32)
+    nodes = [helper.make_node("MatMul", ["obs", "w"], ["logits"])]
+    nodes += [helper.make_node("ArgMax", ["logits"], ["action"], axis=1, keepdims=0)]
+    outputs = [
+        helper.make_tensor_value_info("action", TensorProto.INT64, [batch]),
+        helper.make_tensor_value_info("logits", TensorProto.FLOAT, [batch, weight.shape[1]]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "linear",
+        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, [batch, weight.shape[0]])],
+        outputs if whole else outputs[::-1],
+        [onnx.numpy_helper.from_array(weight, "w")],
+    )
+    opset = [helper.make_opsetid("", 17)]
+    model = helper.make_model(graph, opset_imports=opset, ir_version=9)
+    beside = {"save_as_external_data": True, "location": "w.data", "size_threshold": 0}
+    onnx.save(model, path, **(beside if apart else {}))
+    return path
+
+
+def sb3_zip(path: Path, name: str = "ppo", env: Any = "CartPole-v1", **settings: Any) -> Path:
+    import stable_baselines3
+
+    policy = settings.pop("policy", "MlpPolicy")
+    kind = getattr(stable_baselines3, name.upper())
+    kind(policy, env, seed=0, device="cpu", **settings).save(path)
+    return path
+
+
+class Evil:
+    """Leaves a file behind when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.mark,)
+
+
+def poisoned(path: Path, mark: Path) -> Path:
+    """A model's zip that creates ``mark`` when it is opened."""
+    sound = sb3_zip(path.with_name("sound.zip"))
+    evil = base64.b64encode(pickle.dumps(Evil(mark))).decode()
+    with zipfile.ZipFile(sound) as old, zipfile.ZipFile(path, "w") as new:
+        for item in old.namelist():
+            content = old.read(item)
+            if item == "data":
+                data = json.loads(content) | {"evil": {":type:": "x", ":serialized:": evil}}
+                content = json.dumps(data).encode()
+            new.writestr(item, content)
+    return path

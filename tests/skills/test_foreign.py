@@ -1,0 +1,331 @@
+"""Policies from elsewhere, each by itself; in a hierarchy: tests/hierarchy/test_foreign_skills."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete
+from skills.foreign_models import WEIGHT, linear, onnx_file, poisoned, sb3_zip
+
+from skillweave import from_function, from_onnx, from_sb3, from_torch
+from skillweave.skills import Skill, ready_policy
+from skillweave.skills.foreign import Foreign, as_recorded, fitted, source_of
+from skillweave.types import MissingExtra, SkillweaveError
+
+OBS, ACTION = gym.make("CartPole-v1").observation_space, Discrete(2)
+ROWS = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+
+
+def lean(obs):
+    return (obs @ WEIGHT).argmax(1)
+
+
+def fit(policy, observation_space=OBS, action_space=ACTION):
+    return fitted(policy, observation_space, action_space, "skill 'x'", "CartPole-v1")
+
+
+def acts(policy, obs=ROWS, **how):
+    return policy.act({}, obs, **how)[0]
+
+
+# One line each --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def zip_file(tmp_path_factory):
+    pytest.importorskip("stable_baselines3")
+    return sb3_zip(tmp_path_factory.mktemp("sb3") / "ppo.zip")
+
+
+def test_a_function_a_module_and_an_onnx_file_act_alike(tmp_path):
+    pytest.importorskip("onnxruntime")
+    for policy in (from_function(lean), from_torch(linear()), from_onnx(onnx_file(tmp_path / "x"))):
+        found = fit(policy)
+        assert (found.observation_space, found.action_space) == (OBS, ACTION)
+        assert (policy.observation_space, policy.action_space) == (None, None)
+        np.testing.assert_array_equal(acts(found), lean(ROWS))
+        assert acts(found).dtype == np.int64
+
+
+@pytest.mark.parametrize("batch", ["n", None, 1])
+@pytest.mark.parametrize("whole", [False, True])
+def test_an_onnx_file_takes_any_batch_or_one_at_a_time(tmp_path, batch, whole):
+    pytest.importorskip("onnxruntime")
+    path = onnx_file(tmp_path / "x.onnx", batch=batch, whole=whole)
+    np.testing.assert_array_equal(acts(fit(from_onnx(path))), lean(ROWS))
+
+
+def test_an_onnx_file_may_keep_its_weights_in_another_and_have_several_outputs(tmp_path):
+    pytest.importorskip("onnxruntime")
+    path = onnx_file(tmp_path / "x.onnx", apart=True)
+    policy = from_onnx(path, output="action")
+    (tmp_path / "w.data").unlink()
+    np.testing.assert_array_equal(acts(fit(policy)), lean(ROWS))
+    copied = fit(policy).restored(policy.content())
+    np.testing.assert_array_equal(acts(copied), lean(ROWS))
+
+
+def test_a_module_gets_the_parts_of_a_dict_by_name():
+    class Net(torch.nn.Module):
+        def forward(self, obs):
+            return obs["speed"]
+
+    space = Dict({"place": Discrete(3), "speed": Box(-1, 1, (2,))})
+    obs = np.zeros(3, [("place", np.int64), ("speed", np.float32, (2,))])
+    obs["speed"] = [[1, 0], [0, 1], [1, 0]]
+    assert acts(fit(from_torch(Net()), space), obs).tolist() == [0, 1, 0]
+
+
+def test_a_module_acts_as_the_copy_that_was_fitted_and_in_evaluation_mode():
+    module = torch.nn.Sequential(linear(), torch.nn.Dropout(0.9))
+    policy = fit(from_torch(module))
+    assert module.training
+    with torch.no_grad():
+        module[0].weight[:] = 0.0
+    np.testing.assert_array_equal(acts(policy), lean(ROWS))
+
+
+@pytest.mark.parametrize("name", ["ppo", "a2c", "dqn"])
+def test_every_discrete_algorithm_of_sb3_acts_as_it_would_itself(tmp_path, name):
+    sb3 = pytest.importorskip("stable_baselines3")
+    path = sb3_zip(tmp_path / "model.zip", name)
+    kind = getattr(sb3, name.upper())
+    want = kind.load(path, device="cpu").predict(ROWS, deterministic=True)[0]
+    for policy in (from_sb3(path, name, trust=True), from_sb3(str(path), kind, trust=True)):
+        np.testing.assert_array_equal(acts(fit(policy)), want)
+
+
+@pytest.mark.parametrize("name", ["sac", "td3", "ddpg"])
+def test_every_continuous_algorithm_of_sb3_acts_as_it_would_itself(tmp_path, name):
+    sb3 = pytest.importorskip("stable_baselines3")
+    path = sb3_zip(tmp_path / "model.zip", name, "Pendulum-v1", buffer_size=1000)
+    env = gym.make("Pendulum-v1")
+    policy = fit(from_sb3(path, name, trust=True), env.observation_space, env.action_space)
+    want = getattr(sb3, name.upper()).load(path, device="cpu")
+    want = want.predict(ROWS[:, :3], deterministic=True)[0]
+    np.testing.assert_allclose(acts(policy, ROWS[:, :3]), want, rtol=1e-6)
+
+
+class Camera(gym.Env):
+    observation_space = Box(0, 255, (40, 40, 3), np.uint8)
+    action_space = Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros((40, 40, 3), np.uint8), {}
+
+
+def test_images_that_sb3_has_turned_fit_the_environment_as_it_is(tmp_path):
+    sb3 = pytest.importorskip("stable_baselines3")
+    model = sb3.A2C("CnnPolicy", Camera(), device="cpu")
+    assert model.observation_space.shape == (3, 40, 40)
+    policy = fit(from_sb3(model), Camera.observation_space, Discrete(3))
+    assert policy.observation_space == Camera.observation_space
+    obs = np.random.default_rng(0).integers(0, 255, (5, 40, 40, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(acts(policy, obs), model.predict(obs, deterministic=True)[0])
+
+
+def test_sampling_follows_the_given_generator_and_leaves_the_global_one_alone(zip_file):
+    for policy in (fit(from_sb3(zip_file, "ppo", trust=True)), fit(from_torch(linear(0 * WEIGHT)))):
+        before = torch.get_rng_state()
+        draws = [
+            acts(policy, deterministic=False, rng=np.random.default_rng(s)).tolist()
+            for s in (0, 0, 1)
+        ]
+        assert draws[0] == draws[1] != draws[2]
+        assert torch.equal(torch.get_rng_state(), before)
+
+
+# Trust ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("trust", [{}, {"trust": False}, {"trust": 1}, {"trust": "no"}])
+def test_a_zip_is_not_opened_without_trust(tmp_path, trust):
+    pytest.importorskip("stable_baselines3")
+    mark = tmp_path / "mark"
+    path = poisoned(tmp_path / "evil.zip", mark)
+    with pytest.raises(SkillweaveError, match=r"evil.zip was not opened.*pickle.*trust=True"):
+        from_sb3(path, "ppo", **trust)
+    assert not mark.exists()
+    from_sb3(path, "ppo", trust=True)  # else the test would not show anything
+    assert mark.exists()
+
+
+def test_refusing_needs_nothing_installed_and_no_file(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(SkillweaveError, match="trust=True"):
+        from_sb3(tmp_path / "nothing.zip", "ppo")
+
+
+# What does not fit ----------------------------------------------------------------------------
+
+
+def says(policy, *spaces, both=True):
+    with pytest.raises(SkillweaveError, match="skill 'x'") as raised:
+        fit(policy, *spaces)
+    return str(raised.value)
+
+
+EIGHT = Box(-1, 1, (8,))
+
+
+def test_other_spaces_are_both_named(zip_file, tmp_path):
+    pytest.importorskip("onnxruntime")
+    said = says(from_sb3(zip_file, "ppo", trust=True), EIGHT, ACTION)
+    assert str(OBS) in said
+    assert str(EIGHT) in said
+    said = says(from_sb3(zip_file, "ppo", trust=True), OBS, Discrete(5))
+    assert "Discrete(2)" in said
+    assert "Discrete(5)" in said
+    said = says(from_onnx(onnx_file(tmp_path / "x.onnx")), EIGHT, ACTION)
+    assert "shape (4)" in said
+    assert str(EIGHT) in said
+    said = says(from_onnx(tmp_path / "x.onnx"), OBS, Discrete(5))
+    assert "(2, 2)" in said
+    assert "Discrete(5)" in said
+    said = says(from_torch(linear()), EIGHT, ACTION)
+    assert "module Linear" in said
+    assert str(EIGHT) in said
+    assert "Discrete(5)" in says(from_torch(linear()), OBS, Discrete(5))
+    assert "Discrete(3)" in says(from_function(lean, action_space=Discrete(3)))
+
+
+def test_what_fails_or_returns_something_else_is_named():
+    def broken(obs):
+        return obs["speed"]
+
+    assert "function broken() fails on observations of Box" in says(from_function(broken))
+    assert "function <lambda>() returned shape (2, 4)" in says(from_function(lambda obs: obs))
+
+    class Pair(torch.nn.Module):
+        def forward(self, obs):
+            return obs, obs
+
+    assert "module Pair returned a tuple" in says(from_torch(Pair()))
+
+
+def test_a_policy_without_spaces_says_that_it_needs_some():
+    with pytest.raises(SkillweaveError, match="module Linear has no spaces yet"):
+        acts(from_torch(linear()))
+
+
+def test_wrong_files_are_named(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("onnxruntime")
+    (tmp_path / "junk").write_bytes(b"junk")
+    for make, match in [
+        (lambda: from_sb3(tmp_path / "junk", "ppo", trust=True), "junk could not be opened.*PPO"),
+        (lambda: from_sb3(tmp_path / "none", "ppo", trust=True), "could not read .*none"),
+        (lambda: from_sb3(tmp_path / "junk", trust=True), "algorithm is None.*ppo, a2c"),
+        (lambda: from_sb3(tmp_path / "junk", "ppoo", trust=True), "'ppoo'"),
+        (lambda: from_sb3(3), "neither"),
+        (lambda: from_torch(torch.nn.Linear), "made of its class"),
+        (lambda: from_function(3), "not 3"),
+        (lambda: from_onnx(tmp_path / "junk"), "junk is no ONNX model|junk cannot be run"),
+        (lambda: from_onnx(tmp_path / "none"), "could not read .*none"),
+        (lambda: from_onnx(onnx_file(tmp_path / "x", batch=7)), "exactly 7.*dynamic"),
+        (lambda: from_onnx(onnx_file(tmp_path / "x"), output="y"), "no output 'y'.*logits, action"),
+    ]:
+        with pytest.raises(SkillweaveError, match=match):
+            make()
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "make"),
+    [
+        ("stable_baselines3", "sb3", lambda path: from_sb3(path, "ppo", trust=True)),
+        ("onnx", "onnx", from_onnx),
+        ("onnxruntime", "onnx", lambda path: from_onnx(onnx_file(path))),
+    ],
+)
+def test_a_missing_extra_is_named(module, extra, make, monkeypatch, tmp_path):
+    if module == "onnxruntime":
+        pytest.importorskip("onnx")
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtra, match=rf"skillweave\[{extra}\]"):
+        make(tmp_path / "file")
+
+
+def test_declaring_skills_imports_nothing_heavy():
+    code = "import sys, skillweave\n"
+    code += "skillweave.Skill, skillweave.from_onnx, skillweave.from_sb3, skillweave.from_torch\n"
+    code += "print({'torch', 'onnx', 'onnxruntime', 'stable_baselines3'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+# What may stand after ``policy =`` ------------------------------------------------------------
+
+
+def test_functions_methods_and_modules_become_policies():
+    class Bare(Skill):
+        policy = lean
+
+    class Static(Skill):
+        policy = staticmethod(lean)
+
+    class Method(Skill):
+        def policy(self, obs):
+            assert isinstance(self, Method)
+            return lean(obs)
+
+    class Module(Skill):
+        policy = linear()
+
+    class Inherited(Bare):
+        pass
+
+    set_later = Skill()
+    set_later.policy = lean
+    with_option = Skill()
+    with_option.policy = lambda obs, gain=1: lean(gain * obs)
+    for skill in (Bare(), Static(), Method(), Module(), Inherited(), set_later, with_option):
+        policy = fit(ready_policy(skill))
+        assert isinstance(policy, Foreign)
+        np.testing.assert_array_equal(acts(policy), lean(ROWS))
+    assert ready_policy(Skill()) is None
+
+
+def test_what_cannot_act_is_named():
+    skill = Skill()
+    skill.name = "x"
+    for value, match in [("skill.onnx", "'skill.onnx', which cannot act.*from_onnx"), (3, "3")]:
+        skill.policy = value
+        with pytest.raises(SkillweaveError, match=f"skill 'x'.*{match}"):
+            ready_policy(skill)
+
+
+# What a run remembers -------------------------------------------------------------------------
+
+
+def test_sources_say_where_policies_come_from(zip_file, tmp_path):
+    pytest.importorskip("onnxruntime")
+    file = onnx_file(tmp_path / "x.onnx")
+    found = [source_of(p) for p in (from_function(lean), from_torch(linear()), from_onnx(file))]
+    assert [s["kind"] for s in found] == ["function", "torch", "onnx"]
+    assert found[0]["name"].endswith("test_foreign.lean")
+    assert found[1]["name"] == "torch.nn.modules.linear.Linear"
+    assert found[2]["file"] == str(file)
+    zipped = source_of(from_sb3(zip_file, "ppo", trust=True))
+    assert (zipped["kind"], zipped["name"], zipped["file"]) == ("sb3", "PPO", str(zip_file))
+    assert [len(s.get("sha256", "")) for s in (*found, zipped)] == [0, 64, 64, 64]
+
+
+def test_a_copy_that_is_damaged_missing_or_of_another_shape_is_said():
+    then, now = fit(from_torch(linear())), fit(from_torch(linear(2 * WEIGHT)))
+
+    def load(policy, content):
+        return as_recorded(policy, then.source(), lambda: content, "runs/x: skill 'x'")
+
+    assert load(now, then.content()).source() == then.source()
+    assert now.source() != then.source()
+    with pytest.raises(SkillweaveError, match=r"runs/x: skill 'x': the copy.*damaged"):
+        load(now, b"junk")
+    with pytest.raises(SkillweaveError, match=r"runs/x.*torch .*Linear.*another checksum"):
+        load(now, None)
+    with pytest.raises(SkillweaveError, match=r"module Linear.*do not fit"):
+        load(from_torch(torch.nn.Linear(4, 3)), then.content())
+    with pytest.raises(SkillweaveError, match=r"kind torch .*Linear.*now it is function .*lean"):
+        load(from_function(lean), then.content())

@@ -1,0 +1,286 @@
+"""Observations of parts and of pixels: packed as one array, split into a vector and images."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from gymnasium.vector.utils import batch_space, create_empty_array, iterate
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skillweave.spaces import (
+    obs_codec,
+    obs_dtype,
+    obs_shape,
+    pack,
+    same_space,
+    space_from_json,
+    space_to_json,
+    to_tensor,
+    unpack,
+)
+from skillweave.types import SkillweaveError
+
+BYTES = np.uint8
+
+
+def pixels(*shape, dtype=BYTES, high=255):
+    return Box(0, high, shape, dtype)
+
+
+# Images
+
+
+@pytest.mark.parametrize(
+    ("space", "image"),
+    [
+        (pixels(84, 84, 3), (3, 84, 84)),
+        (pixels(3, 84, 84), (3, 84, 84)),
+        (pixels(7, 8, 7), (7, 8, 7)),  # a tie: first
+        (pixels(84, 84, 1), (1, 84, 84)),
+        (pixels(4, 84, 84, 3), (12, 84, 84)),  # a stack of frames
+        (pixels(4, 3, 84, 84), (12, 84, 84)),
+        (pixels(16, 20), (1, 16, 20)),
+        (pixels(5, 6, 3, dtype=bool, high=1), (3, 5, 6)),
+        (pixels(5, 6, 3, dtype=np.int64, high=9), (3, 5, 6)),
+        (pixels(5, 6, 3, dtype=np.float32, high=1), (3, 5, 6)),
+    ],
+    ids=str,
+)
+def test_images_are_found_with_their_channels(space, image):
+    codec = obs_codec(space)
+    assert (codec.images, codec.size) == ((image,), 0)
+    assert codec.item == space.shape
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        pixels(15, 20),
+        pixels(16, 20, dtype=np.int16),
+        pixels(400),
+        pixels(2, 2, 2, 2, 2),
+        Box(-np.inf, 1, (5, 6, 3)),
+        Box(0, 1, (16, 20)),
+    ],
+    ids=str,
+)
+def test_any_other_box_is_a_vector(space):
+    codec = obs_codec(space)
+    assert (codec.images, codec.size) == ((), int(np.prod(space.shape)))
+
+
+def test_channels_come_first_and_pixels_keep_their_place_and_type():
+    x = np.arange(2 * 5 * 6 * 3, dtype=BYTES).reshape(2, 5, 6, 3)
+    vector, (image,) = obs_codec(pixels(5, 6, 3)).split(to_tensor(x))
+    assert (vector.shape, vector.dtype) == ((2, 0), torch.float32)
+    assert image.dtype == torch.uint8
+    assert np.array_equal(image.numpy(), x.transpose(0, 3, 1, 2))
+
+
+def test_the_frames_of_a_stack_follow_each_other():
+    last = np.arange(4 * 8 * 9 * 2, dtype=BYTES).reshape(1, 4, 8, 9, 2)
+    first = last.transpose(0, 1, 4, 2, 3)
+    wanted = first.reshape(1, 8, 8, 9)
+    for x in (last, np.ascontiguousarray(first)):
+        _, (image,) = obs_codec(pixels(*x.shape[1:])).split(to_tensor(x))
+        assert np.array_equal(image.numpy(), wanted)
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "wanted"),
+    [
+        (pixels(2, 3, 3), 51, 0.2),
+        (pixels(2, 3, 3, dtype=bool, high=1), True, 1.0),
+        (pixels(2, 3, 3, dtype=np.int32, high=8), 2, 0.25),
+        (pixels(2, 3, 3, dtype=np.uint16, high=1000), 500, 0.5),
+        (pixels(2, 3, 3, dtype=np.float64, high=1), 0.3, 0.3),
+    ],
+    ids=str,
+)
+def test_a_network_sees_pixels_from_zero_to_one(space, value, wanted):
+    codec = obs_codec(space)
+    x = np.full((1, *space.shape), value, space.dtype)
+    _, (image,) = codec.split(to_tensor(x))
+    assert image.dtype == to_tensor(x).dtype
+    seen = codec.pixels(image, 0)
+    assert seen.dtype == torch.float32
+    torch.testing.assert_close(seen, torch.full((1, 2, 3, 3), wanted))
+
+
+# Dict and Tuple
+
+NESTED = Dict(
+    [
+        ("speed", Box(-1, 1, (2,), np.float64)),
+        ("alarm", MultiBinary(2)),
+        ("eye", pixels(3, 4, 2)),
+        ("rest", Tuple((Discrete(3, start=1), Dict({"gear": MultiDiscrete([2, 2])})))),
+    ]
+)
+BATCH = {
+    "speed": np.array([[0.5, -0.5], [1, 0]]),
+    "alarm": np.array([[1, 0], [0, 1]], np.int8),
+    "eye": np.arange(48, dtype=BYTES).reshape(2, 3, 4, 2),
+    "rest": (np.array([1, 3]), {"gear": np.array([[0, 1], [1, 1]])}),
+}
+
+
+def test_parts_are_a_structured_array_that_is_used_as_any_other():
+    obs = pack(NESTED, BATCH)
+    assert (obs.shape, obs.dtype) == ((2,), obs_dtype(NESTED))
+    assert obs_shape(NESTED) == ()
+    assert obs["speed"].tolist() == [[0.5, -0.5], [1, 0]]
+    assert obs["rest"]["0"].tolist() == [1, 3]
+    assert obs["rest"]["1"]["gear"].tolist() == [[0, 1], [1, 1]]
+    other = np.empty_like(obs)
+    other[np.array([1, 0])] = obs
+    assert np.array_equal(other[np.array([True, False])], obs[1:])
+    obs.copy()["speed"][:] = 9
+    assert obs["speed"].max() == 1
+
+
+def test_what_is_packed_is_not_copied_and_neither_are_plain_arrays():
+    obs = pack(NESTED, BATCH)
+    assert pack(NESTED, obs) is obs
+    plain = np.zeros((3, 2), np.float32)
+    assert pack(Box(-1, 1, (2,)), plain) is plain
+    assert unpack(Box(-1, 1, (2,)), plain) is plain
+
+
+def test_a_dict_of_values_may_be_in_any_order_and_a_single_observation_is_packed_too():
+    assert np.array_equal(pack(NESTED, dict(reversed(BATCH.items()))), pack(NESTED, BATCH))
+    one = {
+        "speed": BATCH["speed"][1],
+        "alarm": BATCH["alarm"][1],
+        "eye": BATCH["eye"][1],
+        "rest": (3, {"gear": BATCH["rest"][1]["gear"][1]}),
+    }
+    assert pack(NESTED, one) == pack(NESTED, BATCH)[1]
+
+
+def test_the_types_are_those_of_the_space():
+    dtype = obs_dtype(NESTED)
+    assert dtype["speed"].base == np.float64
+    assert dtype["alarm"].base == np.int8
+    assert dtype["rest"]["0"] == np.int64
+    assert (obs_dtype(Discrete(3)), obs_shape(Discrete(3))) == (np.int64, ())
+    assert (obs_dtype(pixels(4, 4)), obs_shape(pixels(4, 4))) == (np.uint8, (4, 4))
+
+
+def test_a_nested_observation_is_split_by_hand():
+    codec = obs_codec(NESTED)
+    assert (codec.size, codec.images, codec.scaled) == (2 + 2 + 3 + 4, ((2, 3, 4),), True)
+    vector, (eye,) = codec.split(to_tensor(pack(NESTED, BATCH)))
+    assert vector.dtype == torch.float32
+    assert vector.tolist() == [
+        [0.5, -0.5, 1, 0, 1, 0, 0, 1, 0, 0, 1],
+        [1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 1],
+    ]
+    assert np.array_equal(eye.numpy(), BATCH["eye"].transpose(0, 3, 1, 2))
+
+
+def test_a_tensor_of_a_structured_array_shares_its_memory():
+    obs = pack(NESTED, BATCH)
+    raw, split = to_tensor(obs), obs_codec(NESTED).split
+    assert (raw.dtype, raw.shape) == (torch.uint8, (2, obs.dtype.itemsize))
+    obs["speed"][0, 0] = 0.75
+    assert split(raw)[0][0, 0] == 0.75
+    backwards = split(to_tensor(obs[::-1]))  # not contiguous: a copy
+    assert torch.equal(backwards[0], split(raw)[0].flip(0))
+
+
+def test_one_vector_of_floats_costs_no_copy():
+    x = np.zeros((4, 2, 3), np.float32)
+    vector, images = obs_codec(Box(-1, 1, (2, 3))).split(to_tensor(x))
+    assert images == ()
+    x[1, 0, 2] = 5
+    assert vector[1].tolist() == [0, 0, 5, 0, 0, 0]
+
+
+@pytest.mark.parametrize("space", [Dict({}), Tuple(()), Dict([(1, Discrete(2))])], ids=str)
+def test_parts_need_names(space):
+    with pytest.raises(SkillweaveError, match="at least one part, each with text as its name"):
+        obs_codec(space)
+
+
+NUMBERS = [np.float16, np.float32, np.float64, np.uint8, np.int16, np.int64, np.uint16, np.bool_]
+
+
+def boxes():
+    shapes = st.lists(st.integers(1, 4), max_size=4).map(tuple)
+    return st.builds(lambda shape, dtype: Box(0, 1, shape, dtype), shapes, st.sampled_from(NUMBERS))
+
+
+leaves = st.one_of(
+    boxes(),
+    st.builds(lambda n, start: Discrete(n, start=start), st.integers(1, 4), st.integers(-2, 2)),
+    st.builds(MultiDiscrete, st.lists(st.integers(1, 3), min_size=1, max_size=3)),
+    st.builds(MultiBinary, st.integers(1, 3)),
+)
+spaces = st.recursive(
+    leaves,
+    lambda inner: st.one_of(
+        st.dictionaries(st.sampled_from("zyxabc"), inner, min_size=1, max_size=3).map(
+            lambda found: Dict(list(found.items()))
+        ),
+        st.lists(inner, min_size=1, max_size=3).map(Tuple),
+    ),
+    max_leaves=5,
+)
+
+
+@given(spaces, st.integers(1, 3), st.integers(0, 99))
+def test_packing_loses_nothing(space, n, seed):
+    space.seed(seed)
+    batched = batch_space(space, n)
+    batched.seed(seed)
+    sample = batched.sample()
+    obs = pack(space, sample)
+    assert (obs.shape, obs.dtype) == ((n, *obs_shape(space)), obs_dtype(space))
+    back = unpack(space, obs)
+    assert batched.contains(back)
+    assert np.array_equal(pack(space, back), obs)
+    for row, one in zip(iterate(batched, sample), obs, strict=True):
+        assert np.array_equal(pack(space, row), one)
+
+
+@given(spaces)
+def test_a_packed_array_has_the_parts_of_gymnasiums(space):
+    empty = create_empty_array(space, 2)
+    assert pack(space, empty).shape[0] == 2
+
+
+@given(spaces)
+def test_a_space_of_parts_survives_json(space):
+    back = space_from_json(json.loads(json.dumps(space_to_json(space), allow_nan=False)))
+    assert same_space(space, back)
+    assert back == space
+    assert obs_dtype(back) == obs_dtype(space)
+
+
+@given(spaces, st.integers(0, 99))
+def test_the_vector_is_that_of_the_parts_side_by_side(space, seed):
+    space.seed(seed)
+    obs = pack(space, space.sample())
+    vector, images = obs_codec(space).split(to_tensor(obs))
+    vectors, pictures = [], []
+
+    def walk(part, value):
+        if isinstance(part, Dict):
+            for name, inner in part.spaces.items():
+                walk(inner, value[name])
+        elif isinstance(part, Tuple):
+            for i, inner in enumerate(part.spaces):
+                walk(inner, value[str(i)])
+        else:
+            some, found = obs_codec(part).split(to_tensor(np.asarray(value)))
+            vectors.append(some)
+            pictures.extend(found)
+
+    walk(space, obs)
+    assert torch.equal(vector, torch.cat(vectors))
+    assert len(images) == len(pictures)
+    assert all(torch.equal(a, b) for a, b in zip(images, pictures, strict=True))
