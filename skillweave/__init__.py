@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3
-    from skillweave.api import Hierarchy, Run
+    from skillweave.api import Hierarchy, Run, train_agent
     from skillweave.envs.make import EnvSpec
     from skillweave.hierarchy.options import OptionsEnv
     from skillweave.networks.config import CNN, RNN, Network
@@ -43,6 +43,7 @@ _HOME = {
     "from_sb3": "skills",
     "from_torch": "skills",
     "register_encoder": "networks.encoders",
+    "train_agent": "api",
 }
 
 __all__ = [
@@ -70,6 +71,7 @@ __all__ = [
     "from_sb3",
     "from_torch",
     "register_encoder",
+    "train_agent",
 ]
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave import recipes
+from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -124,6 +126,35 @@ class Hierarchy(Declaration):
         self.greedy_skills = run.manifest["greedy_skills"]
 
 
+class Task(Skill):
+    """The environment's own reward and ends."""
+
+
+def train_agent(
+    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
+    algorithm: AlgorithmConfig,
+    steps: int,
+    run_dir: str | Path,
+    *,
+    seed: int = 0,
+    quiet: bool = False,
+    track: Sequence[str] = (),
+) -> Run:
+    """Train one plain agent on an environment's own reward; the run is like any other.
+
+    Args:
+        env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
+        algorithm: its settings, ``SAC()`` for example.
+        steps: training budget in environment steps.
+        run_dir, seed, quiet, track: as in ``Hierarchy.train``.
+
+    Raises:
+        SkillweaveError: the algorithm cannot act in the environment; the message says which can.
+    """
+    hierarchy = Hierarchy(env, [Task()], algorithm=algorithm, flat_steps=steps)
+    return hierarchy.train(run_dir, seed=seed, flat=True, quiet=quiet, track=track)
+
+
 class Run:
     """A trained policy with its hierarchy: evaluate it, watch it, save it, use it as a skill."""
 
@@ -208,4 +239,4 @@ class Run:
         return self.policy.skills.policies[names.index(skill)]
 
 
-__all__ = ["Hierarchy", "Run"]
+__all__ = ["Hierarchy", "Run", "train_agent"]

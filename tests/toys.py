@@ -8,7 +8,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.seeding import Seeds
+from skillweave.spaces import pack
+from skillweave.training.off_policy import train_off_policy
+from skillweave.training.on_policy import train_on_policy
 from skillweave.types import Array, VecStep
 
 
@@ -241,6 +248,114 @@ class Broken(Identity):
         return next_obs, reward * np.nan, *rest
 
 
+_BITS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+
+
+def _lit(bits: Array) -> Array:
+    """Pictures (n, 6, 8) with the left half lit by the first bit, the right by the second."""
+    return np.repeat(bits[:, None, :], 6, 1).repeat(4, 2).astype(np.uint8) * 255
+
+
+SHOWS: dict[str, gym.Space[Any]] = {
+    "vector": gym.spaces.Box(-1.0, 1.0, (2,), np.float32),
+    "discrete": gym.spaces.Discrete(4, start=-2),
+    "multi-discrete": gym.spaces.MultiDiscrete([2, 3]),
+    "multi-binary": gym.spaces.MultiBinary(2),
+    "image, channels last": gym.spaces.Box(0, 255, (6, 8, 1), np.uint8),
+    "image, channels first": gym.spaces.Box(0, 255, (1, 6, 8), np.uint8),
+    "dict": gym.spaces.Dict(
+        picture=gym.spaces.Box(0, 255, (6, 8, 1), np.uint8),
+        number=gym.spaces.Box(-1.0, 1.0, (1,), np.float32),
+    ),
+    "tuple": gym.spaces.Tuple(
+        (gym.spaces.Discrete(2), gym.spaces.Box(-1.0, 1.0, (1,), np.float32))
+    ),
+}
+"""Kinds of observation that ``Echo`` can show its state in."""
+
+ASKS: dict[str, tuple[gym.Space[Any], Array]] = {
+    "Discrete": (gym.spaces.Discrete(4, start=3), np.array([4, 6, 3, 5])),
+    "MultiDiscrete": (gym.spaces.MultiDiscrete([3, 2]), np.array([[0, 0], [1, 1], [2, 0], [0, 1]])),
+    "MultiBinary": (gym.spaces.MultiBinary(2), _BITS),
+    "Box": (
+        gym.spaces.Box(np.float32([-3, 10]), np.float32([1, 10.5]), dtype=np.float32),
+        np.float32([[-2, 10.375], [0, 10.125], [0, 10.375], [-2, 10.125]]),
+    ),
+}
+"""Kinds of action that ``Echo`` can ask for, and the one it asks for in each state."""
+
+
+class Echo(Toy):
+    """Shows one of four states and pays for the action that belongs to it.
+
+    Choices: the share of them that are right. A Box: minus the mean squared distance, in units of
+    half its ranges. Columns have streams of their own, so that a stack sees what singles see.
+    """
+
+    def __init__(self, columns: int | range, shows: str = "vector", asks: str = "Discrete") -> None:
+        self.columns = columns if isinstance(columns, range) else range(columns)
+        super().__init__(len(self.columns))
+        self.shows, self.observation_space = shows, SHOWS[shows]
+        self.action_space, self.wanted = ASKS[asks]
+        self.state = np.zeros(self.num_envs, np.int64)
+
+    def show(self, state: Array) -> Array:
+        """States (n,) as observations."""
+        bits = _BITS[state]
+        signs = 2.0 * bits.astype(np.float32) - 1.0
+        picture = _lit(bits)
+        batched = {
+            "vector": signs,
+            "discrete": state - 2,
+            "multi-discrete": bits * [1, 2],
+            "multi-binary": bits.astype(np.int8),
+            "image, channels last": picture[..., None],
+            "image, channels first": picture[:, None],
+            "dict": {"number": signs[:, 1:], "picture": _lit(bits * [1, 0])[..., None]},
+            "tuple": (bits[:, 0], signs[:, 1:]),
+        }[self.shows]
+        return pack(self.observation_space, batched)
+
+    def error(self, state: Array, action: Array) -> Array:
+        """How wrong actions are, (n,)."""
+        if not isinstance(self.action_space, gym.spaces.Box):
+            return (action != self.wanted[state]).reshape(len(state), -1).mean(1)
+        half = (self.action_space.high - self.action_space.low) / 2
+        return np.square((action - self.wanted[state]) / half).mean(1)
+
+    def reset(self, seeds: Seeds) -> Array:
+        self.rngs = [(seeds / c).numpy() for c in self.columns]
+        return super().reset(seeds)
+
+    def first(self, rows: Array) -> Array:
+        self.state[rows] = [self.rngs[i].integers(4) for i in rows]
+        return self.show(self.state[rows])
+
+    def play(self, action: Array) -> Any:
+        assert all(self.action_space.contains(a) for a in action)
+        reward = -self.error(self.state, action)
+        truncated = (self.t == 3) & (np.array(self.columns) % 2 == 0)
+        everywhere = np.arange(self.num_envs)
+        return self.first(everywhere), reward, self.t == 4, truncated, self.ones
+
+
+class Recall(Toy):
+    """A sign is shown at the first of four steps; at the last, naming it pays 1."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def first(self, rows: Array) -> Array:
+        if len(rows) == self.num_envs:
+            self.sign = np.zeros(self.num_envs, np.int64)
+        self.sign[rows] = self.rng.integers(2, size=len(rows))
+        return np.stack([2.0 * self.sign[rows] - 1.0, 0.0 * rows], 1).astype(np.float32)
+
+    def play(self, action: Array) -> Any:
+        last = self.t == 4
+        after = np.stack([0.0 * self.t, self.t == 3], 1).astype(np.float32)
+        return after, last & (action == self.sign), last, self.never, self.ones
+
+
 @dataclass(frozen=True)
 class SeedsOfMember:
     """A seed tree in which the only member, 0, has the streams of member ``member``."""
@@ -261,3 +376,19 @@ class _Renumbered:
     def __truediv__(self, member: int) -> Seeds:
         assert member == 0
         return self.node / self.member
+
+
+def learn(
+    config: AlgorithmConfig,
+    env: Toy,
+    budget: int,
+    seeds: Any = 0,
+    members: Any = (0,),
+    **where: Any,
+) -> tuple[Any, Any]:
+    """Any algorithm, trained in an environment: it and its state, whose members have seeds."""
+    algorithm: Algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    seeds = Seeds(seeds) if isinstance(seeds, int) else seeds
+    state = where.pop("state", None) or algorithm.init([Seeds(m) for m in members])
+    train: Any = train_on_policy if isinstance(algorithm, PPOAlgorithm) else train_off_policy
+    return algorithm, train(algorithm, env, state, seeds, budget, **where)

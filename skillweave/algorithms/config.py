@@ -132,6 +132,21 @@ def check_spaces(config: AlgorithmConfig, action_space: gym.Space[Any], where: s
         )
 
 
+def named_config(name: str, where: str) -> AlgorithmConfig:
+    """An algorithm's or a preset's default settings by name, in any case.
+
+    Raises:
+        SkillweaveError: there is none of this name; the message, which begins with ``where``,
+            lists them.
+    """
+    presets: dict[str, Any] = {**_KINDS, "Rainbow": DQN.rainbow, "DDPG": TD3.ddpg}
+    for known, make in presets.items():
+        if known.lower() == name.lower():
+            config: AlgorithmConfig = make()
+            return config
+    raise SkillweaveError(f"{where}: no algorithm {name!r}; there are: {', '.join(presets)}")
+
+
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
     """Settings as plain JSON, with the algorithm's name under ``algorithm``."""
     return {"algorithm": type(config).__name__, **asdict(config)}

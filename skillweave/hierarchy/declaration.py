@@ -46,6 +46,8 @@ class Declaration:
     """Training budget of the selector, in environment steps."""
     flat: AlgorithmConfig | None = None
     """Trains the flat baseline; None: as ``algorithm``."""
+    flat_steps: int | None = None
+    """Training budget of the flat baseline; None: as many steps as the whole hierarchy takes."""
     greedy_skills: bool = True
     """Skills act greedily under the selector; else they sample."""
     reflexes_in_training: bool = True
@@ -64,9 +66,9 @@ class Declaration:
                 )
         for name in ("algorithm", "selector", "flat"):
             _check_algorithm(getattr(self, name), f"{name}", optional=name == "flat")
-        for name in ("skill_steps", "selector_steps", "cut_every", "call_steps"):
+        for name in ("skill_steps", "selector_steps", "flat_steps", "cut_every", "call_steps"):
             value = getattr(self, name)
-            none = name == "call_steps"
+            none = name in ("call_steps", "flat_steps")
             if (value is None and none) or (type(value) is int and value >= 1):
                 continue
             what = "at least 1, or None" if none else "a whole number, at least 1"
@@ -154,6 +156,8 @@ class Declaration:
                 skill.steps = max(1, round(skill.steps * factor))
         self.skill_steps = max(1, round(self.skill_steps * factor))
         self.selector_steps = max(1, round(self.selector_steps * factor))
+        if self.flat_steps is not None:
+            self.flat_steps = max(1, round(self.flat_steps * factor))
 
     def skill_set(self, policies: Sequence[Policy]) -> SkillSet:
         """The skills with their policies, ready to be called."""

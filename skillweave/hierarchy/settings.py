@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
+from skillweave.algorithms.config import named_config
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.types import SkillweaveError
 
@@ -17,6 +18,7 @@ PLAIN = (
     "call_steps",
     "skill_steps",
     "selector_steps",
+    "flat_steps",
     "greedy_skills",
     "reflexes_in_training",
     "cut_every",
@@ -27,10 +29,13 @@ CONFIGS = ("algorithm", "selector", "flat")
 def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
     """Change a declaration in place by ``name=value`` strings; their order does not matter.
 
+    The name of an agent alone takes an algorithm: ``selector=DQN``, ``skills.center=SAC``.
+
     Raises:
         SkillweaveError: no such setting (with close matches), or a value out of range.
     """
     configs: dict[tuple[str, ...], dict[str, str]] = {}
+    kinds: dict[tuple[str, ...], str] = {}
     for setting in settings:
         name, sign, text = (part.strip() for part in setting.partition("="))
         if not sign:
@@ -41,19 +46,26 @@ def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
             setattr(declaration, head, _parse(name, text, hint))
         elif head == "skills" and len(rest) == 2 and rest[1] == "steps":
             declaration.skill(rest[0]).steps = _parse(name, text, int)
+        elif head == "skills" and len(rest) == 1:
+            kinds[head, rest[0]] = text
         elif head == "skills" and len(rest) >= 2:
             configs.setdefault((head, rest[0]), {})[name] = text
-        elif head in CONFIGS and rest:
+        elif head in CONFIGS and not rest:
+            kinds[(head,)] = text
+        elif head in CONFIGS:
             configs.setdefault((head,), {})[name] = text
         else:
             known = [*list_settings(declaration), *(f"{c}." for c in CONFIGS)]
             raise _unknown(name, known)
-    for owner, changes in configs.items():
+    for owner in kinds | configs:
         # All of a config's changes at once: some fit only together (num_envs, batch_size).
+        changes = configs.get(owner, {})
         by_path = {tuple(n.split(".")[len(owner) :]): (n, text) for n, text in changes.items()}
         target: Any = declaration.skill(owner[1]) if owner[0] == "skills" else declaration
         field = "algorithm" if owner[0] == "skills" else owner[0]
         config = getattr(target, field) or declaration.algorithm
+        if owner in kinds:
+            config = named_config(kinds[owner], f"--set {'.'.join(owner)}={kinds[owner]}")
         setattr(target, field, _replaced(config, by_path))
     declaration.__post_init__()
 
@@ -86,6 +98,9 @@ def _replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> A
         inner = values.get(field, getattr(config, field))
         if inner is None and field == "critic":
             inner = values.get("network", getattr(config, "network", None))  # what it stands for
+        if inner is None:
+            parts: list[Any] = [t for t in typing.get_args(hints[field]) if is_dataclass(t)]
+            inner = parts[0]() if parts else None
         if not is_dataclass(inner):
             name = next(iter(inner_changes.values()))[0]
             raise SkillweaveError(f"--set {name}: {field} has no parts")

@@ -63,9 +63,10 @@ def phases_of(declaration: Declaration) -> list[Phase]:
 
 
 def flat_phase(declaration: Declaration) -> Phase:
-    """One agent on the task itself, on as many steps as the whole hierarchy takes."""
+    """One agent on the task itself: the baseline, or all that is asked for."""
     config = declaration.flat or declaration.algorithm
-    return Phase("flat", config, declaration.total_steps, _skill_env(declaration, None))
+    budget = declaration.flat_steps or declaration.total_steps
+    return Phase("flat", config, budget, _skill_env(declaration, None))
 
 
 def train(

@@ -178,7 +178,8 @@ class _Loop:
         if algorithm.config.normalize_rewards:
             each = self.env.num_envs // self.members
             gamma = np.repeat(self.state.gamma.numpy(), each)
-            self._returns = self._returns * gamma**step.steps + step.reward
+            now = self._returns * gamma**step.steps + step.reward
+            self._returns = now.astype(np.float32)  # a power of integers has 64 bits
             returns = torch.from_numpy(self._returns).view(self.members, each)
             algorithm.see_returns(self.state, returns)
             self._returns[step.ended] = 0.0

@@ -8,13 +8,13 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, Text
 
-from skillweave import PPO, EnvSpec, Hierarchy, Reflex, Skill, SkillweaveError, recipes
+from skillweave import DQN, PPO, SAC, EnvSpec, Hierarchy, Reflex, Skill, SkillweaveError, recipes
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Run
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import apply_settings, list_settings
 from skillweave.hierarchy.weights import read_weights, write_weights
-from skillweave.networks.config import Network
+from skillweave.networks.config import CNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
@@ -262,8 +262,10 @@ WRONG_SETTINGS = {
     "skills.center.learning_rat=1": "learning_rat'.*did you mean.*skills.center.learning_rate",
     "selector.network.hiden=3": "hiden.*did you mean.*selector.network.hidden",
     "skills.centre.gamma=1": "'centre'.*center, lean",
-    "skills.center=4": "no setting 'skills.center'",
-    "selector=4": "no setting 'selector'",
+    "skills.center=4": "skills.center=4: no algorithm '4'; there are: PPO, DQN, TD3, SAC",
+    "selector=4": "selector=4: no algorithm '4'; there are: PPO, DQN, TD3, SAC, Rainbow, DDPG",
+    "skills.nobody=DQN": "no skill 'nobody'",
+    "selector.update_epoch=4": "no setting 'selector.update_epoch'.*update_epochs",
     "=4": "no setting ''",
     "selector.gamma.x=4": "gamma has no parts",
     "call_steps=soon": "call_steps=soon: expected int",
@@ -287,6 +289,19 @@ WRONG_SETTINGS = {
     "selector.batch_size=100000": "batch_size is 100000.*num_envs",
     "selector.learning_rate_schedule=kl": "target_kl",
 }
+
+
+def test_a_setting_of_an_agents_name_alone_takes_another_algorithm_then_the_rest_applies():
+    declaration = declare()
+    declaration.algorithm = PPO(num_envs=4, n_steps=8, batch_size=32)
+    settings = ["selector.gamma=0.9", "selector=dqn", "selector.network.cnn.kernels=(3,)"]
+    settings += ["selector.network.cnn.channels=(4,)", "selector.network.cnn.strides=(1,)"]
+    apply_settings(declaration, [*settings, "skills.center=Rainbow", "algorithm=SAC"])
+    cnn = CNN("plain", (4,), (3,), (1,))
+    expected = DQN(gamma=0.9, network=Network((256, 256), "relu", cnn=cnn))
+    assert declaration.selector == expected
+    assert declaration.skill("center").algorithm == DQN.rainbow()
+    assert declaration.algorithm == SAC()
 
 
 @pytest.mark.parametrize("setting", WRONG_SETTINGS)
