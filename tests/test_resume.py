@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import shutil
@@ -14,12 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from toys import Echo
 
-from skillweave import Hierarchy, recipes
+from skillweave import DQN, SAC, TD3, Hierarchy, Network, recipes
 from skillweave.cli import main
 from skillweave.hierarchy import training
 from skillweave.hierarchy.settings import apply_settings
 from skillweave.runs.directory import RunDirectory
+from skillweave.seeding import Seeds
+from skillweave.training.phase import Phase, train_phase
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
 
@@ -347,6 +351,107 @@ def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_the
     assert main(["resume", str(run.path), "--quiet", "--evaluate", "0"]) == 1
     assert "--recipe" in capsys.readouterr().err
     assert not RunDirectory.open(run.path).finished
+
+
+# What learns from a replay buffer
+
+
+REPLAY: dict[str, Any] = {
+    "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 200, "update_ratio": 0.25,
+    "network": Network((8,), "relu"), "normalize_rewards": True,
+}  # fmt: skip
+REPLAYERS = {
+    "dqn": (DQN(**REPLAY), "dict", "Discrete"),
+    "rainbow": (DQN.rainbow(**REPLAY), "discrete", "Discrete"),
+    "td3": (TD3(**REPLAY, normalize_obs=True), "vector", "Box"),
+    "sac": (SAC(**REPLAY, normalize_obs=True), "tuple", "Box"),
+    "sac of choices": (SAC(**REPLAY), "image, channels first", "Discrete"),
+}
+
+
+def phase_of(name: str, save_buffer: bool = True) -> Phase:
+    config, shows, asks = REPLAYERS[name]
+    config = dataclasses.replace(config, save_buffer=save_buffer)
+    return Phase("echo", config, 1300, lambda _: Echo(4, shows, asks))
+
+
+def new_run(path: Path, phase: Phase) -> RunDirectory:
+    manifest = {
+        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 500, "skills": [],
+        "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "phases": [phase.entry()],
+    }  # fmt: skip
+    return RunDirectory.create(path, manifest)
+
+
+def train_echo(run: RunDirectory, phase: Phase, *listeners: Any) -> None:
+    try:
+        train_phase(phase, run, Seeds(3) / phase.name, listeners, 250)
+    finally:
+        run.close()
+
+
+@pytest.mark.parametrize("name", REPLAYERS)
+def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
+    tmp_path: Path, name: str
+) -> None:
+    phase = phase_of(name)
+    train_echo(new_run(tmp_path / "whole", phase), phase)
+    run = new_run(tmp_path / "run", phase)
+    for stop in (3, 4):  # a tick at each cut, every 250 steps
+        with pytest.raises(Stopped):
+            train_echo(run, phase, StopAt(stop))
+        run = RunDirectory.open(run.path)
+        assert (run.path / "checkpoint.safetensors").exists()
+    train_echo(run, phase)
+    assert policies(run.path) == policies(tmp_path / "whole")
+    mine, theirs = lines(run.path), lines(tmp_path / "whole")
+    assert [r["steps"] for r in mine] == [252, 500, 752, 1000, 1252, 1300]
+    episodes = {"seconds", "return", "length"}  # means of a window that begins anew
+    for a, b in zip(mine, theirs, strict=True):
+        assert {k: a[k] for k in a.keys() - episodes} == {k: b[k] for k in b.keys() - episodes}
+
+
+@pytest.mark.parametrize("name", ["rainbow", "sac"])
+def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
+    tmp_path: Path, name: str
+) -> None:
+    phase = phase_of(name, save_buffer=False)
+    train_echo(new_run(tmp_path / "whole", phase), phase)
+    run = new_run(tmp_path / "run", phase)
+    with pytest.raises(Stopped):
+        train_echo(run, phase, StopAt(3))
+    with_buffer = new_run(tmp_path / "bigger", phase_of(name))
+    with pytest.raises(Stopped):
+        train_echo(with_buffer, phase_of(name), StopAt(3))
+    sizes = [(r.path / "checkpoint.safetensors").stat().st_size for r in (run, with_buffer)]
+    assert sizes[0] < sizes[1]
+    train_echo(RunDirectory.open(run.path), phase)
+    assert RunDirectory.open(run.path).finished
+    mine, theirs = policies(run.path), policies(tmp_path / "whole")
+    assert mine["echo.safetensors"][1] != theirs["echo.safetensors"][1]
+    assert [r["steps"] for r in lines(run.path)] == [252, 500, 752, 1000, 1252, 1300]
+
+
+def test_a_hierarchy_that_learns_from_replay_ends_as_if_it_had_not_been_stopped(
+    tmp_path: Path,
+) -> None:
+    text = RECIPE.replace(', engine="ENGINE"', "").replace("Left.algorithm = moving\n", "")
+    text = text.replace("import Network, PPO,", "import DQN, SAC, Network, PPO,")
+    replay = "num_envs=4, learning_starts=40, buffer_size=300, batch_size=8, update_ratio=0.25"
+    replay += ", network=Network((8,))"
+    text = text.replace("    algorithm=small,", f"    algorithm=DQN.rainbow({replay}),")
+    text = text.replace("    selector=small,", f"    selector=SAC({replay}),")
+    (tmp_path / "replay.py").write_text(text)
+    recipe = str(tmp_path / "replay.py")
+    recipes.load(recipe).train(tmp_path / "whole", seed=3, quiet=True)
+    run = stopped_run(recipes.load(recipe), tmp_path / "run", 13)
+    assert [run.phase(n)["status"] for n in ("left", "balance", "selector")] == [
+        "done", "done", "training",
+    ]  # fmt: skip
+    recipes.load(recipe).resume(run.path, quiet=True)
+    assert policies(run.path) == policies(tmp_path / "whole")
+    headers = [header["__metadata__"]["skillweave"] for header, _ in policies(run.path).values()]
+    assert [json.loads(h)["algorithm"]["algorithm"] for h in headers] == ["DQN", "DQN", "SAC"]
 
 
 # Interrupted from outside

@@ -18,7 +18,10 @@ from skillweave.algorithms.config_off_policy import (
     OffPolicy,
     check,
     check_networks,
+    number,
     one_of,
+    positive,
+    whole,
 )
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.types import SkillweaveError
@@ -83,18 +86,13 @@ class PPO:
 
     def __post_init__(self) -> None:
         check_networks(self)
-        for name in ("num_envs", "n_steps", "batch_size", "update_epochs", "threads"):
-            check(self, name, getattr(self, name) >= 1, "at least 1")
-        for name in ("gamma", "gae_lambda"):
-            check(self, name, 0.0 <= getattr(self, name) <= 1.0, "between 0 and 1")
-        for name in ("learning_rate", "clip_coef", "max_grad_norm", "action_std_init", "adam_eps"):
-            check(self, name, 0.0 < getattr(self, name) < float("inf"), "positive and finite")
-        for name in ("ent_coef", "vf_coef"):
-            check(self, name, 0.0 <= getattr(self, name) < float("inf"), "at least 0 and finite")
-        final = self.ent_coef_final
-        check(self, "ent_coef_final", final is None or 0.0 <= final < float("inf"), "at least 0")
-        for name in ("target_kl", "clip_value"):
-            check(self, name, getattr(self, name) is None or getattr(self, name) > 0, "positive")
+        whole(self, "num_envs", "n_steps", "batch_size", "update_epochs", "threads")
+        number(self, "gamma", "gae_lambda", high=1.0)
+        positive(self, "learning_rate", "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")
+        number(self, "ent_coef", "vf_coef")
+        if self.ent_coef_final is not None:
+            number(self, "ent_coef_final")
+        positive(self, *(k for k in ("target_kl", "clip_value") if getattr(self, k) is not None))
         one_of(self, "action_std", ("parameter", "state"))
         if self.learning_rate_schedule == "kl":
             check(self, "target_kl", self.target_kl is not None, "set for the schedule 'kl'")

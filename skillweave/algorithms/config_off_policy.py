@@ -12,6 +12,7 @@ from skillweave.networks.config import Network
 from skillweave.types import SkillweaveError
 
 Schedule = Literal["constant", "linear"]
+INFINITY = float("inf")
 
 
 def check(config: object, field_name: str, ok: bool, asked: str) -> None:
@@ -23,6 +24,33 @@ def check(config: object, field_name: str, ok: bool, asked: str) -> None:
         )
 
 
+def whole(config: object, *names: str) -> None:
+    """Raise where a field is no whole number, or less than 1."""
+    for name in names:
+        value = getattr(config, name)
+        check(config, name, type(value) is int, "a whole number")
+        check(config, name, value >= 1, "at least 1")
+
+
+def number(config: object, *names: str, low: float = 0.0, high: float = INFINITY) -> None:
+    """Raise where a field is no finite number between ``low`` and ``high``."""
+    asked = "at least 0 and finite" if high == INFINITY else f"between {low:g} and {high:g}"
+    if low == -INFINITY:
+        asked = "a finite number"
+    for name in names:
+        value = getattr(config, name)
+        ok = type(value) in (int, float) and abs(value) < INFINITY
+        check(config, name, ok and low <= value <= high, asked)
+
+
+def positive(config: object, *names: str) -> None:
+    """Raise where a field is no finite number above 0."""
+    for name in names:
+        value = getattr(config, name)
+        ok = type(value) in (int, float) and 0.0 < value < INFINITY
+        check(config, name, ok, "positive and finite")
+
+
 def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
     """Raise where a field is none of the known words."""
     check(config, field_name, getattr(config, field_name) in known, f"one of {', '.join(known)}")
@@ -31,8 +59,10 @@ def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
 def check_networks(config: Any) -> None:
     """Raise where ``network`` or ``critic`` is no architecture."""
     check(config, "network", isinstance(config.network, Network), "a Network()")
-    none_or_network = isinstance(getattr(config, "critic", None), Network | None)
-    check(config, "critic", none_or_network, "a Network() or None")
+    critic = getattr(config, "critic", None)
+    check(config, "critic", isinstance(critic, Network | None), "a Network() or None")
+    if critic is not None:
+        check(config, "critic", critic.rnn is None, "without rnn")
 
 
 @dataclass(frozen=True)
@@ -85,13 +115,10 @@ class OffPolicy:
     def __post_init__(self) -> None:
         check_networks(self)
         check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
-        for name in ("num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads"):
-            check(self, name, getattr(self, name) >= 1, "at least 1")
-        for name in ("gamma", "tau", "priority_alpha", "priority_beta"):
-            check(self, name, 0.0 <= getattr(self, name) <= 1.0, "between 0 and 1")
-        for name in ("learning_rate", "max_grad_norm", "adam_eps", "update_ratio"):
-            check(self, name, 0.0 < getattr(self, name) < float("inf"), "positive and finite")
-        check(self, "learning_starts", self.learning_starts >= 0, "at least 0")
+        whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
+        number(self, "gamma", "tau", "priority_alpha", "priority_beta", high=1.0)
+        positive(self, "learning_rate", "max_grad_norm", "adam_eps", "update_ratio")
+        number(self, "learning_starts")
         one_of(self, "learning_rate_schedule", ("constant", "linear"))
         least = self.num_envs * (self.n_step + 1)
         check(
@@ -133,10 +160,11 @@ class DQN(OffPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"):
-            check(self, name, 0.0 <= getattr(self, name) <= 1.0, "between 0 and 1")
-        check(self, "target_update_interval", self.target_update_interval >= 1, "at least 1")
+        exploration = "exploration_fraction", "exploration_initial_eps", "exploration_final_eps"
+        number(self, *exploration, high=1.0)
+        whole(self, "target_update_interval", "n_atoms")
         check(self, "n_atoms", self.n_atoms >= 2, "at least 2")
+        number(self, "v_min", "v_max", low=-INFINITY)
         check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
         one_of(self, "loss", ("huber", "mse"))
 
@@ -169,9 +197,8 @@ class TD3(OffPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("exploration_noise", "target_noise", "target_noise_clip"):
-            check(self, name, 0.0 <= getattr(self, name) < float("inf"), "at least 0 and finite")
-        check(self, "policy_delay", self.policy_delay >= 1, "at least 1")
+        number(self, "exploration_noise", "target_noise", "target_noise_clip")
+        whole(self, "policy_delay")
 
     @classmethod
     def ddpg(cls, **settings: Any) -> TD3:
@@ -196,5 +223,7 @@ class SAC(OffPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "ent_coef", 0.0 < self.ent_coef < float("inf"), "positive and finite")
-        check(self, "policy_delay", self.policy_delay >= 1, "at least 1")
+        positive(self, "ent_coef")
+        whole(self, "policy_delay")
+        if self.target_entropy is not None:
+            number(self, "target_entropy", low=-INFINITY)

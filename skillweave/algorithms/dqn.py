@@ -132,8 +132,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             drawn = [torch.randn(3, size, generator=g) for g in generators]
             noises = list(torch.stack(drawn, dim=1))
         loss, error, q = self.loss(leaves, state, sample, noises)
-        grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
-        grad = self.layout.gather(grads, len(loss))
+        grad = self.layout.gradient(loss, leaves)
         norm = clip_grad_norm_(grad, state.max_grad_norm)
         rate = self.rate(state, progress)
         moments = state.mu, state.nu, state.count

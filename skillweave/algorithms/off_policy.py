@@ -107,7 +107,8 @@ class Critics:
         count = next(iter(views.values())).shape[0] // members
 
         def each(x: Tensor) -> Tensor:
-            return x if count == 1 else x.repeat_interleave(count, 0)
+            # Without a copy where P = 1: expanded, not repeated.
+            return x[:, None].expand(-1, count, *x.shape[1:]).reshape(-1, *x.shape[1:])
 
         extra = None if action is None else each(action)
         out = self.net(views, {k: each(v) for k, v in inputs.items()}, extra)
@@ -119,9 +120,7 @@ class Critics:
 
     def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor, eps: float) -> Tensor:
         """One gradient step on ``state.critic``; the gradient's norm before clipping, (P,)."""
-        grads = torch.autograd.grad(loss.sum(), list(leaves.values()))
-        members = len(state.critic)
-        grad = self.layout.gather(grads, members * self.count).view(members, -1)
+        grad = self.layout.gradient(loss, leaves).view(len(state.critic), -1)
         norm = clip_grad_norm_(grad, state.max_grad_norm)
         flat = [x.flatten(1) for x in (state.critic, state.critic_mu, state.critic_nu)]
         adam_(flat[0], grad, flat[1], flat[2], state.critic_count, rate, eps=eps)

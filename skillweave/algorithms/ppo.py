@@ -171,8 +171,7 @@ class PPOAlgorithm(Algorithm):
         sums = torch.zeros(len(REPORT), len(seeds))
         for batch in minibatches(data, seeds, cfg.update_epochs, cfg.batch_size):
             loss, report = self.loss(leaves, state, batch, ent_coef)
-            grads = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
-            grad = self.layout.gather(grads, len(seeds))
+            grad = self.layout.gradient(loss, leaves)
             report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
             counted = counted + active
             sums.addcmul_(torch.stack([report[k] for k in REPORT]), active.float())

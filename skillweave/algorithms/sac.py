@@ -143,8 +143,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
             policy_loss, entropy = self.policy_loss(
                 policy, state, sample.obs_mask, inputs, alpha, generators
             )
-            grads = torch.autograd.grad(policy_loss.sum(), list(policy.values()))
-            grad = self.layout.gather(grads, len(rate))
+            grad = self.layout.gradient(policy_loss, policy)
             clip_grad_norm_(grad, state.max_grad_norm)
             adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=eps)
             state.policy_loss, state.entropy = policy_loss.detach(), entropy
@@ -180,7 +179,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
             slow = self.critics.views(state.critic_target)
             head = self.net(self.layout.views(state.params), following)
             if self.codec.discrete:
-                log_p = mask_logits(head, sample.mask).log_softmax(-1)
+                log_p = _log_p(head, sample.mask)
                 q = self.critics(slow, following).amin(1)
                 value = (log_p.exp() * (q - alpha[..., None] * log_p)).sum(-1)
             else:
@@ -210,7 +209,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         """``E[α·log π − min Q]`` (eq. 7) and the policy's entropy, detached; each (P,)."""
         head, critics = self.net(views, inputs), self.critics.views(state.critic)
         if self.codec.discrete:
-            log_p = mask_logits(head, mask).log_softmax(-1)
+            log_p = _log_p(head, mask)
             p = log_p.exp()
             with torch.no_grad():
                 q = self.critics(critics, inputs).amin(1)
@@ -228,3 +227,8 @@ class SACAlgorithm(OffPolicyAlgorithm):
         u = torch.addcmul(mean, log_std.exp(), z)
         log_prob = -0.5 * z.square() - log_std - _HALF_LOG_TWO_PI - tanh_log_det(u)
         return u.tanh(), log_prob.sum(-1)
+
+
+def _log_p(logits: Tensor, mask: Tensor | None) -> Tensor:
+    """Log-probabilities; of forbidden choices a number whose exp is 0, but times α is finite."""
+    return mask_logits(logits, mask).log_softmax(-1).clamp_min(-200.0)

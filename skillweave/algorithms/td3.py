@@ -133,8 +133,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
         if int(state.critic_count[0]) % self.config.policy_delay == 0:
             policy = self.layout.leaves(state.params)
             policy_loss = self.policy_loss(policy, state, inputs)
-            grads = torch.autograd.grad(policy_loss.sum(), list(policy.values()))
-            grad = self.layout.gather(grads, len(rate))
+            grad = self.layout.gradient(policy_loss, policy)
             clip_grad_norm_(grad, state.max_grad_norm)
             adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=eps)
             state.target.lerp_(state.params, state.tau[:, None])

@@ -51,8 +51,9 @@ class ReplayBuffer:
         alpha: float = 0.6,
     ) -> None:
         if capacity < num_envs:
-            least = f"it must be at least num_envs, {num_envs}"
-            raise SkillweaveError(f"buffer_size is {capacity}; {least}")
+            raise SkillweaveError(
+                f"buffer_size is {capacity}; it must be at least num_envs, {num_envs}"
+            )
         kind = np.dtype(action_dtype)
         if mask_size is not None and kind.kind in "iu":
             kind = np.dtype(next(k for k in INTEGERS if mask_size - 1 <= np.iinfo(k).max))
@@ -61,21 +62,19 @@ class ReplayBuffer:
             "obs": (shape, item), "action": (action_shape, kind),
             "reward": ((), np.float32), "end": ((), np.uint8), "side": ((), np.int32),
         }  # fmt: skip
-        each = sum(int(np.prod(s)) * np.dtype(d).itemsize for s, d in columns.values())
-        each += 4 * prioritized * (members if shared else 1)
+        each = 4 * prioritized * (members if shared else 1)
+        each += sum(int(np.prod(s)) * np.dtype(d).itemsize for s, d in columns.values())
         _check_memory(capacity, each, f"{shape} {item}")
         self._num_envs, self._n_step, self._mask_size = num_envs, n_step, mask_size or 0
-        self._rows = capacity // num_envs + 1
+        self._count, self._rows = 0, capacity // num_envs + 1  # rows ever added, and held
         self._slots = self._rows * num_envs
-        self._count = 0  # rows ever added
         # Columns that a member draws from, and the first of them.
         self._width = num_envs if shared else num_envs // members
         self._offset = np.arange(members)[:, None] * (0 if shared else self._width)
-        # By slot; "steps" comes with the first call that does not last 1 step, and "mask",
-        # packed to bits, with the first mask.
+        # By slot; "steps" comes with the first call not of 1 step, "mask" (bits) with a mask.
         self._data = {k: np.zeros((self._slots, *s), d) for k, (s, d) in columns.items()}
-        # Side rings of true successors, their lengths powers of two. "side" says which an ended
-        # transition's is, modulo 2^32; in use are those from _side_first to before _side_last.
+        # Side rings of true successors, their lengths powers of two, in use from _side_first to
+        # before _side_last; "side" says which is an ended transition's, modulo 2^32.
         self._ends = {"obs": np.zeros((64, *shape), item)}
         self._side_first = self._side_last = 0
         places = self._rows * self._width
@@ -128,8 +127,7 @@ class ReplayBuffer:
         self, batch: int, gamma: Tensor, rngs: Sequence[np.random.Generator], beta: float = 1.0
     ) -> Sample:
         """``batch`` transitions for each member, with its γ (P,) and its own generator."""
-        if not self._count:
-            raise SkillweaveError("the replay buffer is empty: add transitions before sampling")
+        assert self._count, "sample() before add()"
         index, weight = self._draw(batch, rngs, beta)
         data, n = self._data, self._num_envs
         first = slot = index % self._slots
@@ -185,6 +183,11 @@ class ReplayBuffer:
             to_tensor(array).copy_(state[name])
         if self._priorities is not None:
             self._priorities.load(state)
+
+    @property
+    def capacity(self) -> int:
+        """Transitions that it holds when full, over all columns."""
+        return (self._rows - 1) * self._num_envs
 
     @property
     def _filled(self) -> int:
@@ -277,7 +280,6 @@ def _packed(mask: Array | None) -> Array:
 
 
 def _check_memory(capacity: int, each: int, what: str) -> None:
-    """Raise if ``capacity`` transitions of ``each`` bytes are more than the free memory."""
     free = _free_memory()
     if free is not None and capacity * each > free:
         raise SkillweaveError(
@@ -290,8 +292,8 @@ def _check_memory(capacity: int, each: int, what: str) -> None:
 def _free_memory() -> int | None:
     """Bytes that the machine can still give at most, or None where it does not say."""
     meminfo = Path("/proc/meminfo")
-    found = re.search(r"MemAvailable: *(\d+) kB", meminfo.read_text() if meminfo.exists() else "")
-    if found:
+    text = meminfo.read_text() if meminfo.exists() else ""
+    if found := re.search(r"MemAvailable: *(\d+) kB", text):
         return int(found[1]) * 1024
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):  # macOS: all that it has
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

@@ -148,8 +148,10 @@ class QNet:
             self.shapes |= mlp_shapes(name, self._trunk.width, stream, outputs)
         self._noisy = []
         if noisy:
-            linear = [k for k, v in self.shapes.items() if k.endswith(".weight") and len(v) == 2]
-            self._noisy = [k.removesuffix(".weight") for k in linear]
+            own = mlp_shapes("q", 1, self._trunk.network, None if dueling else 1)
+            for name, stream, outputs in self._parts:
+                own |= mlp_shapes(name, 1, stream, outputs)
+            self._noisy = [k.removesuffix(".weight") for k in own if k.endswith(".weight")]
         for layer in self._noisy:
             for kind in ("weight", "bias"):
                 self.shapes[f"{layer}.{kind}_sigma"] = self.shapes[f"{layer}.{kind}"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -50,12 +50,13 @@ class Layout:
         """Like ``views``, each a leaf that can be differentiated by."""
         return {k: v.detach().requires_grad_() for k, v in self.views(flat).items()}
 
-    def gather(self, grads: Sequence[Tensor | None], members: int) -> Tensor:
-        """Gradients by the leaves, in order, as one (P, D); what was not used has gradient 0."""
-        shapes = self.shapes.values()
+    def gradient(self, loss: Tensor, leaves: Views) -> Tensor:
+        """The gradient (P, D) of losses (P,) by ``leaves``; 0 for what they do not depend on."""
+        # Members do not mix: the gradient of the sum is each member's own.
+        found = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
         flat = [
-            torch.zeros(members, math.prod(s)) if g is None else g.flatten(1)
-            for g, s in zip(grads, shapes, strict=True)
+            torch.zeros_like(leaf).flatten(1) if g is None else g.flatten(1)
+            for g, leaf in zip(found, leaves.values(), strict=True)
         ]
         return torch.cat(flat, dim=1)
 

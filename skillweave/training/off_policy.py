@@ -36,7 +36,7 @@ def make_buffer(
     """
     cfg, codec = algorithm.config, algorithm.codec
     return ReplayBuffer(
-        cfg.buffer_size,
+        cfg.buffer_size * (1 if shared else members),
         env.num_envs,
         members,
         env.observation_space,
@@ -136,7 +136,7 @@ class _Loop:
         self._returns[:] = 0.0
         self.episodes.cut()
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def collect(self, update: int, steps: int) -> int:
         """Act ``train_freq`` times in every environment; the environment steps it took."""
         algorithm, env, cfg = self.algorithm, self.env, self.algorithm.config
@@ -168,8 +168,8 @@ class _Loop:
 
     @property
     def _round(self) -> int:
-        """Transitions in a round."""
-        return int(self.algorithm.config.train_freq) * self.env.num_envs
+        """Transitions of a member in a round."""
+        return int(self.algorithm.config.train_freq) * (self.env.num_envs // self.members)
 
     def _see(self, rows: Tensor, step: Any) -> None:
         """Keep the running scales of observations and returns."""
@@ -188,7 +188,8 @@ class _Loop:
         """Make the gradient steps that are due after this round."""
         cfg, algorithm = self.algorithm.config, self.algorithm
         due = self._owed(update + 1) - self._owed(update)
-        if not due or len(self.buffer) < min(cfg.learning_starts, cfg.buffer_size // 2):
+        own = len(self.buffer) // self.members
+        if not due or own < min(cfg.learning_starts, self.buffer.capacity // self.members // 2):
             return
         progress = min(1.0, steps / self.budget)
         beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)

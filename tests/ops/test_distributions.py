@@ -10,6 +10,7 @@ from skillweave.ops.distributions import (
     gumbel,
     mask_logits,
     normal_stats,
+    tanh_log_det,
 )
 
 
@@ -89,3 +90,13 @@ def test_masked_logits_get_no_gradient_and_the_others_a_finite_one():
 def test_no_mask_leaves_logits_alone():
     logits = torch.randn(3)
     assert mask_logits(logits, None) is logits
+
+
+def test_tanhs_log_derivative_is_exact_where_the_plain_formula_is_not():
+    x = torch.linspace(-15.0, 15.0, 301)
+    exact = torch.log1p(-x.double().tanh().square())
+    torch.testing.assert_close(tanh_log_det(x).double(), exact, rtol=1e-5, atol=2e-6)
+    assert torch.isinf(torch.log(1.0 - x.tanh().square())).any()
+    far = torch.tensor([-300.0, 300.0], requires_grad=True)
+    tanh_log_det(far).sum().backward()
+    assert far.grad.tolist() == [2.0, -2.0]  # −2·tanh

@@ -3,7 +3,13 @@ import math
 import pytest
 import torch
 
-from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
+from skillweave.ops.losses import (
+    approximate_kl,
+    categorical_projection,
+    ppo_policy_loss,
+    td_loss,
+    value_loss,
+)
 
 
 @pytest.mark.parametrize(
@@ -72,3 +78,64 @@ def test_kl_approaches_the_true_divergence_on_samples_of_the_old_policy():
     true = (old * (old / new).log()).sum().item()
     got = approximate_kl(new.log()[action][None], old.log()[action][None])
     assert got.item() == pytest.approx(true, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "loss", "gradient"),
+    [
+        (0.5, "mse", 0.125, 0.5),
+        (-3.0, "mse", 4.5, -3.0),
+        (0.5, "huber", 0.125, 0.5),
+        (-0.999, "huber", 0.5 * 0.999**2, -0.999),
+        (-3.0, "huber", 2.5, -1.0),
+    ],
+)
+def test_a_temporal_difference_costs_half_its_square_or_hubers_loss(error, kind, loss, gradient):
+    value = torch.tensor([[2.0 + error, 2.0]], requires_grad=True)
+    each = td_loss(value, torch.full((1, 2), 2.0), kind)
+    each.sum().backward()
+    assert each.tolist()[0] == pytest.approx([loss, 0.0])
+    assert value.grad.tolist()[0] == pytest.approx([gradient, 0.0])
+
+
+def projected(p, atoms, reward: float, discount: float) -> list[float]:
+    """Bellemare et al. 2017, algorithm 1."""
+    low, high, n = atoms[0], atoms[-1], len(atoms)
+    width, mass = (high - low) / (n - 1), [0.0] * n
+    for j in range(n):
+        at = (min(high, max(low, reward + discount * atoms[j])) - low) / width
+        at = round(at, 9)
+        below, above = math.floor(at), math.ceil(at)
+        if below == above:
+            mass[below] += p[j]
+        else:
+            mass[below] += p[j] * (above - at)
+            mass[above] += p[j] * (at - below)
+    return mass
+
+
+def test_a_distribution_is_projected_as_in_the_papers_loop():
+    g, atoms = torch.Generator().manual_seed(0), torch.linspace(-2.0, 3.0, 11)
+    p = torch.rand(2, 50, 11, generator=g).softmax(-1)
+    reward = 3.0 * torch.randn(2, 50, generator=g)
+    discount = torch.rand(2, 50, generator=g)
+    discount[:, :5] = 0.0
+    reward[0, 0], reward[0, 1], reward[0, 2] = -2.0, 3.0, 0.5  # right on an atom
+    discount[0, 5], reward[0, 5] = 1.0, 0.0  # stays
+    reward[0, 6], reward[0, 7] = -100.0, 100.0  # beyond either end
+    got = categorical_projection(p, atoms, reward, discount)
+    torch.testing.assert_close(got.sum(-1), torch.ones(2, 50))
+    for m in range(2):
+        for b in range(50):
+            numbers = (p[m, b].tolist(), atoms.tolist(), reward[m, b].item(), discount[m, b].item())
+            assert got[m, b].tolist() == pytest.approx(projected(*numbers), abs=1e-5)
+    torch.testing.assert_close(got[0, 5], p[0, 5])
+    assert [got[0, 6, 0].item(), got[0, 7, -1].item()] == pytest.approx([1.0, 1.0])
+
+
+def test_a_projection_keeps_the_mean_within_the_atoms():
+    atoms = torch.linspace(-10.0, 10.0, 51)
+    p = torch.rand(1, 20, 51, generator=torch.Generator().manual_seed(0)).softmax(-1)
+    reward, discount = torch.linspace(-1.0, 1.0, 20)[None], torch.full((1, 20), 0.5)
+    mean = (categorical_projection(p, atoms, reward, discount) * atoms).sum(-1)
+    torch.testing.assert_close(mean, reward + 0.5 * (p * atoms).sum(-1), rtol=1e-4, atol=1e-4)

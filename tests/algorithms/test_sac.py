@@ -1,0 +1,207 @@
+"""SAC's numbers by hand, of forces and of choices."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete
+from torch.distributions import Categorical, Normal, TanhTransform, TransformedDistribution
+from toys import Masked, learn
+
+from skillweave.algorithms.config import SAC
+from skillweave.algorithms.sac import SACAlgorithm, State
+from skillweave.networks.config import Network
+from skillweave.seeding import Seeds
+from skillweave.types import Sample
+
+P, B = 2, 6
+LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2)
+FORCES, CHOICES = Box(-1, 1, (2,)), Discrete(3)
+
+
+def make(space: Any, **settings: Any) -> tuple[SACAlgorithm, State]:
+    algorithm = SACAlgorithm(replace(LINEAR, **settings), Box(-1, 1, (3,)), space)
+    state = algorithm.init([Seeds(m) for m in range(P)])
+    g = torch.Generator().manual_seed(1)
+    for name in ("params", "critic", "critic_target"):
+        flat = getattr(state, name)
+        flat += 0.3 * torch.randn(flat.shape, generator=g)
+    state.log_alpha = torch.tensor([[math.log(0.2)], [math.log(0.7)]])
+    return algorithm, state
+
+
+def sample(space: Any, masked: bool = False) -> Sample:
+    g = torch.Generator().manual_seed(0)
+    discount = torch.full((P, B), 0.9)
+    discount[:, 0] = 0.0
+    masks = [None, None]
+    if masked:
+        masks = list(torch.rand(2, P, B, 3, generator=g) < 0.5)
+        for mask in masks:
+            mask[..., 1] = True
+    forces = torch.rand(P, B, 2, generator=g) * 2 - 1
+    return Sample(
+        obs=torch.randn(P, B, 3, generator=g),
+        action=torch.randint(3, (P, B), generator=g) if space is CHOICES else forces,
+        reward=torch.randn(P, B, generator=g), discount=discount,
+        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=masks[0], mask=masks[1],
+        weight=torch.rand(P, B, generator=g), index=np.zeros((P, B), np.int64),
+    )  # fmt: skip
+
+
+def generators() -> list[torch.Generator]:
+    return [Seeds(9 + m).torch() for m in range(P)]
+
+
+def line(views: Any, prefix: str, m: int, x: torch.Tensor) -> torch.Tensor:
+    return x @ views[f"{prefix}.0.weight"][m] + views[f"{prefix}.0.bias"][m, 0]
+
+
+def critics(algorithm: SACAlgorithm, flat: torch.Tensor, m: int, x: torch.Tensor) -> torch.Tensor:
+    """Both critics of a member, (2, B, out)."""
+    views = algorithm.critics.layout.views(flat[m])
+    return torch.stack([line(views, "critic", k, x) for k in range(2)])
+
+
+def squashed(head: torch.Tensor, g: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """A sampled force and its log-probability, by torch's distributions in float64."""
+    mean, log_std = head.double().chunk(2, -1)
+    std = log_std.clamp(-5, 2).exp()
+    u = mean + std * torch.randn(mean.shape, generator=g).double()
+    law = TransformedDistribution(Normal(mean, std), TanhTransform(cache_size=1))
+    action = law.transforms[0](u)
+    return action, law.log_prob(action).sum(-1)
+
+
+def losses(algorithm: SACAlgorithm, state: State, s: Sample) -> tuple[Any, Any]:
+    alpha = state.log_alpha.exp()
+    inputs, following = {"vector": s.obs}, {"vector": s.next_obs}
+    views = algorithm.critics.views(state.critic)
+    critic = algorithm.critic_loss(views, state, s, inputs, following, alpha, generators())
+    views = algorithm.layout.views(state.params)
+    return critic, algorithm.policy_loss(views, state, s.obs_mask, inputs, alpha, generators())
+
+
+def test_forces_by_hand():
+    algorithm, state = make(FORCES)
+    s, alphas = sample(FORCES), [0.2, 0.7]
+    (total, error, _), (policy, entropy) = losses(algorithm, state, s)
+    views = algorithm.layout.views(state.params)
+    for m in range(P):
+        action, log_prob = squashed(line(views, "actor", m, s.next_obs[m]), generators()[m])
+        slow = critics(
+            algorithm, state.critic_target, m, torch.cat([s.next_obs[m], action.float()], -1)
+        )
+        soft = slow[..., 0].min(0).values - alphas[m] * log_prob
+        target = s.reward[m] + s.discount[m] * soft
+        fast = critics(algorithm, state.critic, m, torch.cat([s.obs[m], s.action[m]], -1))
+        gaps = fast[..., 0] - target.float()
+        cost = (0.5 * gaps**2 * s.weight[m]).sum(0).mean()
+        torch.testing.assert_close(total[m], cost, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(error[m], gaps.abs().mean(0), rtol=1e-4, atol=1e-5)
+        action, log_prob = squashed(line(views, "actor", m, s.obs[m]), generators()[m])
+        q = critics(algorithm, state.critic, m, torch.cat([s.obs[m], action.float()], -1))
+        loss = (alphas[m] * log_prob - q[..., 0].min(0).values).mean()
+        assert policy[m].item() == pytest.approx(loss.item(), rel=1e-4)
+        assert entropy[m].item() == pytest.approx(-log_prob.mean().item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_choices_by_hand(masked):
+    algorithm, state = make(CHOICES)
+    s, alphas = sample(CHOICES, masked), [0.2, 0.7]
+    (total, error, _), (policy, entropy) = losses(algorithm, state, s)
+    views = algorithm.layout.views(state.params)
+
+    def law(m: int, obs: torch.Tensor, mask: torch.Tensor | None) -> Categorical:
+        logits = line(views, "actor", m, obs)
+        return Categorical(logits=logits if mask is None else logits.masked_fill(~mask[m], -1e9))
+
+    for m in range(P):
+        after = law(m, s.next_obs[m], s.mask)
+        slow = critics(algorithm, state.critic_target, m, s.next_obs[m]).min(0).values
+        soft = (after.probs * slow).sum(-1) + alphas[m] * after.entropy()
+        target = s.reward[m] + s.discount[m] * soft
+        fast = critics(algorithm, state.critic, m, s.obs[m])
+        gaps = fast[:, torch.arange(B), s.action[m]] - target
+        cost = (0.5 * gaps**2 * s.weight[m]).sum(0).mean()
+        torch.testing.assert_close(total[m], cost, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(error[m], gaps.abs().mean(0), rtol=1e-4, atol=1e-5)
+        now = law(m, s.obs[m], s.obs_mask)
+        q = fast.min(0).values
+        loss = -(now.probs * q).sum(-1) - alphas[m] * now.entropy()
+        torch.testing.assert_close(policy[m], loss.mean(), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(entropy[m], now.entropy().mean(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("space", [FORCES, CHOICES], ids=["forces", "choices"])
+def test_the_temperature_falls_where_the_entropy_is_above_its_aim_and_rises_below(space):
+    algorithm, state = make(space)
+    s = sample(space)
+    _, (_, entropy) = losses(algorithm, state, s)
+    before = state.log_alpha.clone()
+    for aim in (entropy.min().item() - 2.0, entropy.max().item() + 2.0):
+        algorithm.target_entropy = aim
+        state.log_alpha = before.clone()
+        for name in ("alpha_mu", "alpha_nu", "alpha_count"):
+            getattr(state, name).zero_()
+        algorithm.update(state, s, 0.0, generators())
+        # Adam's first step, of d/d log α of log α·(H − H̄): the rate against the sign.
+        sign = torch.sign(state.entropy - aim)[:, None]
+        torch.testing.assert_close(state.log_alpha, before - 1e-2 * sign)
+        torch.testing.assert_close(
+            state.alpha_mu[:, 0], 0.1 * (state.entropy - aim), rtol=1e-4, atol=1e-6
+        )
+    assert sign.tolist() == [[-1.0], [-1.0]]
+
+
+def test_a_fixed_temperature_stays():
+    algorithm, state = make(FORCES, learn_ent_coef=False)
+    before = state.log_alpha.clone()
+    metrics, _ = algorithm.update(state, sample(FORCES), 0.0, generators())
+    assert torch.equal(state.log_alpha, before)
+    assert metrics["ent_coef"].tolist() == pytest.approx([0.2, 0.7])
+
+
+@pytest.mark.parametrize(
+    ("space", "given", "aim"),
+    [(FORCES, None, -2.0), (CHOICES, None, 0.5 * math.log(3)), (FORCES, -0.5, -0.5)],
+)
+def test_the_usual_aim_of_the_entropy(space, given, aim):
+    assert make(space, target_entropy=given)[0].target_entropy == pytest.approx(aim)
+
+
+def test_the_policy_is_delayed_and_the_target_is_not():
+    algorithm, state = make(FORCES, policy_delay=2, tau=0.25)
+    for due in (False, True, False, True):
+        before = {k: getattr(state, k).clone() for k in ("params", "log_alpha", "critic_target")}
+        algorithm.update(state, sample(FORCES), 0.0, generators())
+        assert torch.equal(state.params, before["params"]) != due
+        assert torch.equal(state.log_alpha, before["log_alpha"]) != due
+        moved = before["critic_target"] + 0.25 * (state.critic - before["critic_target"])
+        torch.testing.assert_close(state.critic_target, moved)
+
+
+def test_greedy_is_the_squashed_mean_and_samples_follow_the_law():
+    algorithm, state = make(FORCES)
+    obs = torch.randn(P, 5, 3, generator=torch.Generator().manual_seed(5))
+    actor, noise = algorithm.actor(state), algorithm.noise(generators(), 1, 5)[0]
+    greedy, head, _ = algorithm.act(actor, obs, None, None)
+    mean, log_std = head.chunk(2, -1)
+    torch.testing.assert_close(greedy, mean.tanh())
+    sampled, _, _ = algorithm.act(actor, obs, None, noise)
+    torch.testing.assert_close(sampled, (mean + log_std.exp() * noise).tanh())
+    assert noise.std() > 0.5
+
+
+@pytest.mark.parametrize("alpha", [0.9, 2.0])
+def test_masks_and_a_high_temperature_leave_everything_finite(alpha):
+    config = SAC(num_envs=4, batch_size=8, learning_starts=8, buffer_size=100, ent_coef=alpha)
+    _, state = learn(replace(config, network=Network((8,))), Masked(4), 40)
+    assert state.critic.isfinite().all()
+    assert state.params.isfinite().all()

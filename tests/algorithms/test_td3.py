@@ -1,0 +1,144 @@
+"""TD3's numbers by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+
+from skillweave.algorithms.config import TD3
+from skillweave.algorithms.td3 import State, TD3Algorithm
+from skillweave.networks.config import Network
+from skillweave.seeding import Seeds
+from skillweave.types import Sample
+
+P, B, A = 2, 6, 2
+LINEAR = TD3(num_envs=2, network=Network(()), learning_rate=1e-2)
+
+
+def make(**settings: Any) -> tuple[TD3Algorithm, State]:
+    algorithm = TD3Algorithm(replace(LINEAR, **settings), Box(-1, 1, (3,)), Box(-1, 1, (A,)))
+    state = algorithm.init([Seeds(m) for m in range(P)])
+    g = torch.Generator().manual_seed(1)
+    for name in ("params", "target", "critic", "critic_target"):
+        flat = getattr(state, name)
+        flat += 0.3 * torch.randn(flat.shape, generator=g)
+    return algorithm, state
+
+
+def sample(weighted: bool = False) -> Sample:
+    g = torch.Generator().manual_seed(0)
+    discount = torch.full((P, B), 0.9)
+    discount[:, 0] = 0.0
+    return Sample(
+        obs=torch.randn(P, B, 3, generator=g), action=torch.rand(P, B, A, generator=g) * 2 - 1,
+        reward=torch.randn(P, B, generator=g), discount=discount,
+        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=None, mask=None,
+        weight=torch.rand(P, B, generator=g) if weighted else None,
+        index=np.zeros((P, B), np.int64),
+    )  # fmt: skip
+
+
+def force(algorithm: TD3Algorithm, flat: torch.Tensor, m: int, obs: torch.Tensor) -> torch.Tensor:
+    views = algorithm.layout.views(flat)
+    return (obs @ views["actor.0.weight"][m] + views["actor.0.bias"][m, 0]).tanh()
+
+
+def worth(algorithm: TD3Algorithm, critic: torch.Tensor, obs: Any, action: Any) -> torch.Tensor:
+    """One critic's (D,) value."""
+    views = algorithm.critics.layout.views(critic[None])
+    x = torch.cat([obs, action], -1)
+    return (x @ views["critic.0.weight"][0] + views["critic.0.bias"][0, 0])[..., 0]
+
+
+def generators() -> list[torch.Generator]:
+    return [Seeds(9 + m).torch() for m in range(P)]
+
+
+def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample) -> Any:
+    from skillweave.algorithms.base import Actor
+
+    actor = Actor({}, None, None)
+    views = algorithm.critics.views(state.critic)
+    return algorithm.critic_loss(views, state, s, actor, {"vector": s.obs}, generators())
+
+
+@pytest.mark.parametrize("twin", [True, False])
+@pytest.mark.parametrize("noise", [0.0, 0.2, 5.0])
+def test_the_target_is_smoothed_by_clipped_noise_and_the_smaller_of_two(twin, noise):
+    algorithm, state = make(twin=twin, target_noise=noise, target_noise_clip=0.3)
+    s = sample(weighted=True)
+    total, error, mean = critic_loss(algorithm, state, s)
+    for m, g in enumerate(generators()):
+        action = force(algorithm, state.target, m, s.next_obs[m])
+        if noise:
+            normal = torch.randn(B, A, generator=g)
+            moved = (noise * normal).clamp(-0.3, 0.3)
+            assert (noise < 1) or (moved.abs() > 0.29).any()
+            action = (action + moved).clamp(-1, 1)
+        slow = [worth(algorithm, c, s.next_obs[m], action) for c in state.critic_target[m]]
+        fast = [worth(algorithm, c, s.obs[m], s.action[m]) for c in state.critic[m]]
+        assert len(slow) == (2 if twin else 1)
+        smallest = torch.stack(slow).min(0).values
+        if twin:
+            assert not torch.equal(smallest, slow[0])
+            assert not torch.equal(smallest, slow[1])
+        target = s.reward[m] + s.discount[m] * smallest
+        assert target[0] == s.reward[m, 0]
+        gaps = torch.stack(fast) - target
+        torch.testing.assert_close(total[m], (0.5 * gaps**2 * s.weight[m]).sum(0).mean())
+        torch.testing.assert_close(error[m], gaps.abs().mean(0))
+        torch.testing.assert_close(mean[m], torch.stack(fast).mean())
+
+
+def test_the_actor_climbs_the_first_critic():
+    algorithm, state = make()
+    s = sample()
+    flat = state.params.clone().requires_grad_()
+    algorithm.policy_loss(algorithm.layout.views(flat), state, {"vector": s.obs}).sum().backward()
+    for m in range(P):
+        leaf = state.params.clone().requires_grad_()
+        action = force(algorithm, leaf, m, s.obs[m])
+        (-worth(algorithm, state.critic[m, 0], s.obs[m], action).mean()).backward()
+        torch.testing.assert_close(flat.grad[m], leaf.grad[m])
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+def test_actor_and_targets_follow_with_a_delay(delay):
+    algorithm, state = make(policy_delay=delay, tau=0.25)
+    names = ("params", "target", "critic_target")
+    for step in range(1, 7):
+        before = {k: getattr(state, k).clone() for k in (*names, "critic")}
+        algorithm.update(state, sample(), 0.0, generators())
+        assert not torch.equal(state.critic, before["critic"])
+        due = step % delay == 0
+        assert [not torch.equal(getattr(state, k), before[k]) for k in names] == [due] * 3
+        if due:
+            moved = before["target"] + 0.25 * (state.params - before["target"])
+            torch.testing.assert_close(state.target, moved)
+            moved = before["critic_target"] + 0.25 * (state.critic - before["critic_target"])
+            torch.testing.assert_close(state.critic_target, moved)
+    assert state.count.tolist() == [6 // delay] * P
+
+
+def test_each_member_explores_with_its_own_noise_within_the_bounds():
+    algorithm, state = make(exploration_noise=0.5)
+    state.exploration_noise = torch.tensor([0.0, 0.5])
+    obs, noise = torch.zeros(P, 4000, 3), algorithm.noise(generators(), 1, 4000)[0]
+    action, _, _ = algorithm.act(algorithm.actor(state), obs, None, noise)
+    greedy, _, _ = algorithm.act(algorithm.actor(state), obs, None, None)
+    assert torch.equal(action[0], greedy[0])
+    expected = (greedy[1] + 0.5 * noise[1]).clamp(-1, 1)
+    torch.testing.assert_close(action[1], expected)
+    assert action.abs().max() == 1.0
+
+
+def test_ddpg_is_td3_without_its_three_additions():
+    config = TD3.ddpg(tau=0.1)
+    assert (config.twin, config.policy_delay, config.target_noise) == (False, 1, 0.0)
+    assert config.tau == 0.1
+    assert make(twin=False)[1].critic.shape[1] == 1

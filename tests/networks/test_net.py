@@ -1,0 +1,136 @@
+"""Whole networks: values of actions, dueling and noisy; and networks with a memory."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from gymnasium.spaces import Box
+from torch.nn import functional as F
+
+from skillweave.networks.config import RNN, Network
+from skillweave.networks.net import Net, QNet
+from skillweave.networks.stacked import Layout
+from skillweave.spaces import obs_codec
+
+P, B, A = 2, 4, 3
+OBS = obs_codec(Box(-1, 1, (5,)))
+
+
+def made(net, *args) -> tuple[Layout, torch.Tensor]:
+    layout = Layout(net.shapes)
+    flat = torch.zeros(P, layout.size)
+    net.init_(layout.views(flat), *args, [torch.Generator().manual_seed(m) for m in range(P)])
+    flat += 0.1 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(9))
+    return layout, flat
+
+
+def inputs() -> dict[str, torch.Tensor]:
+    return {"vector": torch.randn(P, B, 5, generator=torch.Generator().manual_seed(3))}
+
+
+def linear(views, name: str, m: int, x: torch.Tensor) -> torch.Tensor:
+    return F.linear(x, views[f"{name}.weight"][m].T, views[f"{name}.bias"][m, 0])
+
+
+@pytest.mark.parametrize("atoms", [1, 7])
+def test_dueling_streams_are_joined_by_the_formula(atoms):
+    net = QNet(OBS, Network((8, 6), "relu"), A, atoms=atoms, dueling=True)
+    layout, flat = made(net)
+    views = layout.views(flat)
+    q = net(views, inputs())
+    assert q.shape == (P, B, A, atoms)
+    for m in range(P):
+        x = linear(views, "q.0", m, inputs()["vector"][m]).relu()
+        value, advantage = (
+            linear(views, f"{name}.1", m, linear(views, f"{name}.0", m, x).relu())
+            for name in ("value", "advantage")
+        )
+        advantage = advantage.view(B, A, atoms)
+        expected = value[:, None] + advantage - advantage.sum(1, keepdim=True) / A
+        torch.testing.assert_close(q[m], expected)
+    assert views["value.1.bias"].shape == (P, 1, atoms)
+
+
+@pytest.mark.parametrize("hidden", [(), (8,)])
+def test_dueling_needs_no_trunk(hidden):
+    net = QNet(OBS, Network(hidden), A, dueling=True)
+    layout, flat = made(net)
+    q, views = net(layout.views(flat), inputs()), layout.views(flat)
+    assert q.shape == (P, B, A, 1)
+    views["value.0.bias" if not hidden else "value.1.bias"] += 1.0
+    torch.testing.assert_close(net(views, inputs()), q + 1.0)
+
+
+def noisy_net() -> tuple[QNet, Layout, torch.Tensor]:
+    net = QNet(OBS, Network((8,), "relu"), A, noisy=True)
+    return net, *made(net)
+
+
+def test_noisy_weights_are_means_and_scaled_factorised_noise():
+    net, layout, flat = noisy_net()
+    views = layout.views(flat)
+    assert net.noise_size == (5 + 8) + (8 + A)
+    noise = torch.randn(P, net.noise_size, generator=torch.Generator().manual_seed(4))
+    found = net.perturbed(views, noise)
+
+    def f(x: float) -> float:
+        return (1 if x > 0 else -1) * abs(x) ** 0.5
+
+    for m in range(P):
+        at = 0
+        for layer, (n_in, n_out) in (("q.0", (5, 8)), ("q.1", (8, A))):
+            own = [f(x) for x in noise[m, at : at + n_in + n_out].tolist()]
+            at += n_in + n_out
+            weight, bias = views[f"{layer}.weight"][m], views[f"{layer}.bias"][m, 0]
+            spread = views[f"{layer}.weight_sigma"][m], views[f"{layer}.bias_sigma"][m, 0]
+            eps = torch.tensor(own[:n_in])[:, None] * torch.tensor(own[n_in:])[None]
+            torch.testing.assert_close(found[f"{layer}.weight"][m], weight + spread[0] * eps)
+            torch.testing.assert_close(
+                found[f"{layer}.bias"][m, 0], bias + spread[1] * torch.tensor(own[n_in:])
+            )
+
+
+def test_without_noise_the_means_act():
+    net, layout, flat = noisy_net()
+    views = layout.views(flat)
+    still = net.perturbed(views, torch.zeros(P, net.noise_size))
+    assert torch.equal(net(still, inputs()), net(views, inputs()))
+    plain = {k: v for k, v in views.items() if "sigma" not in k}
+    assert torch.equal(net(plain, inputs()), net(views, inputs()))
+
+
+def test_noisy_weights_start_as_published_and_learn_their_deviation():
+    net = QNet(OBS, Network((8,), "relu"), A, noisy=True)
+    layout = Layout(net.shapes)
+    flat = torch.zeros(P, layout.size)
+    net.init_(layout.views(flat), [torch.Generator().manual_seed(m) for m in range(P)])
+    views = layout.views(flat)
+    for layer, n_in in (("q.0", 5), ("q.1", 8)):
+        for kind in ("weight", "bias"):
+            mean = views[f"{layer}.{kind}"]
+            assert mean.abs().max() <= n_in**-0.5
+            assert mean.std() > 0.3 * n_in**-0.5
+            assert torch.allclose(views[f"{layer}.{kind}_sigma"], torch.tensor(0.5 * n_in**-0.5))
+    leaves = layout.leaves(flat)
+    noise = torch.randn(P, net.noise_size, generator=torch.Generator().manual_seed(4))
+    net(net.perturbed(leaves, noise), inputs()).sum().backward()
+    assert all(leaf.grad.any() for leaf in leaves.values())
+
+
+def test_a_network_with_memory_computes_steps_as_a_sequence():
+    net = Net("net", OBS, Network((8,), rnn=RNN("lstm", 6)), 2)
+    layout, flat = made(net, 1.0)
+    views, steps = layout.views(flat), 5
+    g = torch.Generator().manual_seed(3)
+    x = {"vector": torch.randn(P, steps, B, 5, generator=g)}
+    memory = torch.randn(P, B, net.memory, generator=g)
+    start = torch.rand(P, steps, B, generator=g) < 0.3
+    out, after = net.sequence(views, x, memory, start)
+    assert (out.shape, after.shape) == ((P, steps, B, 2), (P, steps, B, 12))
+    for t in range(steps):
+        memory = memory.masked_fill(start[:, t, :, None], 0.0)
+        now, memory = net.step(views, {"vector": x["vector"][:, t]}, memory)
+        torch.testing.assert_close(now, out[:, t])
+        torch.testing.assert_close(memory, after[:, t])
+        for m in range(P):
+            torch.testing.assert_close(now[m], linear(views, "net.head", m, memory[m, :, :6]))
