@@ -1,6 +1,6 @@
-"""Issue 3, figures 1 to 6: what each algorithm learns, with settings that are the same for all seeds.
+"""What each algorithm learns, with settings that are the same for all seeds.
 
-    python -m benchmarks.learning [dqn sac td3 ppo image recurrent] [--seeds 0 1 2 3 4]
+    python -m benchmarks.learning [dqn sac td3 ppo image recurrent feed-forward] [--seeds 0 1 2 3 4]
 
 Scores are 100 greedy episodes of Gymnasium's environment with seeds that training never saw.
 Two seeds are trained side by side (``--processes``), so the seconds are those of a busy machine.
@@ -11,19 +11,16 @@ from __future__ import annotations
 import argparse
 import functools
 import tempfile
-import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
 from benchmarks.common import median, report, table
-from skillweave import DQN, PPO, RNN, SAC, TD3, EnvSpec, Network, evaluate, train_agent
+from skillweave import DQN, PPO, RNN, SAC, TD3, EnvSpec, Network, train_agent
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,6 @@ class Figure:
     steps: int
     asked: float
     reference: str
-    judge: EnvSpec | None = None  # where it is scored, if not in `env`
     episodes: int = 100
 
 
@@ -55,17 +51,134 @@ class NoVelocities(gym.ObservationWrapper[Any, Any, Any]):
         return observation[::2]
 
 
-def atari(game: str, *, training: bool, render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """The usual 84×84 grey frames, four at a time; in training lives end episodes, rewards are ±1."""
-    import ale_py
-    from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation, TransformReward
+def minatar(game: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """MinAtar (Young & Tian 2019): 10×10 pixels of several channels, sticky actions."""
+    from minatar.gym import BaseEnv
 
-    gym.register_envs(ale_py)
-    env = gym.make(f"ALE/{game}-v5", frameskip=1, repeat_action_probability=0.0)
-    env = AtariPreprocessing(env, terminal_on_life_loss=training)
-    env = FrameStackObservation(env, 4)
-    return TransformReward(env, np.sign) if training else env
+    return BaseEnv(game, render_mode)
 
 
 DISCRETE, CONTINUOUS = EnvSpec("LunarLander-v3"), EnvSpec("LunarLanderContinuous-v3")
 BLIND = EnvSpec("CartPole-v1", wrappers=(NoVelocities,))
+FREEWAY = EnvSpec(functools.partial(minatar, "freeway"))
+
+REPLAY: dict[str, Any] = {
+    "num_envs": 8, "learning_rate": 1e-3, "learning_rate_schedule": "linear", "gamma": 0.99,
+    "tau": 0.01,
+}  # fmt: skip
+RECURRENT = PPO(
+    num_envs=16,
+    n_steps=64,
+    batch_size=256,
+    learning_rate=2e-3,
+    ent_coef=0.0,
+    network=Network((32,), "relu", rnn=RNN("lstm", 32)),
+)
+FIGURES = {
+    "dqn": Figure(
+        DISCRETE,
+        DQN(
+            **REPLAY,
+            n_step=3,
+            batch_size=128,
+            update_ratio=0.25,
+            exploration_fraction=0.2,
+            exploration_final_eps=0.02,
+            network=Network((128, 128), "relu", layer_norm=True),
+        ),
+        300_000,
+        265.0,
+        "SLM-Lab DDQN+PER 265.9, rl-zoo3 DQN 154 (100k)",
+    ),
+    "sac": Figure(
+        CONTINUOUS,
+        SAC(**REPLAY, batch_size=256, update_ratio=0.5, network=small(64, 64)),
+        300_000,
+        270.0,
+        "rl-zoo3 SAC 260 (500k), SLM-Lab CrossQ 269",
+    ),
+    "td3": Figure(
+        CONTINUOUS,
+        TD3(**REPLAY, batch_size=256, update_ratio=0.5, network=small(64, 64)),
+        300_000,
+        240.0,
+        "rl-zoo3 TD3 207",
+    ),
+    "ppo": Figure(
+        CONTINUOUS,
+        PPO(
+            num_envs=32,
+            n_steps=64,
+            batch_size=512,
+            update_epochs=6,
+            gamma=0.999,
+            gae_lambda=0.98,
+            ent_coef=0.0,
+            normalize_obs=True,
+            network=small(64, 64),
+        ),
+        1_000_000,
+        270.0,
+        "rl-zoo3 PPO 271",
+    ),
+    "image": Figure(
+        FREEWAY,
+        PPO(n_steps=128, network=small(64)),
+        2_000_000,
+        50.0,
+        "Young & Tian 2019, DQN after 5M frames: about 50 (fig. 3)",
+    ),
+    "recurrent": Figure(BLIND, RECURRENT, 200_000, 475.0, "500 is the most; feed-forward: below"),
+    "feed-forward": Figure(
+        BLIND, replace(RECURRENT, network=small(64, 64)), 200_000, 0.0, "sees no velocities"
+    ),
+}
+
+
+def learn(name: str, seed: int) -> dict[str, Any]:
+    figure = FIGURES[name]
+    with tempfile.TemporaryDirectory() as folder:
+        run = train_agent(
+            figure.env, figure.algorithm, figure.steps, Path(folder) / "run", seed=seed, quiet=True
+        )
+        score = run.evaluate(figure.episodes)
+        seconds = run.info()["phases"][0]["seconds"]
+    return {
+        "figure": name,
+        "seed": seed,
+        "score": round(score.mean, 1),
+        "solved": score.solved_fraction,
+        "seconds": seconds,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("figures", nargs="*", default=list(FIGURES))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--processes", type=int, default=2)
+    given = parser.parse_args()
+    summary = {}
+    with ProcessPoolExecutor(given.processes, get_context("spawn")) as pool:
+        jobs = {
+            name: [pool.submit(learn, name, seed) for seed in given.seeds]
+            for name in given.figures or FIGURES
+        }
+        for name, waiting in jobs.items():
+            rows = [job.result() for job in waiting]
+            print(table(list(rows[0]), [list(r.values()) for r in rows]), flush=True)
+            figure, scores = FIGURES[name], [r["score"] for r in rows]
+            summary[name] = {
+                "asked": figure.asked,
+                "median": median(scores),
+                "worst": min(scores),
+                "scores": scores,
+                "seconds": median(r["seconds"] for r in rows),
+                "steps": figure.steps,
+                "reference": figure.reference,
+            }
+            report(f"learning-{name}", summary[name])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Off-policy training speed against Stable-Baselines3: same network, batch and update ratio.
+
+    python -m benchmarks.off_policy [--seeds 0 1 2] [--sizes small zoo]
+
+`small` is the network that benchmarks.learning uses, `zoo` the one of rl-zoo3, whose matrix
+products alone (see the column `floor`) take most of the time on two cores: no library can be much
+faster with it. One environment, as in rl-zoo3. Measured in turn, in one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.common import median, report, table
+from skillweave import DQN, SAC, TD3, EnvSpec, Network
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.envs.make import make_engine
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.seeding import Seeds
+from skillweave.training.episodes import Tick
+from skillweave.training.off_policy import train_off_policy
+
+SIZES = {
+    "dqn": {"small": (64, 64), "zoo": (256, 256)},
+    "sac": {"small": (64, 64), "zoo": (400, 300)},
+    "td3": {"small": (64, 64), "zoo": (400, 300)},
+}
+ENVS = {
+    "dqn": "LunarLander-v3",
+    "sac": "LunarLanderContinuous-v3",
+    "td3": "LunarLanderContinuous-v3",
+}
+BATCH = {"dqn": 128, "sac": 256, "td3": 256}
+WARM_UP, THREADS = 500, 2
+
+
+def ours(name: str, hidden: tuple[int, ...], steps: int, seed: int) -> float:
+    """Steps/s after the warm-up: one gradient step for each environment step."""
+    kind: Any = {"dqn": DQN, "sac": SAC, "td3": TD3}[name]
+    extra = {"double": False} if name == "dqn" else {}
+    config = kind(
+        num_envs=1, train_freq=4 if name == "dqn" else 1, update_ratio=1.0,
+        learning_starts=WARM_UP, batch_size=BATCH[name], buffer_size=50_000,
+        network=Network(hidden, "relu"), threads=THREADS, **extra,
+    )  # fmt: skip
+    env = SkillEnv(make_engine(EnvSpec(ENVS[name]), 1))
+    algorithm: Any = make_algorithm(config, env.observation_space, env.action_space)
+    seeds = Seeds(seed)
+    ticks: list[Tick] = []
+    train_off_policy(
+        algorithm, env, algorithm.init([seeds / "member" / 0]), seeds, steps + 1000,
+        on_tick=ticks.append, cut_every=10**9,
+    )  # fmt: skip
+    first, last = ticks[0], ticks[-1]
+    return (last.steps - first.steps) / (last.seconds - first.seconds)
+
+
+def theirs(name: str, hidden: tuple[int, ...], steps: int, seed: int) -> float:
+    """The same with Stable-Baselines3."""
+    import stable_baselines3 as sb3
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.env_util import make_vec_env
+
+    class Clock(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 1000:
+                self.started = time.perf_counter()
+            return True
+
+    common: dict[str, Any] = {
+        "batch_size": BATCH[name], "buffer_size": 50_000, "learning_starts": WARM_UP,
+        "policy_kwargs": {"net_arch": list(hidden)}, "device": "cpu", "seed": seed,
+    }  # fmt: skip
+    env = make_vec_env(ENVS[name], n_envs=1, seed=seed)
+    if name == "dqn":
+        model: Any = sb3.DQN("MlpPolicy", env, train_freq=4, gradient_steps=-1, **common)
+    else:
+        kind: Any = {"sac": sb3.SAC, "td3": sb3.TD3}[name]
+        model = kind("MlpPolicy", env, train_freq=1, gradient_steps=1, **common)
+    torch.set_num_threads(THREADS)
+    clock = Clock()
+    model.learn(steps + 1000, callback=clock)
+    return steps / (time.perf_counter() - clock.started)
+
+
+def floor(name: str, hidden: tuple[int, ...]) -> float:
+    """Updates/s if an update were nothing but the matrix products of its hidden layers."""
+    torch.set_num_threads(THREADS)
+    n_in, n_out = hidden
+    x, w = torch.randn(BATCH[name], n_in), torch.randn(n_in, n_out)
+    times = []
+    for _ in range(200):
+        started = time.perf_counter()
+        torch.mm(x, w)
+        times.append(time.perf_counter() - started)
+    # Forward, and twice that backward. DQN: online 3, target 1. SAC: the actor 1 + 3, two critics
+    # 2 (targets) + 6 (loss) + 4 (for the actor, by their inputs alone); TD3: the actor's half as often.
+    products = {"dqn": 4, "sac": 16, "td3": 1 + 2 + 6 + 0.5 * (3 + 2)}[name]
+    return 1.0 / (products * float(np.median(times)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--sizes", nargs="+", default=["small", "zoo"])
+    parser.add_argument("--steps", type=int, default=3_000)
+    given = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for name in ENVS:
+        for size in given.sizes:
+            hidden = SIZES[name][size]
+            for seed in given.seeds:
+                base = theirs(name, hidden, given.steps, seed)
+                mine = ours(name, hidden, given.steps, seed)
+                rows.append(
+                    {
+                        "algorithm": name,
+                        "network": "x".join(map(str, hidden)),
+                        "seed": seed,
+                        "ours": round(mine),
+                        "sb3": round(base),
+                        "ratio": round(mine / base, 2),
+                        "floor": round(floor(name, hidden)),
+                    }
+                )
+    print(table(list(rows[0]), [list(r.values()) for r in rows]))
+    ratios = {
+        f"{name} {size}": median(
+            r["ratio"]
+            for r in rows
+            if r["algorithm"] == name and r["network"] == "x".join(map(str, SIZES[name][size]))
+        )
+        for name in ENVS
+        for size in given.sizes
+    }
+    report("off_policy", {"median_ratio": ratios, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
