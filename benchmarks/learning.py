@@ -99,7 +99,16 @@ FIGURES = {
     ),
     "td3": Figure(
         CONTINUOUS,
-        TD3(**REPLAY, batch_size=256, update_ratio=0.5, network=small(64, 64)),
+        TD3(
+            **REPLAY | {"gamma": 0.98},
+            n_step=3,
+            batch_size=256,
+            update_ratio=0.5,
+            exploration_noise=0.2,
+            network=small(64, 64),
+            # Without layer norm in the critics, or at γ = 0.99, it hovers until the time limit.
+            critic=Network((128, 128), "relu", layer_norm=True),
+        ),
         300_000,
         240.0,
         "rl-zoo3 TD3 207",
@@ -124,7 +133,7 @@ FIGURES = {
     "image": Figure(
         FREEWAY,
         PPO(n_steps=128, network=small(64)),
-        2_000_000,
+        1_000_000,
         50.0,
         "Young & Tian 2019, DQN after 5M frames: about 50 (fig. 3)",
     ),

@@ -99,7 +99,8 @@ def floor(name: str, hidden: tuple[int, ...]) -> float:
         torch.mm(x, w)
         times.append(time.perf_counter() - started)
     # Forward, and twice that backward. DQN: online 3, target 1. SAC: the actor 1 + 3, two critics
-    # 2 (targets) + 6 (loss) + 4 (for the actor, by their inputs alone); TD3: the actor's half as often.
+    # 2 (targets) + 6 (loss) + 4 (for the actor, by their inputs alone); TD3: the actor and one
+    # critic for it half as often.
     products = {"dqn": 4, "sac": 16, "td3": 1 + 2 + 6 + 0.5 * (3 + 2)}[name]
     return 1.0 / (products * float(np.median(times)))
 
