@@ -1,11 +1,18 @@
-"""``make bench``: the quick ones. ``make figures`` runs all of them on all seeds (an hour)."""
+"""``make bench``: the quick ones. ``make figures`` runs all of them on all seeds (two hours)."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
-QUICK = (["startup"], ["updates"], ["speed", "--seeds", "0"], ["flat", "--seeds", "0"])
+QUICK = (
+    ["startup"],
+    ["updates"],
+    ["replay"],
+    ["speed", "--seeds", "0"],
+    ["off_policy", "--seeds", "0", "--sizes", "small"],
+    ["flat", "--seeds", "0"],
+)
 ALL = (
     ["startup"],
     ["updates"],
@@ -14,6 +21,10 @@ ALL = (
     ["hierarchy"],
     ["hierarchy", "--recipe", "lunar-lander-tuned"],
     ["ablation"],
+    ["replay"],
+    ["off_policy"],
+    ["learning"],
+    ["mixed"],
 )
 
 

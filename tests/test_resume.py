@@ -372,7 +372,7 @@ REPLAYERS = {
 def phase_of(name: str, save_buffer: bool = True) -> Phase:
     config, shows, asks = REPLAYERS[name]
     config = dataclasses.replace(config, save_buffer=save_buffer)
-    return Phase("echo", config, 1300, lambda _: Echo(4, shows, asks))
+    return Phase("echo", config, 1300, lambda *_: Echo(4, shows, asks))
 
 
 def new_run(path: Path, phase: Phase) -> RunDirectory:
@@ -385,7 +385,7 @@ def new_run(path: Path, phase: Phase) -> RunDirectory:
 
 def train_echo(run: RunDirectory, phase: Phase, *listeners: Any) -> None:
     try:
-        train_phase(phase, run, Seeds(3) / phase.name, listeners, 250)
+        train_phase(phase, run, Seeds(3) / phase.name, listeners)
     finally:
         run.close()
 

@@ -18,6 +18,10 @@ from skillweave.types import Policy, SkillweaveError
 
 RESERVED = ("selector", "flat")
 """Names of phases that are not skills."""
+WHOLE = (
+    "skill_steps", "selector_steps", "flat_steps", "cut_every", "call_steps", "eval_every",
+    "eval_episodes",
+)  # fmt: skip
 
 
 @dataclass
@@ -54,6 +58,10 @@ class Declaration:
     """Reflexes are in force while skills train too: skills learn the body they will have."""
     cut_every: int = 100_000
     """Environment steps between checkpoints."""
+    eval_every: int | None = None
+    """Environment steps between looks at an agent's own return while it trains; None: none."""
+    eval_episodes: int = 20
+    """Episodes of each look."""
 
     def __post_init__(self) -> None:
         self._check_env()
@@ -66,9 +74,9 @@ class Declaration:
                 )
         for name in ("algorithm", "selector", "flat"):
             _check_algorithm(getattr(self, name), f"{name}", optional=name == "flat")
-        for name in ("skill_steps", "selector_steps", "flat_steps", "cut_every", "call_steps"):
+        for name in WHOLE:
             value = getattr(self, name)
-            none = name in ("call_steps", "flat_steps")
+            none = name in ("call_steps", "flat_steps", "eval_every")
             if (value is None and none) or (type(value) is int and value >= 1):
                 continue
             what = "at least 1, or None" if none else "a whole number, at least 1"

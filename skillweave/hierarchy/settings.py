@@ -22,6 +22,8 @@ PLAIN = (
     "greedy_skills",
     "reflexes_in_training",
     "cut_every",
+    "eval_every",
+    "eval_episodes",
 )
 CONFIGS = ("algorithm", "selector", "flat")
 

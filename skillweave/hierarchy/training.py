@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.foreign import FromVectorEnv
 from skillweave.envs.make import make_engine
 from skillweave.envs.skill_env import SkillEnv
@@ -17,6 +15,7 @@ from skillweave.seeding import Seeds
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign import source_of
 from skillweave.training.phase import Listener, Phase, train_phase
+from skillweave.training.probe import MakeEnv
 from skillweave.types import Policy, VecEnv
 
 
@@ -29,6 +28,8 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "env_kwargs": declaration.spec.kwargs,
         "seed": seed,
         "cut_every": declaration.cut_every,
+        "eval_every": declaration.eval_every,
+        "eval_episodes": declaration.eval_episodes,
         "skills": [_skill_entry(s) for s in declaration.skills],
         "call_steps": declaration.call_steps,
         "greedy_skills": declaration.greedy_skills,
@@ -53,7 +54,7 @@ def phases_of(declaration: Declaration) -> list[Phase]:
         if s.policy is None
     ]
 
-    def too_early(config: AlgorithmConfig) -> VecEnv:
+    def too_early(num_envs: int, gamma: Any) -> VecEnv:
         raise AssertionError("the selector's environment needs the skills' policies")
 
     return [
@@ -73,23 +74,23 @@ def train(
     declaration: Declaration, run: RunDirectory, listeners: tuple[Listener, ...] = ()
 ) -> Policy:
     """Train, or finish training, what the run says; returns the policy."""
-    seeds, cut_every = Seeds(int(run.manifest["seed"])), int(run.manifest["cut_every"])
+    seeds = Seeds(int(run.manifest["seed"]))
     if run.manifest["kind"] == "flat":
-        return train_phase(flat_phase(declaration), run, seeds / "flat", listeners, cut_every)
+        return train_phase(flat_phase(declaration), run, seeds / "flat", listeners)
     policies = _ready(declaration, run)
     for name, ready in policies.items():
         run.keep_policy(name, ready)
     *skill_phases, selector = phases_of(declaration)
     for phase in skill_phases:
-        policies[phase.name] = train_phase(phase, run, seeds / phase.name, listeners, cut_every)
+        policies[phase.name] = train_phase(phase, run, seeds / phase.name, listeners)
     skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
 
-    def make_env(config: AlgorithmConfig) -> VecEnv:
-        engine = make_engine(declaration.spec, config.num_envs)
-        return FromVectorEnv(OptionsEnv(engine, skills, config.gamma))
+    def make_env(num_envs: int, gamma: Any) -> VecEnv:
+        engine = make_engine(declaration.spec, num_envs)
+        return FromVectorEnv(OptionsEnv(engine, skills, gamma))
 
     phase = Phase("selector", selector.config, selector.budget, make_env)
-    policy = train_phase(phase, run, seeds / "selector", listeners, cut_every)
+    policy = train_phase(phase, run, seeds / "selector", listeners)
     return HierarchyPolicy(policy, skills)
 
 
@@ -109,15 +110,13 @@ def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
     return {name: run.ready_policy(name, policy) for name, policy in ready.items()}
 
 
-def _skill_env(
-    declaration: Declaration, skill: Skill | None
-) -> Callable[[AlgorithmConfig], VecEnv]:
+def _skill_env(declaration: Declaration, skill: Skill | None) -> MakeEnv:
     # The flat baseline is the plain task: no reflexes either.
     with_reflexes = declaration.reflexes_in_training and skill is not None
     reflexes = tuple(declaration.reflexes) if with_reflexes else ()
 
-    def make_env(config: AlgorithmConfig) -> VecEnv:
-        return SkillEnv(make_engine(declaration.spec, config.num_envs), skill, reflexes)
+    def make_env(num_envs: int, gamma: Any) -> VecEnv:
+        return SkillEnv(make_engine(declaration.spec, num_envs), skill, reflexes)
 
     return make_env
 

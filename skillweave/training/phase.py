@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +14,7 @@ from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.off_policy import train_off_policy
 from skillweave.training.on_policy import train_on_policy
-from skillweave.types import VecEnv
+from skillweave.training.probe import MakeEnv, Probe
 
 START = {"update": 0, "steps": 0, "seconds": 0.0, "metrics": {}}
 """Where a phase stands before its first update."""
@@ -44,7 +43,7 @@ class Phase:
     name: str
     config: AlgorithmConfig
     budget: int
-    make_env: Callable[[AlgorithmConfig], VecEnv]
+    make_env: MakeEnv
 
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
@@ -57,7 +56,7 @@ class Phase:
 
 
 def train_phase(
-    phase: Phase, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...], cut_every: int
+    phase: Phase, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
 ) -> AgentPolicy:
     """Train a phase to its end, or return its policy where it is done already.
 
@@ -67,7 +66,9 @@ def train_phase(
     if entry["status"] == "done":
         return run.load_policy(phase.name)
     config, budget = config_from_json(entry["algorithm"]), int(entry["budget"])
-    env = phase.make_env(config)
+    env = phase.make_env(config.num_envs, config.gamma)
+    every, episodes = run.manifest.get("eval_every"), run.manifest.get("eval_episodes", 0)
+    probe = Probe(phase.make_env, config.gamma, seeds, every, episodes)
     try:
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
         found = run.load_checkpoint(algorithm.state_type, phase.name)
@@ -78,26 +79,29 @@ def train_phase(
         run.save()
         for listener in listeners:
             listener.phase(phase.name, budget)
+        probe.start(at["steps"])
 
         def on_tick(tick: Tick) -> None:
-            at.update(update=tick.update, steps=tick.steps, seconds=tick.seconds)
-            at["metrics"] = tick.metrics
+            metrics = tick.metrics
+            metrics |= probe.look(tick.steps, lambda: AgentPolicy.of(algorithm, tick.state))
+            at.update(update=tick.update, steps=tick.steps, seconds=tick.seconds, metrics=metrics)
             now = {"phase": phase.name, "update": tick.update, "steps": tick.steps}
-            run.log(now | {"seconds": round(tick.seconds, 4)} | tick.metrics)
+            run.log(now | {"seconds": round(tick.seconds, 4)} | metrics)
             for listener in listeners:
-                listener.tick(phase.name, tick.steps, tick.seconds, tick.metrics)
+                listener.tick(phase.name, tick.steps, tick.seconds, metrics)
             if tick.cut:
-                header = {"seconds": tick.seconds, "metrics": tick.metrics}
+                header = {"seconds": tick.seconds, "metrics": metrics}
                 run.save_checkpoint(tick.state, now | header, tick.extra)
 
         where: dict[str, Any] = {k: at[k] for k in ("update", "steps", "seconds")}
-        where |= {"cut_every": cut_every, "on_tick": on_tick}
+        where |= {"cut_every": int(run.manifest["cut_every"]), "on_tick": on_tick}
         if isinstance(algorithm, PPOAlgorithm):
             train_on_policy(algorithm, env, state, seeds, budget, **where)
         elif isinstance(algorithm, OffPolicyAlgorithm):
             train_off_policy(algorithm, env, state, seeds, budget, saved=extra, **where)
     finally:
         env.close()
+        probe.close()
     policy = AgentPolicy.of(algorithm, state)
     run.save_policy(phase.name, policy)
     _finish(run, entry, at)

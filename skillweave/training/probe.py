@@ -1,0 +1,63 @@
+"""A look at an agent while it trains: whole episodes in environments of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from skillweave.seeding import Seeds
+from skillweave.types import Array, Policy, VecEnv
+
+MakeEnv = Callable[[int, Any], VecEnv]
+"""(num_envs, γ of a step: a number, or one for each environment) to an environment."""
+
+
+def episode_returns(
+    policy: Policy, env: VecEnv, seeds: Seeds, *, deterministic: bool = True
+) -> Array:
+    """The return of the first episode in each of N environments, (N,) float64, undiscounted.
+
+    Equal seeds give equal starts, whoever plays.
+    """
+    n = env.num_envs
+    rng = (seeds / "act").numpy()
+    obs, memory, mask = env.reset(seeds / "start"), policy.start(n), env.mask()
+    returns, playing = np.zeros(n), np.ones(n, bool)
+    while playing.any():
+        action, memory = policy.act(memory, obs, mask, deterministic=deterministic, rng=rng)
+        step = env.step(action)
+        returns += playing * np.asarray(step.info.get("call_return", step.reward), np.float64)
+        playing &= ~step.ended
+        obs, mask = step.obs, step.mask
+    return returns
+
+
+class Probe:
+    """Plays ``episodes`` episodes every so many steps of training; always the same starts."""
+
+    def __init__(
+        self, make_env: MakeEnv, gamma: float, seeds: Seeds, every: int | None, episodes: int
+    ) -> None:
+        self._make: Callable[[], VecEnv] = lambda: make_env(episodes, gamma)
+        self._seeds, self._every, self._last = seeds / "probe", every, 0
+        self._env: VecEnv | None = None
+
+    def start(self, steps: int) -> None:
+        """Training stands at ``steps``: what was due until here is done."""
+        self._last = steps
+
+    def look(self, steps: int, policy: Callable[[], Policy]) -> dict[str, float]:
+        """Metrics where it is time to look, else none."""
+        if self._every is None or steps // self._every == self._last // self._every:
+            return {}
+        self._last = steps
+        self._env = self._env or self._make()
+        returns = episode_returns(policy(), self._env, self._seeds)
+        return {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
+
+    def close(self) -> None:
+        """Release the environments."""
+        if self._env is not None:
+            self._env.close()
