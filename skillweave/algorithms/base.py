@@ -80,6 +80,10 @@ class Algorithm:
             return None, None
         return state.obs_mean[:, None].clone(), (state.obs_var + 1e-8).rsqrt()[:, None]
 
+    def layouts(self) -> dict[str, Layout]:
+        """The fields of the state that hold parameters, or moments of them, and their columns."""
+        return dict.fromkeys(("params", "mu", "nu"), self.layout)
+
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of one member's ``weights``."""
         scaling = {"obs_mean": (self.obs.size,), "obs_var": (self.obs.size,)}

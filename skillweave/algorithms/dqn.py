@@ -80,6 +80,10 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             **self.fresh(self.config, len(seeds)),
         )
 
+    def layouts(self) -> dict[str, Layout]:
+        """The fields of the state that hold parameters, or moments of them, and their columns."""
+        return super().layouts() | {"target": self.layout}
+
     def actor(self, state: State, progress: float = 1.0) -> Actor:
         """A copy of what acting needs, with ε."""
         cfg, actor = self.config, super().actor(state, progress)

@@ -114,6 +114,11 @@ class Critics:
         out = self.net(views, {k: each(v) for k, v in inputs.items()}, extra)
         return out.view(members, count, *out.shape[1:])
 
+    def layouts(self) -> dict[str, Layout]:
+        """The fields of a state that hold critics, or moments of them, and their columns."""
+        names = ("critic", "critic_target", "critic_mu", "critic_nu")
+        return dict.fromkeys(names, self.layout)
+
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """Windows into (P, K, D), each (P·K, *shape)."""
         return self.layout.views(flat.flatten(0, 1))

@@ -106,6 +106,10 @@ class SACAlgorithm(OffPolicyAlgorithm):
             **self.fresh(self.config, members),
         )
 
+    def layouts(self) -> dict[str, Layout]:
+        """The fields of the state that hold parameters, or moments of them, and their columns."""
+        return super().layouts() | self.critics.layouts()
+
     def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
         """Noise for ``steps`` calls of ``act``, first axis the steps."""
         return self.head.noise(generators, steps, batch)

@@ -94,6 +94,10 @@ class TD3Algorithm(OffPolicyAlgorithm):
             **self.fresh(self.config, len(seeds)),
         )
 
+    def layouts(self) -> dict[str, Layout]:
+        """The fields of the state that hold parameters, or moments of them, and their columns."""
+        return super().layouts() | {"target": self.layout} | self.critics.layouts()
+
     def actor(self, state: State, progress: float = 1.0) -> Actor:
         """A copy of what acting needs, with the deviation of its noise."""
         actor = super().actor(state, progress)

@@ -1,0 +1,1 @@
+"""Evolution: a population that learns in stacks, is judged, selected and mutated."""

@@ -1,0 +1,112 @@
+"""Stacks: members that share one set of tensors while they learn (contract 5).
+
+Between generations every member is a thing of its own; ``join`` puts members of one architecture
+into a stack, ``split`` takes them out again. Members whose hidden layers differ in width are padded
+with zeros to the widest: a unit with no weights in and none out stays at zero for ever, whatever
+the others learn, so a padded member is exactly the member alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.networks.config import Network
+from skillweave.networks.stacked import Layout
+
+
+@dataclass
+class Member:
+    """One agent of a population, with settings and architecture of its own."""
+
+    number: int
+    config: AlgorithmConfig
+    state: Any  # of its algorithm, P = 1
+
+    def algorithm(self, spaces: tuple[Any, Any]) -> Algorithm:
+        """The algorithm it learns by, on (observation space, action space)."""
+        return make_algorithm(self.config, *spaces)
+
+
+def stack_key(config: AlgorithmConfig, settings: Sequence[str]) -> AlgorithmConfig:
+    """What members must have in common to share a stack: all but ``settings`` and widths.
+
+    Layer norm divides by what all units of a layer do, so there widths count, too.
+    """
+    kind = type(config)
+    changes: dict[str, Any] = {k: kind.__dataclass_fields__[k].default for k in settings}
+    for name in ("network", "critic"):
+        network = getattr(config, name, None)
+        if isinstance(network, Network) and not network.layer_norm:
+            changes[name] = replace(network, hidden=(1,) * len(network.hidden))
+    return replace(config, **changes)
+
+
+def join(members: Sequence[Member], spaces: tuple[Any, Any]) -> tuple[Algorithm, Any]:
+    """The algorithm of the widest of all, and one state of P members; copies."""
+    first = members[0].config
+    changes: dict[str, Any] = {
+        name: _widest([getattr(m.config, name) for m in members])
+        for name in ("network", "critic")
+        if isinstance(getattr(first, name, None), Network)
+    }
+    algorithm = make_algorithm(replace(first, **changes), *spaces)
+    wide, padded = algorithm.layouts(), []
+    for member in members:
+        own = member.algorithm(spaces).layouts()
+        tensors = {f.name: getattr(member.state, f.name) for f in fields(member.state)}
+        padded.append({
+            k: pad(v, own[k], wide[k]) if k in wide else v for k, v in tensors.items()
+        })  # fmt: skip
+    joined = {k: torch.cat([p[k] for p in padded]) for k in padded[0]}
+    return algorithm, algorithm.state_type(**joined)
+
+
+def split(
+    algorithm: Algorithm, state: Any, members: Sequence[Member], spaces: tuple[Any, Any]
+) -> None:
+    """Give each member its part of a stack's state: the inverse of ``join``; copies."""
+    wide = algorithm.layouts()
+    for i, member in enumerate(members):
+        own = member.algorithm(spaces).layouts()
+        tensors = {f.name: getattr(state, f.name)[i : i + 1] for f in fields(state)}
+        member.state = algorithm.state_type(**{
+            k: crop(v, wide[k], own[k]) if k in wide else v.clone() for k, v in tensors.items()
+        })  # fmt: skip
+
+
+def pad(flat: Tensor, own: Layout, wide: Layout) -> Tensor:
+    """Parameters (…, D) in a wider layout (…, D′), zero where there was nothing."""
+    rows = flat.reshape(-1, flat.shape[-1])
+    found = rows.new_zeros(len(rows), wide.size)
+    into = wide.views(found)
+    for name, view in own.views(rows).items():
+        into[name][_corner(view)] = view
+    return found.view(*flat.shape[:-1], wide.size)
+
+
+def crop(flat: Tensor, wide: Layout, own: Layout) -> Tensor:
+    """Parameters (…, D′) in the narrower layout (…, D) that they were padded from."""
+    rows = flat.reshape(-1, flat.shape[-1])
+    found = rows.new_zeros(len(rows), own.size)
+    outof = wide.views(rows)
+    for name, view in own.views(found).items():
+        view.copy_(outof[name][_corner(view)])
+    return found.view(*flat.shape[:-1], own.size)
+
+
+def _corner(view: Tensor) -> tuple[slice, ...]:
+    """The first entries along each axis, as many as ``view`` has."""
+    return tuple(slice(n) for n in view.shape)
+
+
+def _widest(networks: Sequence[Network]) -> Network:
+    widths = zip(*(n.hidden for n in networks), strict=True)
+    return replace(networks[0], hidden=tuple(max(w) for w in widths))
