@@ -78,12 +78,12 @@ FIGURES = {
     "dqn": Figure(
         DISCRETE,
         DQN(
-            **REPLAY,
+            **REPLAY | {"gamma": 0.995},
             n_step=3,
             batch_size=128,
             update_ratio=0.25,
-            exploration_fraction=0.2,
-            exploration_final_eps=0.02,
+            exploration_fraction=0.15,
+            exploration_final_eps=0.01,
             network=Network((128, 128), "relu", layer_norm=True),
         ),
         300_000,

@@ -3,31 +3,46 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+import skillweave
 from skillweave import Hierarchy
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
 
-def test_the_readme_example_runs_as_it_stands(
+def test_the_readme_examples_run_as_they_stand(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("Box2D")
     pytest.importorskip("PIL")
     code = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    assert len(code) == 1
+    assert len(code) == 3
     train = Hierarchy.train
 
     def train_briefly(self: Hierarchy, *args: Any, **kwargs: Any) -> Any:
         self.scale(0.01)
-        return train(self, *args, quiet=True, **kwargs)
+        return train(self, *args, **kwargs | {"quiet": True})
 
     monkeypatch.setattr(Hierarchy, "train", train_briefly)
     monkeypatch.chdir(tmp_path)
-    exec(compile(code[0], "README.md", "exec"), {"__name__": "readme"})
+    names: dict[str, Any] = {"__name__": "readme"}
+    exec(compile(code[0], "README.md", "exec"), names)
     assert "over 100 episodes" in capsys.readouterr().out
     assert (tmp_path / "lander.gif").read_bytes().startswith(b"GIF89a")
     assert (tmp_path / "runs/lander/run.json").exists()
+
+    exec(compile(code[1], "README.md", "exec"), names)
+    assert (tmp_path / "runs/sac/run.json").exists()
+    assert names["hierarchy"].selector.noisy
+    names["hierarchy"].check_spaces()
+
+    made: list[Any] = []  # the files of foreign skills are tested where they are made
+    for name in ("from_sb3", "from_onnx"):
+        monkeypatch.setattr(skillweave, name, lambda *a, **k: made.append((a, k)), raising=False)
+    names |= {"glide": lambda obs: obs[:, 0], "network": torch.nn.Linear(8, 4)}
+    exec(compile(code[2], "README.md", "exec"), names)
+    assert made == [(("dock.zip", "ppo"), {"trust": True}), (("hop.onnx",), {})]
 
 
 def test_every_shell_command_of_the_readme_is_one_that_exists() -> None:
