@@ -48,7 +48,7 @@ def ours(name: str, hidden: tuple[int, ...], steps: int, seed: int) -> float:
         learning_starts=WARM_UP, batch_size=BATCH[name], buffer_size=50_000,
         network=Network(hidden, "relu"), threads=THREADS, **extra,
     )  # fmt: skip
-    env = SkillEnv(make_engine(EnvSpec(ENVS[name]), 1))
+    env = SkillEnv(make_engine(EnvSpec(ENVS[name], engine="sync"), 1))  # the same as theirs
     algorithm: Any = make_algorithm(config, env.observation_space, env.action_space)
     seeds = Seeds(seed)
     ticks: list[Tick] = []
