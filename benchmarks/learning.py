@@ -174,7 +174,10 @@ def main() -> None:
             for name in given.figures or FIGURES
         }
         for name, waiting in jobs.items():
-            rows = [job.result() for job in waiting]
+            rows = []
+            for job in waiting:
+                rows.append(job.result())
+                print(rows[-1], flush=True)
             print(table(list(rows[0]), [list(r.values()) for r in rows]), flush=True)
             figure, scores = FIGURES[name], [r["score"] for r in rows]
             summary[name] = {

@@ -126,7 +126,7 @@ def check_spaces(config: AlgorithmConfig, action_space: gym.Space[Any], where: s
         able = [name for name, spaces in _ACTS.items() if isinstance(action_space, spaces)]
         raise SkillweaveError(
             f"{where}{kind} cannot act in {action_space}; "
-            + (f"{' and '.join(able)} can" if able else "no algorithm here can")
+            + (f"{', '.join(able)} can" if able else "no algorithm here can")
         )
 
 

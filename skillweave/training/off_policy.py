@@ -100,7 +100,8 @@ def train_off_policy(
                 buffer.cut()
             if tick and on_tick is not None:
                 metrics = to_numbers(loop.metrics, update) | loop.episodes.summary()
-                extra = buffer.state() if cut and saves else None
+                # The last checkpoint needs no buffer: there is nothing left to learn from it.
+                extra = buffer.state() if cut and saves and steps < budget else None
                 seconds = time.perf_counter() - started
                 on_tick(Tick(update, steps, seconds, metrics, state, cut, extra))
             if cut and steps < budget:
