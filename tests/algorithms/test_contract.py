@@ -569,7 +569,7 @@ def test_an_algorithm_that_cannot_act_names_those_that_can(kind, space, able):
         make_algorithm(kind(), obs, space)
         return
     names = [k.__name__ for k in (PPO, DQN, TD3, SAC) if k in able]
-    says = f"{' and '.join(names)} can" if names else "no algorithm here can"
+    says = f"{', '.join(names)} can" if names else "no algorithm here can"
     with pytest.raises(SkillweaveError) as error:
         make_algorithm(kind(), obs, space)
     assert str(error.value) == f"{kind.__name__} cannot act in {space}; {says}"
