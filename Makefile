@@ -39,6 +39,7 @@ bench: .venv/dev
 	$(BIN)/python -m benchmarks
 
 figures: .venv/dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
 	$(BIN)/python -m benchmarks --all
 
 weights: .venv/demo

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.networks.encoders import Inputs
+from skillweave.networks.heads import ActionHead
 from skillweave.networks.stacked import Layout
 from skillweave.ops.optim import merge_moments
 from skillweave.seeding import Seeds
@@ -43,6 +44,7 @@ class Algorithm:
     config: Any
     layout: Layout
     acting: Layout
+    head: ActionHead
     memory: int = 0
     """M, numbers that an environment's memory holds; 0: none."""
 
@@ -53,11 +55,12 @@ class Algorithm:
         action_space: gym.Space[Any],
     ) -> None:
         check_spaces(config, action_space)
+        self.config = config
         self.observation_space, self.action_space = observation_space, action_space
         self.obs, self.codec = obs_codec(observation_space), action_codec(action_space)
         self.normalize_obs = config.normalize_obs and self.obs.scaled
 
-    def fresh(self, config: AlgorithmConfig, members: int) -> dict[str, Tensor]:
+    def fresh(self, members: int) -> dict[str, Tensor]:
         """The fields that every state has: moments of observations and returns, settings."""
         return {
             "obs_mean": torch.zeros(members, self.obs.size),
@@ -66,7 +69,7 @@ class Algorithm:
             "return_mean": torch.zeros(members, 1),
             "return_var": torch.ones(members, 1),
             "return_count": torch.full((members,), 1e-4),
-            **{k: torch.full((members,), float(getattr(config, k))) for k in self.settings},
+            **{k: torch.full((members,), float(getattr(self.config, k))) for k in self.settings},
         }
 
     def actor(self, state: Any, progress: float = 1.0) -> Actor:
@@ -78,7 +81,7 @@ class Algorithm:
         """Shift and scale of observations, each (P, 1, O), or None where they are not scaled."""
         if not self.normalize_obs:
             return None, None
-        return state.obs_mean[:, None].clone(), (state.obs_var + 1e-8).rsqrt()[:, None]
+        return _scaling(state.obs_mean, state.obs_var)
 
     def layouts(self) -> dict[str, Layout]:
         """The fields of the state that hold parameters, or moments of them, and their columns."""
@@ -101,8 +104,7 @@ class Algorithm:
         views = {k: weights[k][None].clone() for k in self.acting.shapes}
         if not self.normalize_obs:
             return Actor(views, None, None)
-        shift, scale = weights["obs_mean"], (weights["obs_var"] + 1e-8).rsqrt()
-        return Actor(views, shift[None, None], scale[None, None])
+        return Actor(views, *_scaling(weights["obs_mean"][None], weights["obs_var"][None]))
 
     def inputs(self, actor: Actor, obs: Tensor) -> Inputs:
         """Raw observations (P, B, *item) as the network's inputs; images stay as they came."""
@@ -116,7 +118,7 @@ class Algorithm:
 
     def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Any:
         """Exploration noise for ``steps`` calls of ``act``, by step; a stream a member."""
-        raise NotImplementedError
+        return self.head.noise(generators, steps, batch)
 
     def act(
         self,
@@ -147,6 +149,13 @@ class Algorithm:
             vector, _ = self.obs.split(obs)
             state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector)
 
+    def see_returns(self, state: Any, returns: Tensor) -> None:
+        """Take returns (P, B) into account in their running moments, in place."""
+        moments = state.return_mean, state.return_var, state.return_count
+        state.return_mean, state.return_var, state.return_count = merge_moments(
+            *moments, returns[..., None]
+        )
+
     def to_env(self, action: Array) -> Array:
         """Policy units (n, …) to the environment's."""
         return self.codec.to_env(action)
@@ -154,3 +163,8 @@ class Algorithm:
     def member_generators(self, seeds: list[Seeds]) -> list[torch.Generator]:
         """The generators of fresh members' weights."""
         return [(s / "init").torch() for s in seeds]
+
+
+def _scaling(mean: Tensor, var: Tensor) -> tuple[Tensor, Tensor]:
+    """Shift and scale (P, 1, O) from moments (P, O); copies."""
+    return mean[:, None].clone(), (var + 1e-8).rsqrt()[:, None]

@@ -14,13 +14,12 @@ from torch import Tensor
 
 from skillweave.algorithms.base import Actor
 from skillweave.algorithms.config import DQN
-from skillweave.algorithms.off_policy import OffPolicyAlgorithm, weighted_mean
+from skillweave.algorithms.off_policy import OffPolicyAlgorithm, normal, weighted_mean
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.net import QNet
 from skillweave.networks.stacked import Layout, Views
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import categorical_projection, td_loss
-from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.seeding import Seeds
 from skillweave.types import Sample
 
@@ -56,7 +55,6 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         self, config: DQN, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
-        self.config = config
         self.atoms = None
         if config.distributional:
             self.atoms = torch.linspace(config.v_min, config.v_max, config.n_atoms)
@@ -77,7 +75,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
             count=torch.zeros(len(seeds)),
-            **self.fresh(self.config, len(seeds)),
+            **self.fresh(len(seeds)),
         )
 
     def layouts(self) -> dict[str, Layout]:
@@ -132,15 +130,10 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         leaves = self.layout.leaves(state.params)
         noises: list[Tensor | None] = [None, None, None]  # online, target, choice of its action
         if self.config.noisy:
-            size = self.net.noise_size
-            drawn = [torch.randn(3, size, generator=g) for g in generators]
-            noises = list(torch.stack(drawn, dim=1))
+            noises = list(normal(generators, 3, self.net.noise_size).unbind(1))
         loss, error, q = self.loss(leaves, state, sample, noises)
-        grad = self.layout.gradient(loss, leaves)
-        norm = clip_grad_norm_(grad, state.max_grad_norm)
         rate = self.rate(state, progress)
-        moments = state.mu, state.nu, state.count
-        adam_(state.params, grad, *moments, rate, eps=self.config.adam_eps)
+        norm = self.step_(state, loss, leaves, rate)
         if int(state.count[0]) % self.config.target_update_interval == 0:
             state.target.lerp_(state.params, state.tau[:, None])
         metrics = {"loss": loss.detach(), "q": q, "grad_norm": norm, "learning_rate": rate}
@@ -152,8 +145,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         """Loss (P,), error of each sample (P, B) and mean value (P,), the latter two detached."""
         actor = Actor({}, *self.scaling(state))
         out = self.net(self._noisy(views, noises[0]), self.inputs(actor, sample.obs))
-        chosen = sample.action[..., None, None].expand(*sample.action.shape, 1, out.shape[-1])
-        out = out.gather(2, chosen).squeeze(2)  # (P, B, atoms)
+        out = _taken(out, sample.action)
         next_inputs = self.inputs(actor, sample.next_obs)
         reward = self.rewards(state, sample)
         with torch.no_grad():
@@ -183,11 +175,10 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         out = self.net(self._noisy(slow, noises[1]), inputs)
         judge = self.net(self._noisy(views, noises[2]), inputs) if self.config.double else out
         best = mask_logits(self._q(judge), sample.mask).argmax(-1)
-        chosen = out.gather(2, best[..., None, None].expand(*best.shape, 1, out.shape[-1]))
+        chosen = _taken(out, best)
         if self.atoms is None:
-            return self.target(reward, sample.discount, chosen.flatten(2).squeeze(-1))
-        p = chosen.squeeze(2).softmax(-1)
-        return categorical_projection(p, self.atoms, reward, sample.discount)
+            return self.target(reward, sample.discount, chosen.squeeze(-1))
+        return categorical_projection(chosen.softmax(-1), self.atoms, reward, sample.discount)
 
     def _noisy(self, views: Views, noise: Tensor | None) -> Views:
         return views if noise is None else self.net.perturbed(views, noise)
@@ -197,3 +188,9 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         if self.atoms is None:
             return out.squeeze(-1)
         return (out.softmax(-1) * self.atoms).sum(-1)
+
+
+def _taken(out: Tensor, action: Tensor) -> Tensor:
+    """What a network says of one action each: (P, B, A, atoms), (P, B) to (P, B, atoms)."""
+    index = action[..., None, None].expand(*action.shape, 1, out.shape[-1])
+    return out.gather(2, index).squeeze(2)

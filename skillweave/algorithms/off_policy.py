@@ -4,32 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.config import OffPolicy
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
 from skillweave.ops.distributions import mask_logits
-from skillweave.ops.optim import adam_, clip_grad_norm_, merge_moments
+from skillweave.ops.losses import td_loss
+from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.spaces import ObsCodec
 from skillweave.types import Sample
 
 
 class OffPolicyAlgorithm(Algorithm):
     """Learns from samples of a replay buffer, one gradient step at a time."""
-
-    config: Any
-
-    def __init__(
-        self, config: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
-    ) -> None:
-        super().__init__(config, observation_space, action_space)
-        assert isinstance(config, OffPolicy)
 
     def update(
         self, state: Any, sample: Sample, progress: float, generators: list[torch.Generator]
@@ -55,13 +46,6 @@ class OffPolicyAlgorithm(Algorithm):
             return 2.0 * uniform - 1.0
         return mask_logits(uniform, mask).argmax(-1)
 
-    def see_returns(self, state: Any, returns: Tensor) -> None:
-        """Take running discounted returns (P, B) into account in the scale of rewards."""
-        moments = state.return_mean, state.return_var, state.return_count
-        state.return_mean, state.return_var, state.return_count = merge_moments(
-            *moments, returns[..., None]
-        )
-
     def rewards(self, state: Any, sample: Sample) -> Tensor:
         """Rewards (P, B) in the units that critics learn in."""
         if not self.config.normalize_rewards:
@@ -79,6 +63,14 @@ class OffPolicyAlgorithm(Algorithm):
         """``r + discount·V(s′)``, each (P, B)."""
         # Not a product: what a terminal observation is worth may be anything, 0·NaN is NaN.
         return reward + torch.where(discount == 0.0, 0.0, discount * value)
+
+    def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor) -> Tensor:
+        """One gradient step on ``state.params``; the gradient's norm before clipping, (P,)."""
+        grad = self.layout.gradient(loss, leaves)
+        norm = clip_grad_norm_(grad, state.max_grad_norm)
+        moments = state.mu, state.nu, state.count
+        adam_(state.params, grad, *moments, rate, eps=self.config.adam_eps)
+        return norm
 
 
 class Critics:
@@ -123,6 +115,10 @@ class Critics:
         """Windows into (P, K, D), each (P·K, *shape)."""
         return self.layout.views(flat.flatten(0, 1))
 
+    def leaves(self, flat: Tensor) -> dict[str, Tensor]:
+        """Like ``views``, each a leaf that can be differentiated by."""
+        return self.layout.leaves(flat.flatten(0, 1))
+
     def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor, eps: float) -> Tensor:
         """One gradient step on ``state.critic``; the gradient's norm before clipping, (P,)."""
         grad = self.layout.gradient(loss, leaves).view(len(state.critic), -1)
@@ -135,3 +131,21 @@ class Critics:
 def weighted_mean(loss: Tensor, weight: Tensor | None) -> Tensor:
     """Mean over the batch, (P, B) to (P,), with the weights of prioritised replay."""
     return loss.mean(1) if weight is None else (loss * weight).mean(1)
+
+
+def regression(q: Tensor, target: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Critics' values (P, K, B) against one target (P, B), half the squared error.
+
+    Returns:
+        Loss (P,), summed over the critics, and detached the error of each sample (P, B) and the
+        mean value (P,).
+    """
+    target = target[:, None]
+    loss = weighted_mean(td_loss(q, target, "mse").sum(1), weight)
+    error = (q.detach() - target).abs().mean(1)
+    return loss, error, q.detach().mean((1, 2))
+
+
+def normal(generators: list[torch.Generator], *shape: int) -> Tensor:
+    """Standard normal numbers (P, *shape), a stream a member."""
+    return torch.stack([torch.randn(shape, generator=g) for g in generators])

@@ -22,7 +22,7 @@ from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views, take_rows
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
-from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate, merge_moments
+from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
 from skillweave.ops.returns import explained_variance, gae, normalise
 from skillweave.seeding import Seeds
 from skillweave.types import Array, Transition
@@ -79,7 +79,6 @@ class PPOAlgorithm(Algorithm):
         self, config: PPO, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
-        self.config = config
         self.head = ActionHead(self.codec, config.action_std, config.squash_actions)
         self.actor_net = Net("actor", self.obs, config.network, self.head.width)
         self.critic_net = Net("critic", self.obs, config.critic or config.network, 1)
@@ -109,12 +108,8 @@ class PPOAlgorithm(Algorithm):
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
             count=torch.zeros(members),
-            **self.fresh(cfg, members),
+            **self.fresh(members),
         )
-
-    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
-        """Noise for ``steps`` calls of ``act``, first axis the steps."""
-        return self.head.noise(generators, steps, batch)
 
     def act(
         self,
@@ -241,10 +236,7 @@ class PPOAlgorithm(Algorithm):
         returns = advantage + value
         metrics = {"explained_variance": explained_variance(value.flatten(1), returns.flatten(1))}
         if cfg.normalize_returns:
-            moments = state.return_mean, state.return_var, state.return_count
-            state.return_mean, state.return_var, state.return_count = merge_moments(
-                *moments, returns.flatten(1)[..., None]
-            )
+            self.see_returns(state, returns.flatten(1))
         if cfg.normalize_advantage:
             advantage = normalise(advantage)
         mean, scale = state.return_mean[..., None], self._return_scale(state)[..., None]

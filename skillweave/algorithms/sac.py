@@ -15,14 +15,13 @@ from torch import Tensor
 
 from skillweave.algorithms.base import Actor
 from skillweave.algorithms.config import SAC
-from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, weighted_mean
+from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
 from skillweave.ops.distributions import mask_logits, tanh_log_det
-from skillweave.ops.losses import td_loss
-from skillweave.ops.optim import adam_, clip_grad_norm_
+from skillweave.ops.optim import adam_
 from skillweave.seeding import Seeds
 from skillweave.types import Sample
 
@@ -70,7 +69,6 @@ class SACAlgorithm(OffPolicyAlgorithm):
         self, config: SAC, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
-        self.config = config
         self.head = ActionHead(self.codec, "state")
         self.net = Net("actor", self.obs, config.network, self.head.width)
         self.layout = self.acting = Layout(self.net.shapes)
@@ -103,16 +101,12 @@ class SACAlgorithm(OffPolicyAlgorithm):
             alpha_count=torch.zeros(members),
             policy_loss=torch.zeros(members),
             entropy=torch.zeros(members),
-            **self.fresh(self.config, members),
+            **self.fresh(members),
         )
 
     def layouts(self) -> dict[str, Layout]:
         """The fields of the state that hold parameters, or moments of them, and their columns."""
         return super().layouts() | self.critics.layouts()
-
-    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
-        """Noise for ``steps`` calls of ``act``, first axis the steps."""
-        return self.head.noise(generators, steps, batch)
 
     def act(
         self,
@@ -136,7 +130,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         actor, rate = Actor({}, *self.scaling(state)), self.rate(state, progress)
         eps, alpha = self.config.adam_eps, state.log_alpha.exp()
         inputs = self.inputs(actor, sample.obs)
-        leaves = self.critics.layout.leaves(state.critic.flatten(0, 1))
+        leaves = self.critics.leaves(state.critic)
         following = self.inputs(actor, sample.next_obs)
         loss, error, q = self.critic_loss(
             leaves, state, sample, inputs, following, alpha, generators
@@ -147,9 +141,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
             policy_loss, entropy = self.policy_loss(
                 policy, state, sample.obs_mask, inputs, alpha, generators
             )
-            grad = self.layout.gradient(policy_loss, policy)
-            clip_grad_norm_(grad, state.max_grad_norm)
-            adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=eps)
+            self.step_(state, policy_loss, policy, rate)
             state.policy_loss, state.entropy = policy_loss.detach(), entropy
             if self.config.learn_ent_coef:
                 # d/d log α of −log α·(log π + H̄), as in the authors' code, not of −α·(…).
@@ -190,16 +182,14 @@ class SACAlgorithm(OffPolicyAlgorithm):
                 action, log_prob = self._sampled(head, generators)
                 q = self.critics(slow, following, action).squeeze(-1).amin(1)
                 value = q - alpha * log_prob
-            target = self.target(self.rewards(state, sample), sample.discount, value)[:, None]
+            target = self.target(self.rewards(state, sample), sample.discount, value)
         if self.codec.discrete:
             out = self.critics(views, inputs)  # (P, K, B, A)
             chosen = sample.action[:, None, :, None].expand(*out.shape[:3], 1)
             q = out.gather(-1, chosen).squeeze(-1)
         else:
             q = self.critics(views, inputs, sample.action).squeeze(-1)
-        loss = weighted_mean(td_loss(q, target, "mse").sum(1), sample.weight)
-        error = (q.detach() - target).abs().mean(1)
-        return loss, error, q.detach().mean((1, 2))
+        return regression(q, target, sample.weight)
 
     def policy_loss(
         self,
@@ -226,8 +216,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
     def _sampled(self, head: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, Tensor]:
         """Squashed actions (P, B, A) and their log-probability (P, B); app. C."""
         mean, log_std = self.head.moments(head, None)
-        shape = mean.shape[1:]
-        z = torch.stack([torch.randn(shape, generator=g) for g in generators])
+        z = normal(generators, *mean.shape[1:])
         u = torch.addcmul(mean, log_std.exp(), z)
         log_prob = -0.5 * z.square() - log_std - _HALF_LOG_TWO_PI - tanh_log_det(u)
         return u.tanh(), log_prob.sum(-1)

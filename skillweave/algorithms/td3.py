@@ -14,12 +14,11 @@ from torch import Tensor
 
 from skillweave.algorithms.base import Actor
 from skillweave.algorithms.config import TD3
-from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, weighted_mean
+from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
 from skillweave.networks.encoders import Inputs
+from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
-from skillweave.ops.losses import td_loss
-from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.seeding import Seeds
 from skillweave.types import Sample
 
@@ -67,7 +66,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
         self, config: TD3, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
-        self.config = config
+        self.head = ActionHead(self.codec)
         self.net = Net("actor", self.obs, config.network, self.codec.size)
         self.layout = self.acting = Layout(self.net.shapes)
         network, count = config.critic or config.network, 2 if config.twin else 1
@@ -91,7 +90,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
             critic_nu=torch.zeros_like(critic),
             critic_count=torch.zeros(len(seeds)),
             policy_loss=torch.zeros(len(seeds)),
-            **self.fresh(self.config, len(seeds)),
+            **self.fresh(len(seeds)),
         )
 
     def layouts(self) -> dict[str, Layout]:
@@ -103,11 +102,6 @@ class TD3Algorithm(OffPolicyAlgorithm):
         actor = super().actor(state, progress)
         actor.extra["noise"] = state.exploration_noise[:, None, None].clone()
         return actor
-
-    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
-        """Standard normal noise, (steps, P, batch, A)."""
-        shape = (steps, batch, self.codec.size)
-        return torch.stack([torch.randn(shape, generator=g) for g in generators], dim=1)
 
     def act(
         self,
@@ -129,17 +123,14 @@ class TD3Algorithm(OffPolicyAlgorithm):
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step of the critics, and now and then of the actor, in place."""
         actor, rate = Actor({}, *self.scaling(state)), self.rate(state, progress)
-        eps = self.config.adam_eps
         inputs = self.inputs(actor, sample.obs)
-        leaves = self._leaves(state)
+        leaves = self.critics.leaves(state.critic)
         loss, error, q = self.critic_loss(leaves, state, sample, actor, inputs, generators)
-        norm = self.critics.step_(state, loss, leaves, rate, eps)
+        norm = self.critics.step_(state, loss, leaves, rate, self.config.adam_eps)
         if int(state.critic_count[0]) % self.config.policy_delay == 0:
             policy = self.layout.leaves(state.params)
             policy_loss = self.policy_loss(policy, state, inputs)
-            grad = self.layout.gradient(policy_loss, policy)
-            clip_grad_norm_(grad, state.max_grad_norm)
-            adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=eps)
+            self.step_(state, policy_loss, policy, rate)
             state.target.lerp_(state.params, state.tau[:, None])
             state.critic_target.lerp_(state.critic, state.tau[:, None, None])
             state.policy_loss = policy_loss.detach()
@@ -160,24 +151,18 @@ class TD3Algorithm(OffPolicyAlgorithm):
             following = self.inputs(actor, sample.next_obs)
             action = self.net(self.layout.views(state.target), following).tanh()
             if self.config.target_noise:
-                shape = action.shape[1:]
-                normal = torch.stack([torch.randn(shape, generator=g) for g in generators])
+                noise = normal(generators, *action.shape[1:]) * state.target_noise[:, None, None]
                 bound = state.target_noise_clip[:, None, None]
-                noise = (normal * state.target_noise[:, None, None]).clamp(-bound, bound)
+                noise = noise.clamp(-bound, bound)
                 action = (action + noise).clamp(-1.0, 1.0)
             slow = self.critics.views(state.critic_target)
             value = self.critics(slow, following, action).squeeze(-1).amin(1)
-            target = self.target(self.rewards(state, sample), sample.discount, value)[:, None]
+            target = self.target(self.rewards(state, sample), sample.discount, value)
         q = self.critics(views, inputs, sample.action).squeeze(-1)  # (P, K, B)
-        loss = weighted_mean(td_loss(q, target, "mse").sum(1), sample.weight)
-        error = (q.detach() - target).abs().mean(1)
-        return loss, error, q.detach().mean((1, 2))
+        return regression(q, target, sample.weight)
 
     def policy_loss(self, views: Views, state: State, inputs: Inputs) -> Tensor:
         """``−Q₁(s, π(s))`` (eq. 15 with one critic, as in the paper), (P,)."""
         first = self.critics.views(state.critic[:, :1])
         q = self.critics(first, inputs, self.net(views, inputs).tanh())
         return -q.flatten(1).mean(1)
-
-    def _leaves(self, state: State) -> dict[str, Tensor]:
-        return self.critics.layout.leaves(state.critic.flatten(0, 1))

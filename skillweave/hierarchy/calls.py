@@ -44,15 +44,7 @@ class SkillSet:
         """
         if not any(s.defines("initiation") for s in self.skills):
             return None
-        mask = np.stack(
-            [
-                checked(s.initiation(obs), len(obs), bool, f"skill {s.name!r}", "initiation")
-                if s.defines("initiation")
-                else np.ones(len(obs), bool)
-                for s in self.skills
-            ],
-            axis=1,
-        )
+        mask = self.startable(obs)
         if not mask.any(axis=1).all():
             row = int(np.flatnonzero(~mask.any(axis=1))[0])
             names = ", ".join(repr(s.name) for s in self.skills)
@@ -61,6 +53,18 @@ class SkillSet:
                 f"initiation() of {names} is False there. Let at least one start everywhere"
             )
         return mask
+
+    def startable(self, obs: Array) -> Array:
+        """Where each skill may start, (n, S) bool; perhaps none in some observation."""
+        return np.stack(
+            [
+                checked(s.initiation(obs), len(obs), bool, f"skill {s.name!r}", "initiation")
+                if s.defines("initiation")
+                else np.ones(len(obs), bool)
+                for s in self.skills
+            ],
+            axis=1,
+        )
 
     def start(self, n: int) -> Memory:
         """Memory of n environments in which no call has begun."""

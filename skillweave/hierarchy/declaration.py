@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import gymnasium as gym
@@ -18,10 +18,6 @@ from skillweave.types import Policy, SkillweaveError
 
 RESERVED = ("selector", "flat")
 """Names of phases that are not skills."""
-WHOLE = (
-    "skill_steps", "selector_steps", "flat_steps", "cut_every", "call_steps", "eval_every",
-    "eval_episodes",
-)  # fmt: skip
 
 
 @dataclass
@@ -74,13 +70,13 @@ class Declaration:
                 )
         for name in ("algorithm", "selector", "flat"):
             _check_algorithm(getattr(self, name), f"{name}", optional=name == "flat")
-        for name in WHOLE:
-            value = getattr(self, name)
-            none = name in ("call_steps", "flat_steps", "eval_every")
-            if (value is None and none) or (type(value) is int and value >= 1):
+        for f in fields(self):
+            value, none = getattr(self, f.name), f.type == "int | None"
+            if f.type not in ("int", "int | None") or (value is None and none):
                 continue
-            what = "at least 1, or None" if none else "a whole number, at least 1"
-            raise SkillweaveError(f"{name} is {value!r}; it must be {what}")
+            if type(value) is not int or value < 1:
+                what = "at least 1, or None" if none else "a whole number, at least 1"
+                raise SkillweaveError(f"{f.name} is {value!r}; it must be {what}")
         if self.call_steps is None:
             for skill in self.skills:
                 if skill.max_steps is None and not skill.defines("termination"):

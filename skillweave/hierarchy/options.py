@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +11,6 @@ from gymnasium.vector.utils import batch_space
 
 from skillweave.envs.engine import Engine
 from skillweave.hierarchy.calls import SkillSet
-from skillweave.skills import Skill
 from skillweave.spaces import unpack
 from skillweave.types import Array, SkillweaveError, Step
 
@@ -51,8 +49,6 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = np.broadcast_to(np.asarray(gamma, np.float64), (self.num_envs,))
         self._watches = skills.watches
-        # With a skill that may start everywhere beside the others, a mask is never an error.
-        self._never_stuck = replace(skills, skills=(*skills.skills, Skill()))
         self._seed = seed
         self._obs: Array = np.empty(0)
         self._mask: Array | None = None
@@ -136,7 +132,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         mask[terminated] = True
         cut = np.flatnonzero(truncated & ~terminated)
         if len(cut):
-            found = np.asarray(self._never_stuck.mask(next_obs[cut]))[:, :-1]
+            found = self.skills.startable(next_obs[cut])
             mask[cut] = found | ~found.any(axis=1, keepdims=True)
         return {"action_mask": self._mask, "next_action_mask": mask}
 

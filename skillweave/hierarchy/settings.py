@@ -14,17 +14,7 @@ from skillweave.algorithms.config import named_config
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.types import SkillweaveError
 
-PLAIN = (
-    "call_steps",
-    "skill_steps",
-    "selector_steps",
-    "flat_steps",
-    "greedy_skills",
-    "reflexes_in_training",
-    "cut_every",
-    "eval_every",
-    "eval_episodes",
-)
+PLAIN = tuple(f.name for f in fields(Declaration) if f.type in ("int", "int | None", "bool"))
 CONFIGS = ("algorithm", "selector", "flat")
 
 

@@ -34,7 +34,7 @@ class Net:
     def __init__(
         self, name: str, obs: ObsCodec, network: Network, outputs: int | None, extra: int = 0
     ) -> None:
-        self.name, self.network, self._extra = name, network, extra
+        self.name, self.network = name, network
         self.encoders: dict[str, Encoder] = {}
         self._vector = network.encoder is None and obs.size > 0
         if network.encoder is not None:

@@ -54,6 +54,11 @@ class Foreign(Memoryless):
         """Actions for a batch of observations."""
         raise NotImplementedError
 
+    def must_be_bound(self) -> None:
+        """Raise a SkillweaveError where it has not met an environment yet."""
+        if self.action_space is None:
+            raise SkillweaveError(f"{self._who} has no spaces yet: bind() it to an environment's")
+
     def source(self) -> dict[str, Any]:
         """Where it comes from, as JSON for ``run.json``: at least its kind."""
         content = self.content()

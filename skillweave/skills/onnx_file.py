@@ -85,8 +85,7 @@ class OnnxPolicy(Foreign):
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """The model's actions; logits are sampled with ``rng`` where not ``deterministic``."""
-        if self.action_space is None:
-            raise SkillweaveError(f"{self._who} has no spaces yet: bind() it to an environment's")
+        self.must_be_bound()
         rows = np.ascontiguousarray(obs, NUMBERS[self._input.type])
         if self._input.shape[0] == 1 and len(rows) != 1:
             output = np.concatenate([self._run(row[None]) for row in rows])

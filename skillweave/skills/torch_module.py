@@ -49,8 +49,7 @@ class TorchPolicy(Foreign):
 
         from skillweave.spaces import unpack
 
-        if self.action_space is None:
-            raise SkillweaveError(f"{self._who} has no spaces yet: bind() it to an environment's")
+        self.must_be_bound()
         some = next(chain(self.module.parameters(), self.module.buffers()), None)
         device = None if some is None else some.device
         with torch.inference_mode():

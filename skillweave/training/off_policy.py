@@ -18,8 +18,8 @@ from torch import Tensor
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.buffers.replay import ReplayBuffer
 from skillweave.seeding import Seeds
-from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick, to_numbers
+from skillweave.training.members import by_member, member_seeds, passed
 from skillweave.types import Array, VecEnv
 
 REPORT_EVERY = 1_000
@@ -93,8 +93,8 @@ def train_off_policy(
         while steps < budget:
             taken = loop.collect(update, steps)
             loop.learn(update, steps + taken)
-            cut = (steps + taken) // cut_every > steps // cut_every or steps + taken >= budget
-            tick = cut or (steps + taken) // REPORT_EVERY > steps // REPORT_EVERY
+            cut = passed(cut_every, steps, steps + taken) or steps + taken >= budget
+            tick = cut or passed(REPORT_EVERY, steps, steps + taken)
             update, steps = update + 1, steps + taken
             if cut:
                 buffer.cut()
@@ -126,6 +126,7 @@ class _Loop:
         self.algorithm, self.env, self.state, self.seeds = algorithm, env, state, seeds
         self.budget, self.buffer = budget, buffer
         self.members = len(state.params)
+        self._each = env.num_envs // self.members
         self.episodes = Episodes()
         self.metrics: dict[str, Tensor] = {}
         self._obs: Array = np.empty(0)
@@ -141,21 +142,20 @@ class _Loop:
     def collect(self, update: int, steps: int) -> int:
         """Act ``train_freq`` times in every environment; the environment steps it took."""
         algorithm, env, cfg = self.algorithm, self.env, self.algorithm.config
-        each, spent = env.num_envs // self.members, 0
+        spent = 0
         actor = algorithm.actor(self.state, min(1.0, steps / self.budget))
-        generators = [(self.seeds / "act" / m / update).torch() for m in range(self.members)]
-        noises = algorithm.noise(generators, cfg.train_freq, each)
+        seeds = member_seeds(self.seeds, "act", self.members, update)
+        generators = [s.torch() for s in seeds]
+        noises = algorithm.noise(generators, cfg.train_freq, self._each)
         # A resumed run whose buffer was not saved fills it by what it has learnt already.
         at_random = update * self._round < cfg.learning_starts
         mask = env.mask()
         for noise in noises:
             obs = self._obs
-            rows = to_tensor(obs).unflatten(0, (self.members, each))
-            allowed = None
-            if mask is not None:
-                allowed = torch.from_numpy(mask).unflatten(0, (self.members, each))
+            rows = by_member(obs, self.members)
+            allowed = None if mask is None else by_member(mask, self.members)
             if at_random:
-                chosen = algorithm.random_actions(generators, each, allowed)
+                chosen = algorithm.random_actions(generators, self._each, allowed)
             else:
                 chosen, _, _ = algorithm.act(actor, rows, allowed, noise)
             action = chosen.flatten(0, 1).numpy()
@@ -170,19 +170,17 @@ class _Loop:
     @property
     def _round(self) -> int:
         """Transitions of a member in a round."""
-        return int(self.algorithm.config.train_freq) * (self.env.num_envs // self.members)
+        return int(self.algorithm.config.train_freq) * self._each
 
     def _see(self, rows: Tensor, step: Any) -> None:
         """Keep the running scales of observations and returns."""
         algorithm = self.algorithm
         algorithm.see(self.state, rows)
         if algorithm.config.normalize_rewards:
-            each = self.env.num_envs // self.members
-            gamma = np.repeat(self.state.gamma.numpy(), each)
+            gamma = np.repeat(self.state.gamma.numpy(), self._each)
             now = self._returns * gamma**step.steps + step.reward
             self._returns = now.astype(np.float32)  # a power of integers has 64 bits
-            returns = torch.from_numpy(self._returns).view(self.members, each)
-            algorithm.see_returns(self.state, returns)
+            algorithm.see_returns(self.state, by_member(self._returns, self.members))
             self._returns[step.ended] = 0.0
 
     def learn(self, update: int, steps: int) -> None:
@@ -194,7 +192,7 @@ class _Loop:
             return
         progress = min(1.0, steps / self.budget)
         beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)
-        seeds = [self.seeds / "learn" / m / update for m in range(self.members)]
+        seeds = member_seeds(self.seeds, "learn", self.members, update)
         rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
         for _ in range(due):
             sample = self.buffer.sample(cfg.batch_size, self.state.gamma, rngs, beta)

@@ -18,8 +18,8 @@ from skillweave.algorithms.base import Actor
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.buffers.rollout import RolloutBuffer
 from skillweave.seeding import Seeds
-from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick, to_numbers
+from skillweave.training.members import by_member, member_seeds, passed
 from skillweave.types import Array, VecEnv
 
 
@@ -59,7 +59,7 @@ def train_on_policy(
             rollout, taken = loop.collect(actor, state, update)
             actor = learner.wait(actor)
             learner.start(rollout, update, steps, steps + taken)
-            cut = (steps + taken) // cut_every > steps // cut_every or steps + taken >= budget
+            cut = passed(cut_every, steps, steps + taken) or steps + taken >= budget
             update, steps = update + 1, steps + taken
             if cut or not algorithm.config.overlap:
                 actor = learner.wait(actor, cut)
@@ -127,7 +127,7 @@ class _Loop:
 
     def member_seeds(self, name: str, update: int) -> list[Seeds]:
         """A node of the seed tree for each member."""
-        return [self.seeds / name / member / update for member in range(self.members)]
+        return member_seeds(self.seeds, name, self.members, update)
 
     def restart(self, update: int) -> None:
         """Start every environment anew from a seed of this update's."""
@@ -149,8 +149,8 @@ class _Loop:
         starts = torch.zeros(p, t, n // p, dtype=torch.bool)
         for i, noise in enumerate(noises):
             obs = self._obs
-            rows = to_tensor(obs).unflatten(0, (p, n // p))
-            allowed = None if mask is None else torch.from_numpy(mask).unflatten(0, (p, n // p))
+            rows = by_member(obs, p)
+            allowed = None if mask is None else by_member(mask, p)
             action, head, memory = algorithm.act(actor, rows, allowed, noise, self._memory)
             step = env.step(algorithm.to_env(action.flatten(0, 1).numpy()))
             buffer.add(obs, mask, action, head, step)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.seeding import Seeds
+from skillweave.training.members import passed
 from skillweave.types import Array, Policy, VecEnv
 
 MakeEnv = Callable[[int, Any], VecEnv]
@@ -50,7 +51,7 @@ class Probe:
 
     def look(self, steps: int, policy: Callable[[], Policy]) -> dict[str, float]:
         """Metrics where it is time to look, else none."""
-        if self._every is None or steps // self._every == self._last // self._every:
+        if self._every is None or not passed(self._every, self._last, steps):
             return {}
         self._last = steps
         self._env = self._env or self._make()
