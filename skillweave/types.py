@@ -5,8 +5,8 @@ This module imports nothing of the library and does not import torch at run time
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
@@ -116,6 +116,14 @@ class Sample:
     mask: Tensor | None  # (P, B, A) bool, allowed actions in ``next_obs``; None: all
     weight: Tensor | None  # (P, B) float32, importance weights; None where drawn uniformly
     index: Array  # (P, B) int64, which transitions these are, to give them new priorities
+
+    def split(self, batch: int) -> Iterator[Sample]:
+        """Samples of ``batch`` transitions of each member, one after another."""
+        size = self.reward.shape[1]
+        whole: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        for start in range(0, size, batch):
+            rows = slice(start, start + batch)
+            yield Sample(**{k: None if v is None else v[:, rows] for k, v in whole.items()})
 
 
 class VecEnv(Protocol):

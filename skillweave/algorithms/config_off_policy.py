@@ -111,6 +111,8 @@ class OffPolicy:
     """Checkpoints hold the replay buffer, so that resuming is exact; else it fills anew."""
     threads: int = 1
     """Torch threads while learning."""
+    compile: bool = False
+    """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute."""
 
     def __post_init__(self) -> None:
         check_networks(self)

@@ -5,6 +5,7 @@ Read down the page: State, init, act, update, loss. The settings are ``config.DQ
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,11 +51,13 @@ class DQNAlgorithm(OffPolicyAlgorithm):
 
     state_type = State
     settings = ("learning_rate", "gamma", "tau", "max_grad_norm")
+    counter = "count"
 
     def __init__(
         self, config: DQN, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
+        self.interval = config.target_update_interval
         self.atoms = None
         if config.distributional:
             self.atoms = torch.linspace(config.v_min, config.v_max, config.n_atoms)
@@ -123,24 +126,28 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             action = torch.where(explore, anything, action)
         return action, q, None
 
-    def update(
-        self, state: State, sample: Sample, progress: float, generators: list[torch.Generator]
+    def learning_noise(
+        self, generators: list[torch.Generator], batch: int, due: bool
+    ) -> list[Tensor]:
+        """Of the weights: online, the target's, and those that choose its action; (P, K) each."""
+        if not self.config.noisy:
+            return []
+        return list(normal(generators, 3, self.net.noise_size).unbind(1))
+
+    def learn(
+        self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step, in place; metrics (P,) and errors (P, B)."""
         leaves = self.layout.leaves(state.params)
-        noises: list[Tensor | None] = [None, None, None]  # online, target, choice of its action
-        if self.config.noisy:
-            noises = list(normal(generators, 3, self.net.noise_size).unbind(1))
-        loss, error, q = self.loss(leaves, state, sample, noises)
-        rate = self.rate(state, progress)
+        loss, error, q = self.loss(leaves, state, sample, noise or [None] * 3)
         norm = self.step_(state, loss, leaves, rate)
-        if int(state.count[0]) % self.config.target_update_interval == 0:
+        if due:
             state.target.lerp_(state.params, state.tau[:, None])
         metrics = {"loss": loss.detach(), "q": q, "grad_norm": norm, "learning_rate": rate}
         return metrics, error
 
     def loss(
-        self, views: Views, state: State, sample: Sample, noises: list[Tensor | None]
+        self, views: Views, state: State, sample: Sample, noises: Sequence[Tensor | None]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Loss (P,), error of each sample (P, B) and mean value (P,), the latter two detached."""
         actor = Actor({}, *self.scaling(state))
@@ -168,7 +175,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         sample: Sample,
         inputs: Inputs,
         reward: Tensor,
-        noises: list[Tensor | None],
+        noises: Sequence[Tensor | None],
     ) -> Tensor:
         """r + discount·Q̄(s′, a′), (P, B); or its distribution over the atoms, (P, B, N)."""
         slow = self.layout.views(state.target)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.compiled import compiled
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.net import Net
@@ -22,6 +25,11 @@ from skillweave.types import Sample
 class OffPolicyAlgorithm(Algorithm):
     """Learns from samples of a replay buffer, one gradient step at a time."""
 
+    counter: ClassVar[str] = "critic_count"
+    """The field of the state that counts gradient steps."""
+    interval: int
+    """Gradient steps between those that the slower networks take part in."""
+
     def update(
         self, state: Any, sample: Sample, progress: float, generators: list[torch.Generator]
     ) -> tuple[dict[str, Tensor], Tensor]:
@@ -33,6 +41,34 @@ class OffPolicyAlgorithm(Algorithm):
 
         Returns:
             Metrics (P,), and the samples' errors (P, B), for their priorities.
+        """
+        due = (int(getattr(state, self.counter)[0]) + 1) % self.interval == 0
+        noise = self.learning_noise(generators, sample.reward.shape[1], due)
+        learn = self._compiled if self.config.compile else self.learn
+        done: tuple[dict[str, Tensor], Tensor] = learn(
+            state, sample, self.rate(state, progress), noise, due
+        )
+        return done
+
+    @functools.cached_property
+    def _compiled(self) -> Callable[..., Any]:
+        return compiled(self.learn, f"{type(self.config).__name__}.compile")
+
+    def learning_noise(
+        self, generators: list[torch.Generator], batch: int, due: bool
+    ) -> list[Tensor]:
+        """What ``learn`` needs of chance, a stream a member."""
+        raise NotImplementedError
+
+    def learn(
+        self, state: Any, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """``update`` as nothing but tensor operations, so that it can be compiled.
+
+        Args:
+            rate: the learning rate now, (P,).
+            noise: of ``learning_noise``.
+            due: whether it is the slower networks' turn, too.
         """
         raise NotImplementedError
 

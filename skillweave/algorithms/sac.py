@@ -69,6 +69,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         self, config: SAC, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
+        self.interval = config.policy_delay
         self.head = ActionHead(self.codec, "state")
         self.net = Net("actor", self.obs, config.network, self.head.width)
         self.layout = self.acting = Layout(self.net.shapes)
@@ -123,23 +124,29 @@ class SACAlgorithm(OffPolicyAlgorithm):
             return self.head.act(head, None, noise), head, None
         return self.head.act(head, None, noise).tanh(), head, None
 
-    def update(
-        self, state: State, sample: Sample, progress: float, generators: list[torch.Generator]
+    def learning_noise(
+        self, generators: list[torch.Generator], batch: int, due: bool
+    ) -> list[Tensor]:
+        """Of the next actions, and of those that the actor learns from; (P, B, A) each."""
+        if self.codec.discrete:
+            return []
+        return [normal(generators, batch, self.codec.size) for _ in range(1 + due)]
+
+    def learn(
+        self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step of critics, actor and temperature, in place."""
-        actor, rate = Actor({}, *self.scaling(state)), self.rate(state, progress)
+        actor = Actor({}, *self.scaling(state))
         eps, alpha = self.config.adam_eps, state.log_alpha.exp()
         inputs = self.inputs(actor, sample.obs)
         leaves = self.critics.leaves(state.critic)
         following = self.inputs(actor, sample.next_obs)
-        loss, error, q = self.critic_loss(
-            leaves, state, sample, inputs, following, alpha, generators
-        )
+        loss, error, q = self.critic_loss(leaves, state, sample, inputs, following, alpha, noise)
         norm = self.critics.step_(state, loss, leaves, rate, eps)
-        if int(state.critic_count[0]) % self.config.policy_delay == 0:
+        if due:
             policy = self.layout.leaves(state.params)
             policy_loss, entropy = self.policy_loss(
-                policy, state, sample.obs_mask, inputs, alpha, generators
+                policy, state, sample.obs_mask, inputs, alpha, noise[1:]
             )
             self.step_(state, policy_loss, policy, rate)
             state.policy_loss, state.entropy = policy_loss.detach(), entropy
@@ -168,7 +175,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         inputs: Inputs,
         following: Inputs,
         alpha: Tensor,
-        generators: list[torch.Generator],
+        noise: list[Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Loss (P,), error of each sample (P, B) and mean value (P,)."""
         with torch.no_grad():
@@ -179,7 +186,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
                 q = self.critics(slow, following).amin(1)
                 value = (log_p.exp() * (q - alpha[..., None] * log_p)).sum(-1)
             else:
-                action, log_prob = self._sampled(head, generators)
+                action, log_prob = self._sampled(head, noise[0])
                 q = self.critics(slow, following, action).squeeze(-1).amin(1)
                 value = q - alpha * log_prob
             target = self.target(self.rewards(state, sample), sample.discount, value)
@@ -198,7 +205,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         mask: Tensor | None,
         inputs: Inputs,
         alpha: Tensor,
-        generators: list[torch.Generator],
+        noise: list[Tensor],
     ) -> tuple[Tensor, Tensor]:
         """``E[α·log π − min Q]`` (eq. 7) and the policy's entropy, detached; each (P,)."""
         head, critics = self.net(views, inputs), self.critics.views(state.critic)
@@ -209,14 +216,13 @@ class SACAlgorithm(OffPolicyAlgorithm):
                 q = self.critics(critics, inputs).amin(1)
             loss = (p * (alpha[..., None] * log_p - q)).sum(-1).mean(1)
             return loss, -(p * log_p).detach().sum(-1).mean(1)
-        action, log_prob = self._sampled(head, generators)
+        action, log_prob = self._sampled(head, noise[0])
         q = self.critics(critics, inputs, action).squeeze(-1).amin(1)
         return (alpha * log_prob - q).mean(1), -log_prob.detach().mean(1)
 
-    def _sampled(self, head: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, Tensor]:
+    def _sampled(self, head: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Squashed actions (P, B, A) and their log-probability (P, B); app. C."""
         mean, log_std = self.head.moments(head, None)
-        z = normal(generators, *mean.shape[1:])
         u = torch.addcmul(mean, log_std.exp(), z)
         log_prob = -0.5 * z.square() - log_std - _HALF_LOG_TWO_PI - tanh_log_det(u)
         return u.tanh(), log_prob.sum(-1)

@@ -66,6 +66,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
         self, config: TD3, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
+        self.interval = config.policy_delay
         self.head = ActionHead(self.codec)
         self.net = Net("actor", self.obs, config.network, self.codec.size)
         self.layout = self.acting = Layout(self.net.shapes)
@@ -118,16 +119,22 @@ class TD3Algorithm(OffPolicyAlgorithm):
             action = (action + scale * noise).clamp(-1.0, 1.0)
         return action, None, None
 
-    def update(
-        self, state: State, sample: Sample, progress: float, generators: list[torch.Generator]
+    def learning_noise(
+        self, generators: list[torch.Generator], batch: int, due: bool
+    ) -> list[Tensor]:
+        """Of the target's actions, (P, B, A), where there is any."""
+        return [normal(generators, batch, self.codec.size)] if self.config.target_noise else []
+
+    def learn(
+        self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step of the critics, and now and then of the actor, in place."""
-        actor, rate = Actor({}, *self.scaling(state)), self.rate(state, progress)
+        actor = Actor({}, *self.scaling(state))
         inputs = self.inputs(actor, sample.obs)
         leaves = self.critics.leaves(state.critic)
-        loss, error, q = self.critic_loss(leaves, state, sample, actor, inputs, generators)
+        loss, error, q = self.critic_loss(leaves, state, sample, actor, inputs, noise)
         norm = self.critics.step_(state, loss, leaves, rate, self.config.adam_eps)
-        if int(state.critic_count[0]) % self.config.policy_delay == 0:
+        if due:
             policy = self.layout.leaves(state.params)
             policy_loss = self.policy_loss(policy, state, inputs)
             self.step_(state, policy_loss, policy, rate)
@@ -144,17 +151,16 @@ class TD3Algorithm(OffPolicyAlgorithm):
         sample: Sample,
         actor: Actor,
         inputs: Inputs,
-        generators: list[torch.Generator],
+        noise: list[Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Loss (P,), error of each sample (P, B) and mean value (P,)."""
         with torch.no_grad():
             following = self.inputs(actor, sample.next_obs)
             action = self.net(self.layout.views(state.target), following).tanh()
-            if self.config.target_noise:
-                noise = normal(generators, *action.shape[1:]) * state.target_noise[:, None, None]
+            if noise:
                 bound = state.target_noise_clip[:, None, None]
-                noise = noise.clamp(-bound, bound)
-                action = (action + noise).clamp(-1.0, 1.0)
+                moved = (noise[0] * state.target_noise[:, None, None]).clamp(-bound, bound)
+                action = (action + moved).clamp(-1.0, 1.0)
             slow = self.critics.views(state.critic_target)
             value = self.critics(slow, following, action).squeeze(-1).amin(1)
             target = self.target(self.rewards(state, sample), sample.discount, value)

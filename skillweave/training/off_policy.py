@@ -24,6 +24,8 @@ from skillweave.types import Array, VecEnv
 
 REPORT_EVERY = 1_000
 """Environment steps between reports."""
+TOGETHER = 8
+"""Gradient steps whose samples are drawn at once."""
 
 
 def make_buffer(
@@ -194,11 +196,15 @@ class _Loop:
         beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)
         seeds = member_seeds(self.seeds, "learn", self.members, update)
         rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
-        for _ in range(due):
-            sample = self.buffer.sample(cfg.batch_size, self.state.gamma, rngs, beta)
-            self.metrics, error = algorithm.update(self.state, sample, progress, generators)
-            if cfg.prioritized:
-                self.buffer.update_priorities(sample.index, error)
+        # Several draws at once cost little more than one, but priorities change in between.
+        together = 1 if cfg.prioritized else TOGETHER
+        for first in range(0, due, together):
+            size = cfg.batch_size * min(together, due - first)
+            drawn = self.buffer.sample(size, self.state.gamma, rngs, beta)
+            for sample in drawn.split(cfg.batch_size):
+                self.metrics, error = algorithm.update(self.state, sample, progress, generators)
+                if cfg.prioritized:
+                    self.buffer.update_priorities(sample.index, error)
 
     def _owed(self, update: int) -> int:
         """Gradient steps that are due once ``update`` rounds are over."""

@@ -82,9 +82,10 @@ def losses(algorithm: SACAlgorithm, state: State, s: Sample) -> tuple[Any, Any]:
     alpha = state.log_alpha.exp()
     inputs, following = {"vector": s.obs}, {"vector": s.next_obs}
     views = algorithm.critics.views(state.critic)
-    critic = algorithm.critic_loss(views, state, s, inputs, following, alpha, generators())
+    noise = algorithm.learning_noise(generators(), s.reward.shape[1], False)
+    critic = algorithm.critic_loss(views, state, s, inputs, following, alpha, noise)
     views = algorithm.layout.views(state.params)
-    return critic, algorithm.policy_loss(views, state, s.obs_mask, inputs, alpha, generators())
+    return critic, algorithm.policy_loss(views, state, s.obs_mask, inputs, alpha, noise)
 
 
 def test_forces_by_hand():

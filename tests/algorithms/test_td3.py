@@ -64,7 +64,8 @@ def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample) -> Any:
 
     actor = Actor({}, None, None)
     views = algorithm.critics.views(state.critic)
-    return algorithm.critic_loss(views, state, s, actor, {"vector": s.obs}, generators())
+    noise = algorithm.learning_noise(generators(), B, False)
+    return algorithm.critic_loss(views, state, s, actor, {"vector": s.obs}, noise)
 
 
 @pytest.mark.parametrize("twin", [True, False])

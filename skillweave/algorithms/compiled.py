@@ -1,0 +1,46 @@
+"""Gradient steps compiled into one program: a small network's time is mostly calls of operations.
+
+LeanRL (Meta 2024) showed what this brings; here the backward pass and Adam are compiled along.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from skillweave.types import SkillweaveError
+
+
+def compiled(function: Callable[..., Any], setting: str) -> Callable[..., Any]:
+    """``function``, compiled by its first call; its arguments' shapes must not change much.
+
+    Args:
+        function: tensor operations, which may differentiate within; nothing else.
+        setting: what asks for it, named in errors.
+
+    Raises:
+        SkillweaveError: this torch cannot, or (by the first call) there is no C++ compiler.
+    """
+    from torch._dynamo import config
+
+    if not hasattr(config, "trace_autograd_ops"):
+        raise SkillweaveError(
+            f"{setting}: torch {torch.__version__} cannot compile a gradient step; install "
+            "torch 2.13 or newer, or leave it at False"
+        )
+    program = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
+
+    def call(*args: Any) -> Any:
+        # Without this it refuses torch.autograd.grad; it changes nothing for others.
+        with config.patch(trace_autograd_ops=True):
+            try:
+                return program(*args)
+            except torch._inductor.exc.InvalidCxxCompiler as error:
+                raise SkillweaveError(
+                    f"{setting}: no C++ compiler was found; install g++ or clang, or leave it "
+                    "at False"
+                ) from error
+
+    return call

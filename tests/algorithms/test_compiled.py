@@ -1,0 +1,96 @@
+"""Compiled gradient steps learn what plain ones learn."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import fields
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from skillweave import DQN, SAC, TD3, Network, SkillweaveError
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.seeding import Seeds
+from skillweave.types import Sample
+
+P, B = 2, 16
+OBS = gym.spaces.Box(-1.0, 1.0, (3,))
+SMALL: dict[str, Any] = {"network": Network((8,), "relu", layer_norm=True), "normalize_obs": True}
+needs_compiler = pytest.mark.skipif(
+    not (shutil.which("g++") or shutil.which("clang")), reason="no C++ compiler"
+)
+
+
+def sample(space: gym.Space[Any], seed: int) -> Sample:
+    g = torch.Generator().manual_seed(seed)
+    discrete = isinstance(space, gym.spaces.Discrete)
+    force = torch.rand(P, B, 2, generator=g) * 2 - 1
+    allowed = torch.ones(P, B, 3, dtype=torch.bool)
+    allowed[:, ::2, 0] = False
+    return Sample(
+        obs=torch.randn(P, B, 3, generator=g),
+        action=torch.randint(3, (P, B), generator=g) if discrete else force,
+        reward=torch.randn(P, B, generator=g),
+        discount=torch.rand(P, B, generator=g).round() * 0.9,
+        next_obs=torch.randn(P, B, 3, generator=g),
+        obs_mask=allowed if discrete else None,
+        mask=allowed if discrete else None,
+        weight=torch.rand(P, B, generator=g),
+        index=np.zeros((P, B), np.int64),
+    )
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("kind", "space"),
+    [
+        (DQN.rainbow, gym.spaces.Discrete(3)),
+        (TD3, gym.spaces.Box(-1.0, 1.0, (2,))),
+        (SAC, gym.spaces.Box(-1.0, 1.0, (2,))),
+    ],
+)
+def test_compiled_steps_equal_plain_ones(kind: Any, space: gym.Space[Any]) -> None:
+    states = []
+    for compile in (False, True):
+        algorithm: Any = make_algorithm(kind(**SMALL, compile=compile), OBS, space)
+        state = algorithm.init([Seeds(m) for m in range(P)])
+        for u in range(5):
+            generators = [(Seeds(u) / m).torch() for m in range(P)]
+            algorithm.update(state, sample(space, u), 0.1, generators)
+        states.append(state)
+    for field in fields(states[0]):
+        plain, fused = (getattr(s, field.name) for s in states)
+        torch.testing.assert_close(fused, plain, rtol=1e-4, atol=1e-6, msg=field.name)
+
+
+def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch._dynamo import config
+
+    from skillweave.algorithms import compiled
+
+    class Old:
+        pass
+
+    assert hasattr(config, "trace_autograd_ops")
+    monkeypatch.setattr("torch._dynamo.config", Old())
+    with pytest.raises(SkillweaveError, match=r"DQN\.compile.*2\.13"):
+        compiled.compiled(lambda: None, "DQN.compile")
+
+
+def test_no_compiler_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    from skillweave.algorithms import compiled
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        def call(*_: Any) -> Any:
+            raise InvalidCxxCompiler()
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", refuse)
+    with pytest.raises(SkillweaveError, match=r"SAC\.compile.*g\+\+"):
+        compiled.compiled(lambda: None, "SAC.compile")()
