@@ -122,8 +122,9 @@ class Sample:
         size = self.reward.shape[1]
         whole: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         for start in range(0, size, batch):
-            rows = slice(start, start + batch)
-            yield Sample(**{k: None if v is None else v[:, rows] for k, v in whole.items()})
+            part = slice(start, start + batch)
+            found: dict[str, Any] = {k: v if v is None else v[:, part] for k, v in whole.items()}
+            yield Sample(**found)
 
 
 class VecEnv(Protocol):

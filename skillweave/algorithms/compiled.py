@@ -21,26 +21,29 @@ def compiled(function: Callable[..., Any], setting: str) -> Callable[..., Any]:
         setting: what asks for it, named in errors.
 
     Raises:
-        SkillweaveError: this torch cannot, or (by the first call) there is no C++ compiler.
+        SkillweaveError: this torch cannot, or (by the first call) finds no C++ compiler.
     """
-    from torch._dynamo import config
+    from torch._dynamo import config, exc
 
     if not hasattr(config, "trace_autograd_ops"):
         raise SkillweaveError(
             f"{setting}: torch {torch.__version__} cannot compile a gradient step; install "
             "torch 2.13 or newer, or leave it at False"
         )
-    program = torch.compile(function, fullgraph=True, dynamic=False, isolate_recompiles=True)
+    # One algorithm's programs do not count against another's limit.
+    how: Any = {"fullgraph": True, "dynamic": False, "isolate_recompiles": True}
+    program = torch.compile(function, **how)
 
     def call(*args: Any) -> Any:
         # Without this it refuses torch.autograd.grad; it changes nothing for others.
         with config.patch(trace_autograd_ops=True):
             try:
                 return program(*args)
-            except torch._inductor.exc.InvalidCxxCompiler as error:
+            except exc.BackendCompilerFailed as error:
+                reason = str(error).splitlines()[0]
                 raise SkillweaveError(
-                    f"{setting}: no C++ compiler was found; install g++ or clang, or leave it "
-                    "at False"
+                    f"{setting}: the gradient step could not be compiled ({reason}); install a "
+                    "C++ compiler (g++ or clang), or leave it at False"
                 ) from error
 
     return call

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
+import subprocess
+import sys
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -80,17 +85,18 @@ def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
         compiled.compiled(lambda: None, "DQN.compile")
 
 
-def test_no_compiler_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    from torch._inductor.exc import InvalidCxxCompiler
-
-    from skillweave.algorithms import compiled
-
-    def refuse(*_: Any, **__: Any) -> Any:
-        def call(*_: Any) -> Any:
-            raise InvalidCxxCompiler()
-
-        return call
-
-    monkeypatch.setattr(torch, "compile", refuse)
-    with pytest.raises(SkillweaveError, match=r"SAC\.compile.*g\+\+"):
-        compiled.compiled(lambda: None, "SAC.compile")()
+def test_no_compiler_says_so(tmp_path: Path) -> None:
+    code = """
+import torch
+from skillweave import SkillweaveError
+from skillweave.algorithms.compiled import compiled
+try:
+    compiled(lambda x: x.sin().cos(), "SAC.compile")(torch.randn(3))
+except SkillweaveError as error:
+    print(error)
+"""
+    nowhere = {"CXX": "/nowhere/g++", "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | nowhere, capture_output=True, text=True
+    )
+    assert re.match(r"SAC\.compile: .*install a C\+\+ compiler", said.stdout), said
