@@ -9,6 +9,8 @@ if TYPE_CHECKING:
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3
     from skillweave.api import Hierarchy, Run, train_agent
     from skillweave.envs.make import EnvSpec
+    from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
+    from skillweave.evolution.selection import Heir, Selection
     from skillweave.hierarchy.options import OptionsEnv
     from skillweave.networks.config import CNN, RNN, Network
     from skillweave.networks.encoders import Encoder, register_encoder
@@ -25,18 +27,25 @@ _HOME = {
     "Encoder": "networks.encoders",
     "EnvSpec": "envs.make",
     "Evaluation": "training.evaluation",
+    "Evolution": "evolution.config",
+    "Heir": "evolution.selection",
     "Hierarchy": "api",
+    "Mutations": "evolution.config",
     "Network": "networks.config",
     "OptionsEnv": "hierarchy.options",
     "PPO": "algorithms.config",
     "RNN": "networks.config",
+    "Range": "evolution.config",
     "Reflex": "skills",
     "Run": "api",
     "SAC": "algorithms.config",
+    "Selection": "evolution.selection",
     "Skill": "skills",
     "SkillweaveError": "types",
     "Step": "types",
     "TD3": "algorithms.config",
+    "Tournament": "evolution.config",
+    "Truncation": "evolution.config",
     "evaluate": "training.evaluation",
     "from_function": "skills",
     "from_onnx": "skills",
@@ -57,14 +66,21 @@ __all__ = [
     "Encoder",
     "EnvSpec",
     "Evaluation",
+    "Evolution",
+    "Heir",
     "Hierarchy",
+    "Mutations",
     "Network",
     "OptionsEnv",
+    "Range",
     "Reflex",
     "Run",
+    "Selection",
     "Skill",
     "SkillweaveError",
     "Step",
+    "Tournament",
+    "Truncation",
     "evaluate",
     "from_function",
     "from_onnx",

@@ -13,6 +13,7 @@ import numpy as np
 from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
+from skillweave.evolution.plan import Evolve, plan, trainer
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -40,6 +41,7 @@ class Hierarchy(Declaration):
         flat: bool = False,
         quiet: bool = False,
         track: Sequence[str] = (),
+        evolve: Evolve = None,
     ) -> Run:
         """Train every skill, then the selector; everything goes to ``run_dir``.
 
@@ -49,6 +51,8 @@ class Hierarchy(Declaration):
             flat: train one plain agent on the same number of steps instead: the baseline.
             quiet: no progress.
             track: "tensorboard", "wandb".
+            evolve: a population for every agent, or by phase (a skill's name, "selector", "flat")
+                for some. Each member is trained for the phase's budget.
 
         Raises:
             SkillweaveError: the declaration does not fit the environment, or training diverged.
@@ -57,16 +61,20 @@ class Hierarchy(Declaration):
             raise SkillweaveError(f"seed is {seed}; it must be at least 0")
         self.check_spaces()
         content = training.manifest(self, seed=seed, flat=flat)
+        plan(content["phases"], evolve)
         track = tuple(track)
         make_trackers(track, None)  # a missing extra is said before anything is written
         run = RunDirectory.create(run_dir, content | {"recipe": self.recipe, "track": track})
-        return self._go_on(run, quiet)
+        return self._go_on(run, quiet, evolve)
 
-    def resume(self, run_dir: str | Path, *, quiet: bool = False) -> Run:
-        """Finish a run that was stopped; the end is the same as if it had not been."""
+    def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
+        """Finish a run that was stopped; the end is the same as if it had not been.
+
+        ``evolve`` is needed only where the population evolves by a selection of your own.
+        """
         run = RunDirectory.open(run_dir)
         self._must_fit(run)
-        return self._go_on(run, quiet)
+        return self._go_on(run, quiet, evolve)
 
     def load(self, run_dir: str | Path) -> Run:
         """A finished run of this hierarchy."""
@@ -98,14 +106,14 @@ class Hierarchy(Declaration):
         ]
         return cls(spec, skills, call_steps=call_steps)
 
-    def _go_on(self, run: RunDirectory, quiet: bool) -> Run:
+    def _go_on(self, run: RunDirectory, quiet: bool, evolve: Evolve) -> Run:
         with ExitStack() as stack:
             stack.callback(run.close)
             progress = stack.enter_context(Progress(quiet=quiet))
             trackers = make_trackers(run.manifest.get("track", ()), run)
             for tracker in trackers:
                 stack.callback(tracker.close)
-            policy = training.train(self, run, (progress, *trackers))
+            policy = training.train(self, run, (progress, *trackers), trainer(run, evolve))
         return Run(self, run.path, policy)
 
     def _must_fit(self, run: RunDirectory) -> None:
@@ -139,6 +147,7 @@ def train_agent(
     seed: int = 0,
     quiet: bool = False,
     track: Sequence[str] = (),
+    evolve: Evolve = None,
 ) -> Run:
     """Train one plain agent on an environment's own reward; the run is like any other.
 
@@ -146,13 +155,14 @@ def train_agent(
         env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
         algorithm: its settings, ``SAC()`` for example.
         steps: training budget in environment steps.
-        run_dir, seed, quiet, track: as in ``Hierarchy.train``.
+        run_dir, seed, quiet, track, evolve: as in ``Hierarchy.train``.
 
     Raises:
         SkillweaveError: the algorithm cannot act in the environment; the message says which can.
     """
     hierarchy = Hierarchy(env, [Task()], algorithm=algorithm, flat_steps=steps)
-    return hierarchy.train(run_dir, seed=seed, flat=True, quiet=quiet, track=track)
+    how: Any = {"seed": seed, "quiet": quiet, "track": track, "evolve": evolve}
+    return hierarchy.train(run_dir, flat=True, **how)
 
 
 class Run:

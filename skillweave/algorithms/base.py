@@ -30,6 +30,19 @@ class Actor:
     extra: dict[str, Tensor] = field(default_factory=dict)  # exploration: ε, say, each (P, 1)
 
 
+@dataclass(frozen=True)
+class Family:
+    """Fields of a state (..., D) that hold the same networks, so they change together."""
+
+    layout: Layout
+    nets: tuple[tuple[str, Any], ...]
+    """The networks in the layout, each with the field of the settings that shapes it."""
+    weights: tuple[str, ...] = ("params",)
+    """What learns, then its slow copy if there is one."""
+    moments: tuple[str, ...] = ("mu", "nu")
+    """The optimiser's."""
+
+
 class Algorithm:
     """The part of an algorithm that is the same for all.
 
@@ -83,9 +96,13 @@ class Algorithm:
             return None, None
         return _scaling(state.obs_mean, state.obs_var)
 
+    def families(self) -> list[Family]:
+        """Everything in the state that has the shape of networks."""
+        raise NotImplementedError
+
     def layouts(self) -> dict[str, Layout]:
         """The fields of the state that hold parameters, or moments of them, and their columns."""
-        return dict.fromkeys(("params", "mu", "nu"), self.layout)
+        return {name: f.layout for f in self.families() for name in (*f.weights, *f.moments)}
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of one member's ``weights``."""

@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor
+from skillweave.algorithms.base import Actor, Family
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, normal, weighted_mean
 from skillweave.networks.encoders import Inputs
@@ -81,9 +81,9 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             **self.fresh(len(seeds)),
         )
 
-    def layouts(self) -> dict[str, Layout]:
-        """The fields of the state that hold parameters, or moments of them, and their columns."""
-        return super().layouts() | {"target": self.layout}
+    def families(self) -> list[Family]:
+        """Everything in the state that has the shape of networks."""
+        return [Family(self.layout, (("network", self.net),), ("params", "target"))]
 
     def actor(self, state: State, progress: float = 1.0) -> Actor:
         """A copy of what acting needs, with ε."""

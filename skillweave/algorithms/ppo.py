@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Algorithm
+from skillweave.algorithms.base import Actor, Algorithm, Family
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.minibatches import minibatches
 from skillweave.networks.encoders import Inputs
@@ -110,6 +110,11 @@ class PPOAlgorithm(Algorithm):
             count=torch.zeros(members),
             **self.fresh(members),
         )
+
+    def families(self) -> list[Family]:
+        """Everything in the state that has the shape of networks."""
+        nets = ("network", self.actor_net), ("critic", self.critic_net)
+        return [Family(self.layout, nets)]
 
     def act(
         self,

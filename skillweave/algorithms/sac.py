@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor
+from skillweave.algorithms.base import Actor, Family
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
 from skillweave.networks.encoders import Inputs
@@ -105,9 +105,9 @@ class SACAlgorithm(OffPolicyAlgorithm):
             **self.fresh(members),
         )
 
-    def layouts(self) -> dict[str, Layout]:
-        """The fields of the state that hold parameters, or moments of them, and their columns."""
-        return super().layouts() | self.critics.layouts()
+    def families(self) -> list[Family]:
+        """Everything in the state that has the shape of networks."""
+        return [Family(self.layout, (("network", self.net),)), self.critics.family()]
 
     def act(
         self,

@@ -12,7 +12,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor
+from skillweave.algorithms.base import Actor, Family
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
 from skillweave.networks.encoders import Inputs
@@ -94,9 +94,10 @@ class TD3Algorithm(OffPolicyAlgorithm):
             **self.fresh(len(seeds)),
         )
 
-    def layouts(self) -> dict[str, Layout]:
-        """The fields of the state that hold parameters, or moments of them, and their columns."""
-        return super().layouts() | {"target": self.layout} | self.critics.layouts()
+    def families(self) -> list[Family]:
+        """Everything in the state that has the shape of networks."""
+        actor = Family(self.layout, (("network", self.net),), ("params", "target"))
+        return [actor, self.critics.family()]
 
     def actor(self, state: State, progress: float = 1.0) -> Actor:
         """A copy of what acting needs, with the deviation of its noise."""

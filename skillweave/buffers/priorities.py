@@ -53,14 +53,15 @@ class SumTrees:
             sums = below.reshape(self._trees, -1, FAN_OUT).sum(2, dtype=np.float64)
             level.reshape(self._trees, -1)[:, : sums.shape[1]] = sums
 
-    def find(self, fraction: Array) -> tuple[Array, Array]:
-        """Where the running sum of a tree's leaves passes ``fraction`` (trees, B) of its total.
+    def find(self, fraction: Array, first: int = 0) -> tuple[Array, Array]:
+        """Where the running sum of a tree's leaves passes ``fraction`` (K, B) of its total.
 
-        Fractions are in [0, 1). Returns the leaves and their values, both (trees, B); a leaf of
-        value 0 is never found.
+        Of K trees from ``first`` on. Fractions are in [0, 1). Returns the leaves and their values,
+        both (K, B); a leaf of value 0 is never found.
         """
-        tree = np.repeat(np.arange(self._trees), fraction.shape[1])
-        total = self._levels[-1].reshape(self._trees, -1).sum(1)
+        trees = np.arange(first, first + len(fraction))
+        tree = np.repeat(trees, fraction.shape[1])
+        total = self._levels[-1].reshape(self._trees, -1)[trees].sum(1)
         target = (fraction * total[:, None]).reshape(-1)
         leaf, each = np.zeros_like(tree), np.arange(len(tree))
         for level, nodes in zip(reversed(self._levels), reversed(self._nodes), strict=True):
@@ -97,13 +98,15 @@ class Priorities:
         tree = np.repeat(np.arange(members), len(slot))
         self._trees.put(tree, np.tile(slot, members), value.reshape(-1))
 
-    def draw(self, uniform: Array, beta: float) -> tuple[Array, Array]:
-        """Slots and importance weights (P, B), one of each B-th of the mass (stratified).
+    def draw(self, uniform: Array, beta: float, first: int = 0) -> tuple[Array, Array]:
+        """Slots and importance weights (K, B), one of each B-th of the mass (stratified).
+
+        Of K members from ``first`` on.
 
         The weights are (N·P(i))^−β over the batch's highest, in which N and the total cancel.
         """
         batch = uniform.shape[1]
-        slot, value = self._trees.find((np.arange(batch) + uniform) / batch)
+        slot, value = self._trees.find((np.arange(batch) + uniform) / batch, first)
         return slot, (value.min(1, keepdims=True) / value) ** np.float32(beta)
 
     def update(self, member: Array, slot: Array, priority: Array) -> None:
@@ -111,6 +114,12 @@ class Priorities:
         priority = np.maximum(priority, np.float32(FLOOR))
         np.maximum.at(self._highest, member, priority)
         self._trees.put(member, slot, priority**self._alpha)
+
+    def inherit(self, parents: Array) -> None:
+        """Every member (P,) goes on with the priorities of the one it descends from."""
+        self._trees.leaves[:] = self._trees.leaves[parents]
+        self._trees.rebuild()
+        self._highest[:] = self._highest[parents]
 
     def state(self, used: int) -> dict[str, Tensor]:
         """Copies of the first ``used`` slots' priorities, to go on exactly."""

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +11,7 @@ import torch
 from numpy.typing import DTypeLike
 from torch import Tensor
 
+from skillweave.buffers.memory import check_memory
 from skillweave.buffers.priorities import Priorities
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array, Sample, SkillweaveError, VecStep
@@ -64,7 +62,7 @@ class ReplayBuffer:
         }  # fmt: skip
         each = 4 * prioritized * (members if shared else 1)
         each += sum(int(np.prod(s)) * np.dtype(d).itemsize for s, d in columns.values())
-        _check_memory(capacity, each, f"{shape} {item}")
+        check_memory(capacity, each, f"{shape} {item}")
         self._num_envs, self._n_step, self._mask_size = num_envs, n_step, mask_size or 0
         self._count, self._rows = 0, capacity // num_envs + 1  # rows ever added, and held
         self._slots = self._rows * num_envs
@@ -124,13 +122,21 @@ class ReplayBuffer:
             self._keep(row.start + columns, **after)
 
     def sample(
-        self, batch: int, gamma: Tensor, rngs: Sequence[np.random.Generator], beta: float = 1.0
+        self,
+        batch: int,
+        gamma: Tensor,
+        rngs: Sequence[np.random.Generator],
+        beta: float = 1.0,
+        first: int = 0,
     ) -> Sample:
-        """``batch`` transitions for each member, with its γ (P,) and its own generator."""
+        """``batch`` transitions for each member from ``first`` on, as many as generators are given.
+
+        ``gamma`` (P,) are their discounts.
+        """
         assert self._count, "sample() before add()"
-        index, weight = self._draw(batch, rngs, beta)
+        index, weight = self._draw(batch, rngs, beta, first)
         data, n = self._data, self._num_envs
-        first = slot = index % self._slots
+        start = slot = index % self._slots
         factor = gamma.float().numpy()[:, None]
         reward, discount = data["reward"].take(slot), self._power(factor, slot)
         end, newest = data["end"].take(slot), self._row(self._count - 1).start
@@ -140,8 +146,8 @@ class ReplayBuffer:
             reward += np.where(goes_on, discount * data["reward"].take(slot), np.float32(0))
             discount = np.where(goes_on, discount * self._power(factor, slot), discount)
             end = data["end"].take(slot)
-        now = {name: data[name].take(first, axis=0) for name in self._ends}
-        action, after = data["action"].take(first, axis=0), self._after(slot, end)
+        now = {name: data[name].take(start, axis=0) for name in self._ends}
+        action, after = data["action"].take(start, axis=0), self._after(slot, end)
         return Sample(
             obs=to_tensor(now["obs"]),
             action=to_tensor(action.astype(np.int64) if action.dtype.kind in "iu" else action),
@@ -154,14 +160,21 @@ class ReplayBuffer:
             index=index,
         )
 
-    def update_priorities(self, index: Array, priority: Tensor) -> None:
-        """New priorities (P, B), above 0, of sampled transitions; overwritten ones are skipped."""
+    def update_priorities(self, index: Array, priority: Tensor, first: int = 0) -> None:
+        """New priorities (P, B), above 0, of what members from ``first`` on have sampled."""
         if self._priorities is not None:
+            # What was overwritten since is skipped.
             member, place = (index >= self._count * self._num_envs - len(self)).nonzero()
             index, width = index[member, place], self._width
             own = index - index // self._num_envs * (self._num_envs - width)
-            own = (own - self._offset[member, 0]) % (self._rows * width)
-            self._priorities.update(member, own, priority.detach().float().numpy()[member, place])
+            own = (own - self._offset[first + member, 0]) % (self._rows * width)
+            new = priority.detach().float().numpy()[member, place]
+            self._priorities.update(first + member, own, new)
+
+    def inherit(self, parents: Array) -> None:
+        """Every member (P,) goes on with the priorities of the one it descends from."""
+        if self._priorities is not None:
+            self._priorities.inherit(parents)
 
     def state(self) -> dict[str, Tensor]:
         """Copies of all that was written, to go on exactly; see ``load``."""
@@ -200,7 +213,7 @@ class ReplayBuffer:
         return slice(start, start + self._num_envs)
 
     def _draw(
-        self, batch: int, rngs: Sequence[np.random.Generator], beta: float
+        self, batch: int, rngs: Sequence[np.random.Generator], beta: float, first: int
     ) -> tuple[Array, Array | None]:
         """Which transitions (P, B), counted from the first ever added, and their weights."""
         width, weight = self._width, None
@@ -210,11 +223,12 @@ class ReplayBuffer:
             drawn += (self._count - self._filled) * width
         else:
             uniform = np.stack([rng.random(batch) for rng in rngs])
-            place, weight = self._priorities.draw(uniform, beta)
+            place, weight = self._priorities.draw(uniform, beta, first)
             newest = self._count * width - 1
             drawn = newest - (newest - place) % (self._rows * width)
         # Counted so far among the member's own columns.
-        return drawn + drawn // width * (self._num_envs - width) + self._offset, weight
+        start = self._offset[first : first + len(rngs)]
+        return drawn + drawn // width * (self._num_envs - width) + start, weight
 
     def _power(self, gamma: Array, slot: Array) -> Array:
         """γ^τ of transitions (P, B)."""
@@ -277,24 +291,3 @@ class ReplayBuffer:
 def _packed(mask: Array | None) -> Array:
     """(n, A) bool as bits; no mask allows everything."""
     return np.array(255, np.uint8) if mask is None else np.packbits(mask, axis=-1)
-
-
-def _check_memory(capacity: int, each: int, what: str) -> None:
-    free = _free_memory()
-    if free is not None and capacity * each > free:
-        raise SkillweaveError(
-            f"a replay buffer of {capacity:,} transitions of {what} needs "
-            f"{capacity * each / 2**30:.1f} GiB, but {free / 2**30:.1f} GiB are free: "
-            f"lower buffer_size (at most about {free // each:,})"
-        )
-
-
-def _free_memory() -> int | None:
-    """Bytes that the machine can still give at most, or None where it does not say."""
-    meminfo = Path("/proc/meminfo")
-    text = meminfo.read_text() if meminfo.exists() else ""
-    if found := re.search(r"MemAvailable: *(\d+) kB", text):
-        return int(found[1]) * 1024
-    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):  # macOS: all that it has
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return None

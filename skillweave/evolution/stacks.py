@@ -9,7 +9,7 @@ the others learn, so a padded member is exactly the member alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -22,6 +22,15 @@ from skillweave.networks.config import Network
 from skillweave.networks.stacked import Layout
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Where a member comes from: its parent, and what changed, each setting's old and new value."""
+
+    parent: int | None = None
+    mutation: str = "start"
+    changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+
+
 @dataclass
 class Member:
     """One agent of a population, with settings and architecture of its own."""
@@ -29,6 +38,8 @@ class Member:
     number: int
     config: AlgorithmConfig
     state: Any  # of its algorithm, P = 1
+    steps: int = 0  # environment steps that it and its ancestors were trained for
+    origin: Origin = field(default_factory=lambda: Origin())
 
     def algorithm(self, spaces: tuple[Any, Any]) -> Algorithm:
         """The algorithm it learns by, on (observation space, action space)."""
@@ -47,6 +58,15 @@ def stack_key(config: AlgorithmConfig, settings: Sequence[str]) -> AlgorithmConf
         if isinstance(network, Network) and not network.layer_norm:
             changes[name] = replace(network, hidden=(1,) * len(network.hidden))
     return replace(config, **changes)
+
+
+def grouped(members: Sequence[Member], spaces: tuple[Any, Any]) -> list[list[Member]]:
+    """Members by the stack that they share, in the order in which stacks first appear."""
+    groups: dict[AlgorithmConfig, list[Member]] = {}
+    for member in members:
+        key = stack_key(member.config, member.algorithm(spaces).settings)
+        groups.setdefault(key, []).append(member)
+    return list(groups.values())
 
 
 def join(members: Sequence[Member], spaces: tuple[Any, Any]) -> tuple[Algorithm, Any]:

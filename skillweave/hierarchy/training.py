@@ -14,7 +14,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign import source_of
-from skillweave.training.phase import Listener, Phase, train_phase
+from skillweave.training.phase import Listener, Phase, Trainer, train_phase
 from skillweave.training.probe import MakeEnv
 from skillweave.types import Policy, VecEnv
 
@@ -71,7 +71,10 @@ def flat_phase(declaration: Declaration) -> Phase:
 
 
 def train(
-    declaration: Declaration, run: RunDirectory, listeners: tuple[Listener, ...] = ()
+    declaration: Declaration,
+    run: RunDirectory,
+    listeners: tuple[Listener, ...] = (),
+    train_phase: Trainer = train_phase,
 ) -> Policy:
     """Train, or finish training, what the run says; returns the policy."""
     seeds = Seeds(int(run.manifest["seed"]))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
+from skillweave.networks.growth import Joint, Units, units_of
 from skillweave.networks.recurrent import (
     cell,
     memory_size,
@@ -43,7 +44,8 @@ class Net:
             for i in range(len(obs.images)):
                 image = ImageEncoder(obs, i, network.cnn, network.activation)
                 self.encoders[f"{name}.cnn{i}"] = image
-        width = (obs.size if self._vector else 0) + extra
+        self._features = obs.size if self._vector else 0  # where the encoders' features begin
+        width = self._features + extra
         width += sum(e.size for e in self.encoders.values())
         self.shapes: dict[str, tuple[int, ...]] = {}
         for prefix, encoder in self.encoders.items():
@@ -53,6 +55,10 @@ class Net:
         """Prefix of the head's parameters."""
         self.memory = 0 if network.rnn is None else memory_size(network.rnn)
         """M, the width of its memory; 0: it has none."""
+        reader = self.head if network.rnn is None else f"{name}.rnn"
+        weight, bias = ("weight", "bias") if network.rnn is None else ("input", "bias")
+        self.readers: tuple[tuple[str, str], ...] = ((f"{reader}.{weight}", f"{reader}.{bias}"),)
+        """Weights and biases of what reads the last hidden layer."""
         if network.rnn is None:
             self.shapes |= mlp_shapes(name, width, network, outputs)
             self.width = outputs or (network.hidden[-1] if network.hidden else width)
@@ -63,6 +69,34 @@ class Net:
             self.shapes[f"{self.head}.weight"] = (network.rnn.size, outputs or 1)
             self.shapes[f"{self.head}.bias"] = (1, outputs or 1)
             self.width = outputs or 1
+
+    def units(self, layer: int) -> list[Units]:
+        """The units of a hidden layer, as one group."""
+        width, prefix = self.network.hidden[layer], f"{self.name}.{layer}"
+        return [units_of(self.shapes, width, prefix, self._readers(layer))]
+
+    def channels(self, layer: int) -> list[Units]:
+        """The channels of a convolution, or of a stage, of every image; several groups."""
+        found, start = [], self._features
+        for prefix, encoder in self.encoders.items():
+            if isinstance(encoder, ImageEncoder):
+                onward = tuple((name, start) for name in self._readers(-1))
+                found += encoder.units(layer, prefix, onward)
+            start += encoder.size
+        return found
+
+    def joint(self) -> Joint:
+        """Where the last hidden layer meets what reads it."""
+        depth = len(self.network.hidden)
+        cut = len(prefix := f"{self.name}.{depth - 1}.")
+        kinds = tuple(k[cut:] for k in self.shapes if k.startswith(prefix))
+        return Joint(self.name, depth, self.readers, kinds)
+
+    def _readers(self, layer: int) -> tuple[str, ...]:
+        """Weights that read a hidden layer; -1: the inputs."""
+        if layer + 1 < len(self.network.hidden):
+            return (f"{self.name}.{layer + 1}.weight",)
+        return tuple(weight for weight, _ in self.readers)
 
     def init_(self, views: Views, head_gain: float, generators: list[torch.Generator]) -> None:
         """Fresh parameters in place, one generator a member."""
@@ -134,7 +168,7 @@ class QNet:
         dueling: bool = False,
         noisy: bool = False,
     ) -> None:
-        self._actions, self._atoms = actions, atoms
+        self.network, self._actions, self._atoms = network, actions, atoms
         self._parts: list[tuple[str, Network, int]] = []  # name, layers, outputs of each stream
         if dueling:
             trunk, last = replace(network, hidden=network.hidden[:-1]), network.hidden[-1:]
@@ -143,7 +177,7 @@ class QNet:
             self._parts = [("value", stream, atoms), ("advantage", stream, actions * atoms)]
         else:
             self._trunk = Net("q", obs, network, actions * atoms)
-        self.shapes = dict(self._trunk.shapes)
+        self.shapes, self.encoders = dict(self._trunk.shapes), self._trunk.encoders
         for name, stream, outputs in self._parts:
             self.shapes |= mlp_shapes(name, self._trunk.width, stream, outputs)
         self._noisy = []
@@ -155,8 +189,28 @@ class QNet:
         for layer in self._noisy:
             for kind in ("weight", "bias"):
                 self.shapes[f"{layer}.{kind}_sigma"] = self.shapes[f"{layer}.{kind}"]
+        if dueling:
+            self._trunk.readers = tuple((f"{n}.0.weight", f"{n}.0.bias") for n, _, _ in self._parts)
+        self._trunk.shapes = self.shapes  # what reads the trunk, and the deviations of its noise
         self.noise_size = sum(sum(self.shapes[f"{k}.weight"]) for k in self._noisy)
         """Random numbers that one draw of the weights' noise needs; 0: they have none."""
+
+    def units(self, layer: int) -> list[Units]:
+        """The units of a hidden layer; of the last, when dueling, a group a stream."""
+        if not self._parts or layer < len(self._trunk.network.hidden):
+            return self._trunk.units(layer)
+        return [
+            units_of(self.shapes, stream.hidden[0], f"{name}.0", (f"{name}.1.weight",))
+            for name, stream, _ in self._parts
+        ]
+
+    def channels(self, layer: int) -> list[Units]:
+        """The channels of a convolution, or of a stage, of every image; several groups."""
+        return self._trunk.channels(layer)
+
+    def joint(self) -> Joint:
+        """Where the trunk's last hidden layer meets what reads it."""
+        return self._trunk.joint()
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
         """Fresh parameters in place, one generator a member."""

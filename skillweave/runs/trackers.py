@@ -33,6 +33,9 @@ class TensorBoard:
         """Flush."""
         self._writer.flush()
 
+    def message(self, text: str) -> None:
+        """Nothing to draw."""
+
     def close(self) -> None:
         """Close the files."""
         self._writer.close()
@@ -65,6 +68,9 @@ class WandB:
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Nothing more to say."""
+
+    def message(self, text: str) -> None:
+        """Nothing to draw."""
 
     def close(self) -> None:
         """Finish the run."""

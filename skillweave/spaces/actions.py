@@ -49,6 +49,8 @@ class ActionCodec:
             return self._shaped(action) if self.multi else action
         assert self.low is not None
         low, span, bounded = self._span
+        # A network that has diverged stands still until somebody notices.
+        action = np.nan_to_num(action)
         scaled = action.astype(np.result_type(action, low))
         scaled[:, bounded] = low[bounded] + 0.5 * (action[:, bounded] + 1.0) * span[bounded]
         return self._shaped(scaled.astype(self.space.dtype).clip(self.low, self.high))

@@ -73,11 +73,17 @@ class Tick:
     extra: dict[str, torch.Tensor] | None = None  # what else resuming needs: a replay buffer
 
 
-def to_numbers(metrics: dict[str, Any], update: int) -> dict[str, float]:
-    """Member means; a value that is not finite stops the run, saying which and where."""
-    numbers = {}
+def to_numbers(metrics: dict[str, Any], update: int, *, tolerant: bool = False) -> dict[str, float]:
+    """Member means; a value that is not finite stops the run, saying which and where.
+
+    If ``tolerant`` it is left out of the mean: whoever trains a population replaces its member.
+    """
+    numbers: dict[str, float] = {}
     for name, value in metrics.items():
         finite = torch.isfinite(value)
+        if tolerant:
+            numbers |= {name: float(value[finite].mean())} if bool(finite.any()) else {}
+            continue
         if not bool(finite.all()):
             member = int((~finite).nonzero()[0])
             raise SkillweaveError(

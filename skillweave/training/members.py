@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 from torch import Tensor
 
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.types import Array
+
+
+@dataclass
+class Stack:
+    """Members of one architecture, and the algorithm that they learn by."""
+
+    algorithm: Any
+    state: Any  # of P members
+
+    @property
+    def members(self) -> int:
+        """P."""
+        return len(self.state.params)
 
 
 def by_member(rows: Array, members: int) -> Tensor:
@@ -15,9 +31,9 @@ def by_member(rows: Array, members: int) -> Tensor:
     return tensor.view(members, -1, *tensor.shape[1:])
 
 
-def member_seeds(seeds: Seeds, name: str, members: int, update: int) -> list[Seeds]:
-    """A node of the seed tree for each member."""
-    return [seeds / name / member / update for member in range(members)]
+def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int = 0) -> list[Seeds]:
+    """A node of the seed tree for each member from ``first`` on."""
+    return [seeds / name / (first + member) / update for member in range(members)]
 
 
 def passed(every: int, before: int, after: int) -> bool:

@@ -7,19 +7,22 @@ one of for each decision.
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.algorithms.config import OffPolicy
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.buffers.replay import ReplayBuffer
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick, to_numbers
-from skillweave.training.members import by_member, member_seeds, passed
+from skillweave.training.members import Stack, by_member, member_seeds, passed
 from skillweave.types import Array, VecEnv
 
 REPORT_EVERY = 1_000
@@ -61,35 +64,70 @@ def train_off_policy(
     *,
     saved: dict[str, Tensor] | None = None,
     shared: bool = False,
-    cut_every: int = 250_000,
-    update: int = 0,
-    steps: int = 0,
-    seconds: float = 0.0,
     on_tick: Callable[[Tick], None] | None = None,
+    **where: Any,
 ) -> Any:
-    """Train until ``budget`` environment steps are spent; returns the state.
+    """Train one stack until ``budget`` environment steps are spent; returns the state.
 
     Args:
         env: P·num_envs environments.
         saved: the replay buffer as a checkpoint left it (``Tick.extra``). Without, it is filled
             with ``learning_starts`` transitions before learning begins, or goes on.
         shared: members learn from what all of them did, not from their own alone.
+        on_tick, where: as of ``train_stacks``.
+
+    Raises:
+        SkillweaveError: parameters or losses are no longer finite.
+    """
+    buffer = make_buffer(algorithm, env, len(state.params), shared=shared)
+    if saved:
+        buffer.load(saved)
+
+    def tell(tick: Tick) -> None:
+        if on_tick is not None:
+            on_tick(replace(tick, state=state))
+
+    train_stacks([Stack(algorithm, state)], env, seeds, budget, buffer, on_tick=tell, **where)
+    return state
+
+
+def train_stacks(
+    stacks: Sequence[Stack],
+    env: VecEnv,
+    seeds: Seeds,
+    budget: int,
+    buffer: ReplayBuffer,
+    *,
+    horizon: int | None = None,
+    tolerant: bool = False,
+    cut_every: int = 250_000,
+    update: int = 0,
+    steps: int = 0,
+    seconds: float = 0.0,
+    on_tick: Callable[[Tick], None] | None = None,
+) -> None:
+    """Train stacks side by side, in one environment and from one buffer, states in place.
+
+    What shapes the experience (``num_envs``, ``train_freq``, ``n_step``, the buffer's settings)
+    is that of the first stack.
+
+    Args:
+        env: num_envs environments for each member, in the order of the stacks.
+        horizon: steps at which schedules end; None: the budget.
+        tolerant: a member that diverges does not stop the others.
         cut_every: environment steps between clean cuts, at which episodes in flight are
             truncated and environments restart from a seed of their own (contract 8).
         update, steps, seconds: where a resumed run stands: rounds, and a clean cut.
-        on_tick: told every thousand steps; may raise to stop.
+        on_tick: told every thousand steps, with the stacks as its state; may raise to stop.
 
     Raises:
         SkillweaveError: parameters or losses are no longer finite.
     """
     started = time.perf_counter() - seconds
-    members, saves = len(state.params), algorithm.config.save_buffer
-    buffer = make_buffer(algorithm, env, members, shared=shared)
-    if saved:
-        buffer.load(saved)
-    loop = _Loop(algorithm, env, state, seeds, budget, buffer)
+    config = stacks[0].algorithm.config
+    loop = _Loop(stacks, env, seeds, horizon or budget, buffer)
     threads = torch.get_num_threads()
-    torch.set_num_threads(algorithm.config.threads)
+    torch.set_num_threads(config.threads)
     try:
         loop.restart(update)
         while steps < budget:
@@ -101,34 +139,35 @@ def train_off_policy(
             if cut:
                 buffer.cut()
             if tick and on_tick is not None:
-                metrics = to_numbers(loop.metrics, update) | loop.episodes.summary()
+                metrics = to_numbers(loop.metrics, update, tolerant=tolerant)
                 # The last checkpoint needs no buffer: there is nothing left to learn from it.
-                extra = buffer.state() if cut and saves and steps < budget else None
+                extra = buffer.state() if cut and config.save_buffer and steps < budget else None
                 seconds = time.perf_counter() - started
-                on_tick(Tick(update, steps, seconds, metrics, state, cut, extra))
+                metrics |= loop.episodes.summary()
+                on_tick(Tick(update, steps, seconds, metrics, stacks, cut, extra))
             if cut and steps < budget:
                 loop.restart(update)
     finally:
         torch.set_num_threads(threads)
-    return state
 
 
 class _Loop:
-    """One environment, what acts in it, and what it learns from, a round at a time."""
+    """One environment, who acts in it, and what they learn from, a round at a time."""
 
     def __init__(
         self,
-        algorithm: OffPolicyAlgorithm,
+        stacks: Sequence[Stack],
         env: VecEnv,
-        state: Any,
         seeds: Seeds,
-        budget: int,
+        horizon: int,
         buffer: ReplayBuffer,
     ) -> None:
-        self.algorithm, self.env, self.state, self.seeds = algorithm, env, state, seeds
-        self.budget, self.buffer = budget, buffer
-        self.members = len(state.params)
+        self.stacks, self.env, self.seeds = stacks, env, seeds
+        self.horizon, self.buffer = horizon, buffer
+        self.members = sum(s.members for s in stacks)
+        self.config = stacks[0].algorithm.config
         self._each = env.num_envs // self.members
+        self._first = [0, *itertools.accumulate(s.members for s in stacks)]
         self.episodes = Episodes()
         self.metrics: dict[str, Tensor] = {}
         self._obs: Array = np.empty(0)
@@ -143,70 +182,110 @@ class _Loop:
     @torch.no_grad()
     def collect(self, update: int, steps: int) -> int:
         """Act ``train_freq`` times in every environment; the environment steps it took."""
-        algorithm, env, cfg = self.algorithm, self.env, self.algorithm.config
-        spent = 0
-        actor = algorithm.actor(self.state, min(1.0, steps / self.budget))
-        seeds = member_seeds(self.seeds, "act", self.members, update)
-        generators = [s.torch() for s in seeds]
-        noises = algorithm.noise(generators, cfg.train_freq, self._each)
-        # A resumed run whose buffer was not saved fills it by what it has learnt already.
-        at_random = update * self._round < cfg.learning_starts
+        env, spent = self.env, 0
+        actors = [_Actor(self, i, update, steps) for i in range(len(self.stacks))]
         mask = env.mask()
-        for noise in noises:
+        for at in range(self.config.train_freq):
             obs = self._obs
-            rows = by_member(obs, self.members)
-            allowed = None if mask is None else by_member(mask, self.members)
-            if at_random:
-                chosen = algorithm.random_actions(generators, self._each, allowed)
-            else:
-                chosen, _, _ = algorithm.act(actor, rows, allowed, noise)
-            action = chosen.flatten(0, 1).numpy()
-            step = env.step(algorithm.to_env(action))
+            chosen = [actor.act(obs, mask, at) for actor in actors]
+            action = chosen[0] if len(chosen) == 1 else np.concatenate(chosen)
+            step = env.step(self.stacks[0].algorithm.to_env(action))
             self.buffer.add(obs, mask, action, step)
             self.episodes.add(step)
-            self._see(rows, step)
+            self._see(obs, step)
             self._obs, mask = step.obs, step.mask
             spent += int(step.steps.sum())
         return spent
 
+    def rows(self, stack: int) -> slice:
+        """The environments of a stack."""
+        return slice(self._first[stack] * self._each, self._first[stack + 1] * self._each)
+
+    def seeds_of(self, stack: int, name: str, update: int) -> list[Seeds]:
+        """A node of the seed tree for each member of a stack."""
+        members = self.stacks[stack].members
+        return member_seeds(self.seeds, name, members, update, self._first[stack])
+
+    def acts_at_random(self, update: int) -> bool:
+        """Whether it is too early to act by what was learnt."""
+        # A resumed run whose buffer was not saved fills it by what it has learnt already.
+        return update * self._round < int(self.config.learning_starts)
+
     @property
     def _round(self) -> int:
         """Transitions of a member in a round."""
-        return int(self.algorithm.config.train_freq) * self._each
+        return int(self.config.train_freq) * self._each
 
-    def _see(self, rows: Tensor, step: Any) -> None:
+    def _see(self, obs: Array, step: Any) -> None:
         """Keep the running scales of observations and returns."""
-        algorithm = self.algorithm
-        algorithm.see(self.state, rows)
-        if algorithm.config.normalize_rewards:
-            gamma = np.repeat(self.state.gamma.numpy(), self._each)
-            now = self._returns * gamma**step.steps + step.reward
-            self._returns = now.astype(np.float32)  # a power of integers has 64 bits
-            algorithm.see_returns(self.state, by_member(self._returns, self.members))
-            self._returns[step.ended] = 0.0
+        for i, stack in enumerate(self.stacks):
+            algorithm, state, part = stack.algorithm, stack.state, self.rows(i)
+            algorithm.see(state, by_member(obs[part], stack.members))
+            if algorithm.config.normalize_rewards:
+                gamma = np.repeat(state.gamma.numpy(), self._each)
+                now = self._returns[part] * gamma ** step.steps[part] + step.reward[part]
+                self._returns[part] = now.astype(np.float32)  # a power of integers has 64 bits
+                algorithm.see_returns(state, by_member(self._returns[part], stack.members))
+        self._returns[step.ended] = 0.0
 
     def learn(self, update: int, steps: int) -> None:
         """Make the gradient steps that are due after this round."""
-        cfg, algorithm = self.algorithm.config, self.algorithm
-        due = self._owed(update + 1) - self._owed(update)
+        starts = int(self.config.learning_starts)
         own = len(self.buffer) // self.members
-        if not due or own < min(cfg.learning_starts, self.buffer.capacity // self.members // 2):
+        if own < min(starts, self.buffer.capacity // self.members // 2):
             return
-        progress = min(1.0, steps / self.budget)
+        found = [self._learn(i, update, steps) for i in range(len(self.stacks))]
+        if all(found):
+            self.metrics = {k: torch.cat([m[k] for m in found]) for k in found[0]}
+
+    def _learn(self, at: int, update: int, steps: int) -> dict[str, Tensor]:
+        """A stack's gradient steps; the metrics (P,) of the last one, if there were any."""
+        algorithm, state, first = self.stacks[at].algorithm, self.stacks[at].state, self._first[at]
+        cfg = algorithm.config
+        metrics: dict[str, Tensor] = {}
+        due = self._owed(cfg, update + 1) - self._owed(cfg, update)
+        if not due:
+            return metrics
+        progress = min(1.0, steps / self.horizon)
         beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)
-        seeds = member_seeds(self.seeds, "learn", self.members, update)
+        seeds = self.seeds_of(at, "learn", update)
         rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
         # Several draws at once cost little more than one, but priorities change in between.
         together = 1 if cfg.prioritized else TOGETHER
-        for first in range(0, due, together):
-            size = cfg.batch_size * min(together, due - first)
-            drawn = self.buffer.sample(size, self.state.gamma, rngs, beta)
+        for done in range(0, due, together):
+            size = cfg.batch_size * min(together, due - done)
+            drawn = self.buffer.sample(size, state.gamma, rngs, beta, first)
             for sample in drawn.split(cfg.batch_size):
-                self.metrics, error = algorithm.update(self.state, sample, progress, generators)
+                metrics, error = algorithm.update(state, sample, progress, generators)
                 if cfg.prioritized:
-                    self.buffer.update_priorities(sample.index, error)
+                    self.buffer.update_priorities(sample.index, error, first)
+        return metrics
 
-    def _owed(self, update: int) -> int:
+    def _owed(self, config: OffPolicy, update: int) -> int:
         """Gradient steps that are due once ``update`` rounds are over."""
-        cfg = self.algorithm.config
-        return max(0, int((update * self._round - cfg.learning_starts) * cfg.update_ratio))
+        return max(0, int((update * self._round - config.learning_starts) * config.update_ratio))
+
+
+class _Actor:
+    """A stack that acts for a round: a copy of its parameters, and its noise."""
+
+    def __init__(self, loop: _Loop, at: int, update: int, steps: int) -> None:
+        self._stack, self._rows, self._each = loop.stacks[at], loop.rows(at), loop._each
+        algorithm = self._stack.algorithm
+        self._actor = algorithm.actor(self._stack.state, min(1.0, steps / loop.horizon))
+        self._generators = [s.torch() for s in loop.seeds_of(at, "act", update)]
+        self._noises = algorithm.noise(self._generators, loop.config.train_freq, loop._each)
+        self._at_random = loop.acts_at_random(update)
+
+    def act(self, obs: Array, mask: Array | None, at: int) -> Array:
+        """Actions of the stack's environments in policy units, given all environments' rows."""
+        stack, algorithm = self._stack, self._stack.algorithm
+        allowed = None if mask is None else by_member(mask[self._rows], stack.members)
+        if self._at_random:
+            chosen = algorithm.random_actions(self._generators, self._each, allowed)
+        else:
+            rows = by_member(obs[self._rows], stack.members)
+            chosen, _, _ = algorithm.act(self._actor, rows, allowed, self._noises[at])
+        # A member that has diverged must not spoil what all learn from.
+        found: Array = chosen.flatten(0, 1).nan_to_num().numpy()
+        return found

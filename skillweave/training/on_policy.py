@@ -30,6 +30,8 @@ def train_on_policy(
     seeds: Seeds,
     budget: int,
     *,
+    horizon: int | None = None,
+    tolerant: bool = False,
     cut_every: int = 250_000,
     update: int = 0,
     steps: int = 0,
@@ -40,6 +42,8 @@ def train_on_policy(
 
     Args:
         env: P·num_envs environments.
+        horizon: steps at which schedules end; None: the budget.
+        tolerant: a member that diverges does not stop the others.
         cut_every: environment steps between clean cuts, at which episodes in flight are
             truncated and environments restart from a seed of their own (contract 8).
         update, steps, seconds: where a resumed run stands; a clean cut.
@@ -49,7 +53,8 @@ def train_on_policy(
         SkillweaveError: parameters or losses are no longer finite.
     """
     loop = _Loop(algorithm, env, seeds, members=len(state.params))
-    learner = _Learner(algorithm, state, loop, budget, on_tick, time.perf_counter() - seconds)
+    started = time.perf_counter() - seconds
+    learner = _Learner(algorithm, state, loop, horizon or budget, tolerant, on_tick, started)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -79,12 +84,13 @@ class _Learner:
         algorithm: PPOAlgorithm,
         state: State,
         loop: _Loop,
-        budget: int,
+        horizon: int,
+        tolerant: bool,
         on_tick: Callable[[Tick], None] | None,
         started: float,
     ) -> None:
-        self.algorithm, self.state, self.loop, self.budget = algorithm, state, loop, budget
-        self.on_tick, self.started = on_tick, started
+        self.algorithm, self.state, self.loop, self.horizon = algorithm, state, loop, horizon
+        self.tolerant, self.on_tick, self.started = tolerant, on_tick, started
         set_threads = torch.set_num_threads  # torch counts threads for each thread
         self._worker = ThreadPoolExecutor(1, "learner", set_threads, (algorithm.config.threads,))
         self._pending: Future[dict[str, float]] | None = None
@@ -93,7 +99,7 @@ class _Learner:
     def start(self, rollout: Rollout, update: int, before: int, after: int) -> None:
         """Begin to learn from a rollout that was collected from step ``before`` to ``after``."""
         self._at = (update + 1, after)
-        self._pending = self._worker.submit(self._learn, rollout, update, before / self.budget)
+        self._pending = self._worker.submit(self._learn, rollout, update, before / self.horizon)
 
     def wait(self, actor: Actor, cut: bool = False) -> Actor:
         """Let a pending update end, report it, and return what acts from now on."""
@@ -113,7 +119,7 @@ class _Learner:
     def _learn(self, rollout: Rollout, update: int, progress: float) -> dict[str, float]:
         seeds = self.loop.member_seeds("learn", update)
         _, metrics = self.algorithm.update(self.state, rollout, min(1.0, progress), seeds)
-        return to_numbers(metrics, update)
+        return to_numbers(metrics, update, tolerant=self.tolerant)
 
 
 class _Loop:

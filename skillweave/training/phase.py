@@ -35,6 +35,20 @@ class Listener(Protocol):
         """A phase is over."""
         ...
 
+    def message(self, text: str) -> None:
+        """Something that people should know."""
+        ...
+
+
+class Trainer(Protocol):
+    """How a phase is trained: by one agent, or by a population."""
+
+    def __call__(
+        self, phase: Phase, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
+    ) -> AgentPolicy:
+        """Train it to its end, or return its policy where it is done already."""
+        ...
+
 
 @dataclass(frozen=True)
 class Phase:
@@ -55,6 +69,47 @@ class Phase:
         }
 
 
+class Record:
+    """What a phase under way writes and tells: its entry, its metrics, its listeners."""
+
+    def __init__(
+        self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: dict[str, Any]
+    ) -> None:
+        self.run, self.listeners, self.entry, self.at = run, listeners, run.phase(name), at
+        run.rewind_metrics(at.get("metrics_bytes", self.entry.get("metrics_bytes")))
+        self.entry.setdefault("metrics_bytes", run.metrics_size())
+        self.entry["status"] = "training"
+        run.save()
+        for listener in listeners:
+            listener.phase(name, int(self.entry["budget"]))
+
+    def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """An update was made."""
+        name = self.entry["name"]
+        self.at.update(update=update, steps=steps, seconds=seconds, metrics=metrics)
+        now = {"phase": name, "update": update, "steps": steps}
+        self.run.log(now | {"seconds": round(seconds, 4)} | metrics)
+        for listener in self.listeners:
+            listener.tick(name, steps, seconds, metrics)
+
+    def header(self) -> dict[str, Any]:
+        """Where the phase stands, for its checkpoint."""
+        return {"phase": self.entry["name"]} | {
+            k: self.at[k] for k in ("update", "steps", "seconds", "metrics")
+        }
+
+    def done(self, policy: AgentPolicy) -> None:
+        """The phase is over: keep its policy, and say how it went."""
+        entry, at = self.entry, self.at
+        self.run.save_policy(entry["name"], policy)
+        entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
+        entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
+        entry["final"] = at["metrics"]
+        self.run.save()
+        for listener in self.listeners:
+            listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
+
+
 def train_phase(
     phase: Phase, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
 ) -> AgentPolicy:
@@ -73,25 +128,15 @@ def train_phase(
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
         found = run.load_checkpoint(algorithm.state_type, phase.name)
         state, at, extra = found or (algorithm.init([seeds / "member" / 0]), dict(START), {})
-        run.rewind_metrics(at.get("metrics_bytes", entry.get("metrics_bytes")))
-        entry.setdefault("metrics_bytes", run.metrics_size())
-        entry["status"] = "training"
-        run.save()
-        for listener in listeners:
-            listener.phase(phase.name, budget)
+        record = Record(phase.name, run, listeners, at)
         probe.start(at["steps"])
 
         def on_tick(tick: Tick) -> None:
             metrics = tick.metrics
             metrics |= probe.look(tick.steps, lambda: AgentPolicy.of(algorithm, tick.state))
-            at.update(update=tick.update, steps=tick.steps, seconds=tick.seconds, metrics=metrics)
-            now = {"phase": phase.name, "update": tick.update, "steps": tick.steps}
-            run.log(now | {"seconds": round(tick.seconds, 4)} | metrics)
-            for listener in listeners:
-                listener.tick(phase.name, tick.steps, tick.seconds, metrics)
+            record.tick(tick.update, tick.steps, tick.seconds, metrics)
             if tick.cut:
-                header = {"seconds": tick.seconds, "metrics": metrics}
-                run.save_checkpoint(tick.state, now | header, tick.extra)
+                run.save_checkpoint(tick.state, record.header(), tick.extra)
 
         where: dict[str, Any] = {k: at[k] for k in ("update", "steps", "seconds")}
         where |= {"cut_every": int(run.manifest["cut_every"]), "on_tick": on_tick}
@@ -103,16 +148,5 @@ def train_phase(
         env.close()
         probe.close()
     policy = AgentPolicy.of(algorithm, state)
-    run.save_policy(phase.name, policy)
-    _finish(run, entry, at)
-    for listener in listeners:
-        listener.done(phase.name, at["steps"], at["seconds"], at["metrics"])
+    record.done(policy)
     return policy
-
-
-def _finish(run: RunDirectory, entry: dict[str, Any], at: dict[str, Any]) -> None:
-    """Say in the manifest that a phase is done, and how it went."""
-    entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
-    entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
-    entry["final"] = at["metrics"]
-    run.save()

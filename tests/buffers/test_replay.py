@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skillweave.buffers import replay
+from skillweave.buffers import memory
 from skillweave.buffers.replay import ReplayBuffer
 from skillweave.spaces import obs_dtype
 from skillweave.types import Sample, SkillweaveError, VecStep
@@ -394,7 +394,7 @@ def test_side_ring_grows_only_as_far_as_ends_are_kept():
 def test_more_than_the_memory_is_an_error_that_says_how_much_would_fit():
     space = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8)
     with (
-        mock.patch.object(replay, "_free_memory", return_value=int(11.2 * 2**30)),
+        mock.patch.object(memory, "free_memory", return_value=int(11.2 * 2**30)),
         pytest.raises(SkillweaveError) as error,
     ):
         ReplayBuffer(1_000_000, 8, 1, space, (), np.int64, mask_size=6)
@@ -402,7 +402,7 @@ def test_more_than_the_memory_is_an_error_that_says_how_much_would_fit():
         "a replay buffer of 1,000,000 transitions of (4, 84, 84) uint8 needs 26.3 GiB, "
         "but 11.2 GiB are free: lower buffer_size (at most about 425,937)"
     )
-    free = replay._free_memory()
+    free = memory.free_memory()
     assert free is None or 2**20 < free < 2**50
 
 

@@ -1,0 +1,182 @@
+"""Changes of a member's networks: all of them together, weights and moments alike.
+
+A change is drawn for the settings' networks (``network`` and, where it has its own, ``critic``);
+``rebuilt`` then carries every tensor of the member's state over.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Family
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.evolution.config import Mutations
+from skillweave.evolution.stacks import Member
+from skillweave.networks import growth
+from skillweave.networks.config import CNN, Network
+from skillweave.networks.encoders import ImageEncoder
+from skillweave.networks.growth import Units
+from skillweave.networks.stacked import Views
+from skillweave.types import SkillweaveError
+
+Alter = Callable[[Views, bool], dict[str, Tensor]]
+"""Parameters by name, and whether they are moments, to those of the changed network."""
+Plan = Callable[[Views], Alter]
+"""What learns, by name, to what is done to it and to all that goes with it."""
+NETWORKS = ("network", "critic")
+
+
+@dataclass(frozen=True)
+class Change:
+    """What happens to the networks: to units of a layer, or to a whole one."""
+
+    kind: str  # units, channels, layer
+    layer: int = 0
+    by: int = 0  # units or channels; of a layer 1 or −1
+
+
+def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str) -> None:
+    """Raise a SkillweaveError where networks cannot be changed as asked for."""
+    for name in NETWORKS:
+        network = getattr(config, name, None)
+        if not isinstance(network, Network):
+            continue
+        if mutations.architecture > 0.0 and network.layer_norm:
+            raise SkillweaveError(
+                f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has "
+                "layer_norm, with which no unit can be added without changing the function: set "
+                "it to 0, or layer_norm=False"
+            )
+        if mutations.architecture > 0.0 and not network.hidden:
+            raise SkillweaveError(
+                f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has no "
+                "hidden layers to change: set it to 0, or give it some"
+            )
+
+
+def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> Change | None:
+    """A change that fits the limits, or None where there is none."""
+    config = member.config
+    network: Network = config.network
+    units = [
+        Change("units", layer, by)
+        for layer, width in enumerate(network.hidden)
+        for by in _steps(width, int(rng.choice([8, 16, 32, 64])), mutations.units)
+    ]
+    cnn = _cnn(member, spaces)
+    for layer, count in enumerate(cnn.channels if cnn else ()):
+        steps = _steps(count, max(1, count // 4), mutations.channels)
+        units += [Change("channels", layer, by) for by in steps]
+    layers = [Change("layer", by=by) for by in (1, -1) if _fits(config, by, mutations)]
+    first, second = (layers, units) if rng.random() < mutations.layer_share else (units, layers)
+    options = first or second
+    return options[int(rng.integers(len(options)))] if options else None
+
+
+def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
+    """By how much a size can grow and shrink within its limits."""
+    grown, shrunk = min(limits[1], size + by) - size, max(limits[0], size - by) - size
+    return [step for step, ok in ((grown, grown > 0), (shrunk, shrunk < 0)) if ok]
+
+
+def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
+    """Whether a layer can be added or taken away."""
+    network, fewest = config.network, mutations.layers[0]
+    behind = len(network.hidden) - getattr(config, "dueling", False)
+    if by < 0:
+        return len(network.hidden) > fewest and behind > 1
+    if behind < 1 or len(network.hidden) >= mutations.layers[1]:
+        return False
+    widest = network.hidden[behind - 1] * (1 + (network.activation in growth.PAIRED))
+    both = [n for k in NETWORKS if isinstance(n := getattr(config, k, None), Network)]
+    return widest <= mutations.units[1] and all(n.activation in growth.IDENTITY for n in both)
+
+
+def _cnn(member: Member, spaces: Any) -> CNN | None:
+    """What encodes the member's images, if one architecture encodes them all."""
+    (_, net), *_ = member.algorithm(spaces).families()[0].nets
+    kinds = {e.cnn for e in net.encoders.values() if isinstance(e, ImageEncoder)}
+    return kinds.pop() if len(kinds) == 1 else None
+
+
+def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) -> Network:
+    """The network after a change; ``cnn`` is what encodes its images now."""
+    if change.kind == "channels":
+        assert cnn is not None
+        new = tuple(c + change.by * (i == change.layer) for i, c in enumerate(cnn.channels))
+        return replace(network, cnn=replace(cnn, channels=new))
+    hidden = list(network.hidden)
+    behind = len(hidden) - dueling  # behind the last layer of the trunk
+    if change.kind == "units":
+        layer = min(change.layer, len(hidden) - 1)
+        hidden[layer] = max(1, hidden[layer] + change.by)
+    elif change.by > 0:
+        hidden.insert(behind, hidden[behind - 1] * (1 + (network.activation in growth.PAIRED)))
+    elif behind > 1:
+        del hidden[behind - 1]
+    return replace(network, hidden=tuple(hidden))
+
+
+def rebuilt(member: Member, change: Change, spaces: Any, rng: np.random.Generator) -> Member:
+    """The member after a change: settings, weights and moments."""
+    old = member.algorithm(spaces)
+    cnn, dueling = _cnn(member, spaces), bool(getattr(old.config, "dueling", False))
+    networks = {
+        name: changed(network, change, cnn, dueling)
+        for name in NETWORKS
+        if isinstance(network := getattr(old.config, name, None), Network)
+    }
+    config = replace(old.config, **networks)
+    new = make_algorithm(config, *spaces)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    state = {f.name: getattr(member.state, f.name).clone() for f in fields(member.state)}
+    for before, after in zip(old.families(), new.families(), strict=True):
+        state |= _carried(before, after, state, change, generator)
+    return replace(member, config=config, state=new.state_type(**state))
+
+
+def _carried(
+    before: Family,
+    after: Family,
+    state: dict[str, Tensor],
+    change: Change,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """A family's fields in the new layout."""
+    names = (*before.weights, *before.moments)
+    lead = state[names[0]].shape[:-1]
+    named = {k: before.layout.views(state[k].reshape(-1, before.layout.size)) for k in names}
+    for _, net in before.nets:
+        for plan in _plans(net, change, generator):
+            alter = plan(named[before.weights[0]])
+            named = {k: alter(v, k in before.moments) for k, v in named.items()}
+    return {k: after.layout.flatten(v).reshape(*lead, -1) for k, v in named.items()}
+
+
+def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
+    """What happens to a network's parameters, one plan after another."""
+    if change.kind == "layer":
+        joint, activation = net.joint(), net.network.activation
+        if change.by > 0:
+            return [lambda _: lambda v, m: growth.deepened(v, joint, activation, moments=m)]
+        return [lambda _: lambda v, m: growth.shallower(v, joint, moments=m)] * (joint.depth > 1)
+    layer = min(change.layer, len(net.network.hidden) - 1)
+    groups = net.units(layer) if change.kind == "units" else net.channels(change.layer)
+    return [functools.partial(_resized, units, change.by, generator) for units in groups]
+
+
+def _resized(units: Units, by: int, generator: torch.Generator, online: Views) -> Alter:
+    """More units or fewer; which, and what they compute, is the same for all of a family."""
+    if by > 0:
+        new = growth.fresh(online, units, by, generator)
+        return lambda v, moments: growth.widened(v, units, by, None if moments else new)
+    kept = growth.most_read(online, units, max(1, units.count + by))
+    return lambda v, moments: growth.narrowed(v, units, kept)

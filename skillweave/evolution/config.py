@@ -1,0 +1,263 @@
+"""How a population evolves, as data; this module does not import torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal, get_args
+
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.networks.config import Activation
+from skillweave.types import SkillweaveError
+
+Scale = Literal["linear", "log", "complement"]
+KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")
+"""The kinds of mutation; ``Mutations`` has a probability of each."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a setting may lie, and how it moves there."""
+
+    low: float
+    """The smallest value."""
+    high: float
+    """The largest value."""
+    scale: Scale = "log"
+    """linear; log: ratios count; complement: ratios of 1 − x count (γ, λ)."""
+
+    def __post_init__(self) -> None:
+        if self.scale not in get_args(Scale):
+            known = ", ".join(get_args(Scale))
+            raise SkillweaveError(f"Range.scale is {self.scale!r}; it must be one of {known}")
+        if not self.low < self.high:
+            raise SkillweaveError(f"Range.high is {self.high}; it must be more than {self.low}")
+        if self.scale == "log" and self.low <= 0.0:
+            raise SkillweaveError(f"Range.low is {self.low}; on a log scale it must be positive")
+        if self.scale == "complement" and self.high >= 1.0:
+            raise SkillweaveError(f"Range.high is {self.high}; as a complement it must be below 1")
+
+    def to_unit(self, value: float) -> float:
+        """Where a value lies between low (0) and high (1)."""
+        low, high, x = (self._scaled(v) for v in (self.low, self.high, value))
+        return (x - low) / (high - low)
+
+    def from_unit(self, unit: float) -> float:
+        """The inverse of ``to_unit``; kept within the range."""
+        low, high = self._scaled(self.low), self._scaled(self.high)
+        x = low + min(1.0, max(0.0, unit)) * (high - low)
+        value = {"linear": x, "log": math.exp(x), "complement": 1.0 - math.exp(-x)}[self.scale]
+        return min(self.high, max(self.low, value))
+
+    def _scaled(self, value: float) -> float:
+        if self.scale == "linear":
+            return value
+        return math.log(value) if self.scale == "log" else -math.log(1.0 - value)
+
+
+USUAL: dict[str, Range] = {
+    "learning_rate": Range(1e-5, 1e-2),
+    "gamma": Range(0.9, 0.9999, "complement"),
+    "gae_lambda": Range(0.8, 0.99, "complement"),
+    "clip_coef": Range(0.05, 0.5),
+    "ent_coef": Range(1e-5, 0.1),
+    "vf_coef": Range(0.1, 2.0),
+    "max_grad_norm": Range(0.1, 20.0),
+    "batch_size": Range(16, 4096),
+    "update_epochs": Range(1, 16),
+    "n_steps": Range(8, 1024),
+    "update_ratio": Range(0.05, 4.0),
+    "tau": Range(0.001, 1.0),
+    "exploration_noise": Range(0.01, 1.0),
+    "target_noise": Range(0.01, 1.0),
+    "target_noise_clip": Range(0.1, 1.0),
+    "policy_delay": Range(1, 8),
+    "target_update_interval": Range(1, 1000),
+    "exploration_final_eps": Range(0.001, 0.2),
+    "target_kl": Range(0.002, 0.1),
+}
+"""Every setting that can mutate, and its usual range; all others shape the experience itself."""
+_MUTATED = ("learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "tau")
+"""Those that do where nothing else is said: they never part a stack."""
+
+
+@dataclass(frozen=True)
+class Mutations:
+    """What happens to an heir: one kind of change, by these probabilities."""
+
+    none: float = 0.2
+    """Nothing."""
+    hyperparameters: float = 0.4
+    """One setting moves within its range."""
+    parameters: float = 0.1
+    """Gaussian noise on a share of the policy's weights."""
+    architecture: float = 0.2
+    """Units or a layer are added or removed; growth leaves the function as it was."""
+    activation: float = 0.1
+    """Another nonlinearity."""
+    ranges: Mapping[str, Range] | None = None
+    """By setting; None: learning_rate, gamma and others, where the start value is usual."""
+    strength: float = 0.1
+    """Deviation of the noise on weights, in units of the layer's weights' own."""
+    share: float = 0.1
+    """Share of the weights that get noise."""
+    step: float = 0.1
+    """How far a setting moves: this share of its range, up or down."""
+    layer_share: float = 0.2
+    """Share of architecture mutations that add or remove a layer; the others change units."""
+    layers: tuple[int, int] = (1, 3)
+    """Fewest and most hidden layers."""
+    units: tuple[int, int] = (16, 256)
+    """Fewest and most units of a hidden layer."""
+    channels: tuple[int, int] = (8, 64)
+    """Fewest and most channels of a convolution."""
+    activations: tuple[Activation, ...] = ("tanh", "relu", "elu", "silu")
+    """Nonlinearities to choose from."""
+
+    def __post_init__(self) -> None:
+        for name in (*KINDS, "share", "step", "layer_share"):
+            value = getattr(self, name)
+            _check(self, name, 0.0 <= value <= 1.0, "between 0 and 1")
+        total = sum(getattr(self, name) for name in KINDS)
+        if abs(total - 1.0) > 1e-6:
+            raise SkillweaveError(
+                f"Mutations: the probabilities {', '.join(KINDS)} sum to {total:g}; "
+                "they must sum to 1"
+            )
+        _check(self, "strength", self.strength >= 0.0, "at least 0")
+        for name in ("layers", "units", "channels"):
+            low, high = getattr(self, name)
+            _check(self, name, 1 <= low <= high, "(fewest, most), at least 1")
+        known = get_args(Activation)
+        fits = bool(self.activations) and all(a in known for a in self.activations)
+        _check(self, "activations", fits, f"some of {', '.join(known)}")
+
+    def ranges_of(self, config: AlgorithmConfig, *, start: bool = True) -> dict[str, Range]:
+        """The ranges of an algorithm's settings.
+
+        Args:
+            start: its own values are those that members begin with, so they must lie within.
+
+        Raises:
+            SkillweaveError: a setting that it does not have, or a range without the start value.
+        """
+        own = {f.name for f in fields(config)}
+        if self.ranges is None:
+            usual = {k: USUAL[k] for k in _MUTATED if k in own}
+            return {k: r for k, r in usual.items() if r.low <= getattr(config, k) <= r.high}
+        for name, found in self.ranges.items():
+            kind = type(config).__name__
+            if name not in own or name not in USUAL:
+                can = ", ".join(k for k in USUAL if k in own)
+                raise SkillweaveError(
+                    f"Mutations.ranges: {kind} has no setting {name!r} that can mutate; "
+                    f"those that can: {can}"
+                )
+            value = getattr(config, name)
+            if start and (value is None or not found.low <= value <= found.high):
+                raise SkillweaveError(
+                    f"Mutations.ranges[{name!r}] is {found.low:g} to {found.high:g}, which "
+                    f"excludes the start value {kind}.{name} = {value}"
+                )
+        return dict(self.ranges)
+
+
+@dataclass(frozen=True)
+class Tournament:
+    """Each heir's parent is the best of a few members drawn at random."""
+
+    size: int = 2
+    """Members in a tournament."""
+    elitism: bool = True
+    """The best member goes on as it is."""
+
+    def __post_init__(self) -> None:
+        _check(self, "size", type(self.size) is int and self.size >= 1, "at least 1")
+
+
+@dataclass(frozen=True)
+class Truncation:
+    """The worst members become heirs of the best; all others go on (Jaderberg et al. 2017)."""
+
+    share: float = 0.25
+    """Of the members, how many are replaced, and by how many."""
+
+    def __post_init__(self) -> None:
+        _check(self, "share", 0.0 < self.share <= 0.5, "more than 0 and at most 0.5")
+
+
+@dataclass(frozen=True)
+class Evolution:
+    """A population in place of one agent: it trains, is compared, selected and mutated."""
+
+    population: int = 8
+    """Members."""
+    generations: int = 20
+    """How often they are compared; each trains the budget's equal part in between."""
+    episodes: int = 10
+    """Episodes that a member's fitness is the mean return of; the same starts for all."""
+    target: float | None = None
+    """Fitness at which evolution ends early; None: never."""
+    start: Literal["config", "random"] = "config"
+    """Members begin with the settings given, or with settings drawn from the ranges."""
+    selection: Any = field(default_factory=Tournament)
+    """Tournament(), Truncation(), or your own: see ``Selection``."""
+    mutations: Mutations = field(default_factory=Mutations)
+    """What changes from parent to heir."""
+
+    def __post_init__(self) -> None:
+        for name in ("population", "generations", "episodes"):
+            value = getattr(self, name)
+            _check(self, name, type(value) is int and value >= 1, "a whole number, at least 1")
+        _check(self, "start", self.start in ("config", "random"), "config or random")
+        if isinstance(self.selection, Tournament) and self.selection.elitism:
+            _check(self, "population", self.population > 1, "at least 2 with Tournament.elitism")
+        if isinstance(self.selection, Tournament):
+            fits = self.selection.size <= self.population
+            _check(self, "population", fits, f"at least Tournament.size ({self.selection.size})")
+        if not isinstance(self.selection, Tournament | Truncation):
+            able = callable(getattr(self.selection, "select", None))
+            _check(self, "selection", able, "Tournament(), Truncation() or have select()")
+        _check(self, "mutations", isinstance(self.mutations, Mutations), "a Mutations()")
+
+
+def evolution_to_json(evolution: Evolution) -> dict[str, Any]:
+    """Plain JSON; a selection of the user's own by its name."""
+    data = asdict(evolution)
+    data["selection"] = {"kind": type(evolution.selection).__name__}
+    if isinstance(evolution.selection, Tournament | Truncation):
+        data["selection"] |= asdict(evolution.selection)
+    return data
+
+
+def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = None) -> Evolution:
+    """The inverse of ``evolution_to_json``; ``selection``: the user's own, which is not in it.
+
+    Raises:
+        SkillweaveError: an unknown field or a value out of range, or the selection is missing.
+    """
+    try:
+        values, mutations = dict(data), dict(data["mutations"])
+        chosen = dict(values["selection"])
+        kind = chosen.pop("kind")
+        known: dict[str, Any] = {"Tournament": Tournament, "Truncation": Truncation}
+        if kind not in known and type(selection).__name__ != kind:
+            raise SkillweaveError(
+                f"{where} evolves by a selection of your own, {kind}; give it: "
+                f"resume(..., evolve=Evolution(selection={kind}(), ...))"
+            )
+        values["selection"] = known[kind](**chosen) if kind in known else selection
+        if mutations["ranges"] is not None:
+            mutations["ranges"] = {k: Range(**r) for k, r in mutations["ranges"].items()}
+        mutations = {k: tuple(v) if isinstance(v, list) else v for k, v in mutations.items()}
+        values["mutations"] = Mutations(**mutations)
+        return Evolution(**values)
+    except (KeyError, TypeError) as error:
+        raise SkillweaveError(f"{where}: its evolution is damaged, or newer: {error}") from error
+
+
+def _check(config: object, name: str, ok: bool, asked: str) -> None:
+    if not ok:
+        value = getattr(config, name)
+        raise SkillweaveError(f"{type(config).__name__}.{name} is {value!r}; it must be {asked}")

@@ -1,0 +1,185 @@
+"""What changes from a parent to its heir: a setting, weights, the architecture, an activation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.evolution.architecture import draw_change, rebuilt
+from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
+from skillweave.evolution.stacks import Member, Origin
+from skillweave.networks.config import Network
+from skillweave.types import SkillweaveError
+
+Spaces = tuple[Any, Any]
+
+
+def mutate(
+    member: Member, mutations: Mutations, spaces: Spaces, rng: np.random.Generator
+) -> Member:
+    """A child of the member, which says what mutation it has; "none" where none is possible."""
+    kind = str(rng.choice(KINDS, p=np.array([getattr(mutations, k) for k in KINDS])))
+    if kind == "hyperparameters":
+        changed = _move_setting(member, mutations, rng)
+    elif kind == "parameters":
+        changed = _add_noise(member, mutations, spaces, rng)
+    elif kind == "architecture":
+        change = draw_change(member, mutations, spaces, rng)
+        changed = member if change is None else rebuilt(member, change, spaces, rng)
+    elif kind == "activation":
+        changed = _change_activation(member, mutations, rng)
+    else:
+        changed = member
+    if changed is member:
+        changed, kind = copy(member), "none"
+    changes = difference(member.config, changed.config)
+    return replace(changed, origin=Origin(member.number, kind, changes))
+
+
+def copy(member: Member) -> Member:
+    """The same member with tensors of its own."""
+    state = {f.name: getattr(member.state, f.name).clone() for f in fields(member.state)}
+    return replace(member, state=type(member.state)(**state))
+
+
+def difference(old: AlgorithmConfig, new: AlgorithmConfig) -> dict[str, tuple[Any, Any]]:
+    """Settings that differ, by dotted name, with their old and new values."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for f in fields(old):
+        a, b = getattr(old, f.name), getattr(new, f.name)
+        if a == b:
+            continue
+        if isinstance(a, Network) and isinstance(b, Network):
+            parts = {k.name: (getattr(a, k.name), getattr(b, k.name)) for k in fields(a)}
+            found |= {f"{f.name}.{k}": v for k, v in parts.items() if v[0] != v[1]}
+        else:
+            found[f.name] = (a, b)
+    return found
+
+
+def with_settings(member: Member, **settings: Any) -> Member:
+    """A copy of the member with other settings, in its state too where they stand there."""
+    found = copy(member)
+    found.config = replace(member.config, **settings)
+    for name, value in settings.items():
+        if hasattr(found.state, name):
+            getattr(found.state, name).fill_(value)
+    return found
+
+
+def random_config(
+    config: AlgorithmConfig, mutations: Mutations, rng: np.random.Generator
+) -> AlgorithmConfig:
+    """Settings, architecture and activation drawn evenly from what mutations may reach."""
+    for _ in range(100):
+        drawn = {
+            name: _valued(config, name, within.from_unit(rng.random()))
+            for name, within in sorted(mutations.ranges_of(config, start=False).items())
+        }
+        for name in ("network", "critic"):
+            network = getattr(config, name, None)
+            if isinstance(network, Network):
+                drawn[name] = _random_network(network, mutations, rng)
+        try:
+            return replace(config, **drawn)
+        except SkillweaveError:
+            continue  # they do not fit together: a batch larger than a rollout
+    raise SkillweaveError("Mutations.ranges: 100 settings drawn from them did not fit together")
+
+
+def _random_network(network: Network, by: Mutations, rng: np.random.Generator) -> Network:
+    if by.architecture > 0.0:
+        depth = int(rng.integers(by.layers[0], by.layers[1] + 1))
+        low, high = by.units
+        widths = Range(low, high + 1) if high > low else None
+        hidden = tuple(int(widths.from_unit(rng.random())) if widths else low for _ in range(depth))
+        network = replace(network, hidden=tuple(min(high, w) for w in hidden))
+    if by.activation > 0.0:
+        chosen: Any = by.activations[int(rng.integers(len(by.activations)))]
+        network = replace(network, activation=chosen)
+    return network
+
+
+def check_mutations(config: AlgorithmConfig, evolution: Evolution, where: str) -> None:
+    """Raise a SkillweaveError where a mutation does not fit the algorithm or its network."""
+    from skillweave.evolution.architecture import check_architecture
+
+    mutations = evolution.mutations
+    ranges = _named(where, mutations, config, evolution.start == "config")
+    if mutations.hyperparameters > 0.0 and not ranges:
+        raise SkillweaveError(f"{where}Mutations.hyperparameters is positive, but ranges is empty")
+    check_architecture(config, mutations, where)
+
+
+def _named(where: str, by: Mutations, config: AlgorithmConfig, start: bool) -> Mapping[str, Range]:
+    try:
+        return by.ranges_of(config, start=start)
+    except SkillweaveError as error:
+        raise SkillweaveError(f"{where}{error}") from error
+
+
+def _move_setting(member: Member, by: Mutations, rng: np.random.Generator) -> Member:
+    """One setting up or down; a whole number by at least one."""
+    ranges = by.ranges_of(member.config, start=False)
+    for name in rng.permutation(sorted(ranges)):
+        within, old = ranges[name], getattr(member.config, name)
+        if old is None:
+            continue
+        sign = 1 if rng.random() < 0.5 else -1
+        for way in (sign, -sign):  # the other way where this one ends
+            at = within.to_unit(min(within.high, max(within.low, old)))
+            new = _valued(member.config, name, within.from_unit(at + way * by.step))
+            if isinstance(old, int) and new == old:
+                new = old + way
+            if new == old or not within.low <= new <= within.high:
+                continue
+            try:
+                return with_settings(member, **{str(name): new})
+            except SkillweaveError:
+                continue  # it does not fit the others
+    return member
+
+
+def _valued(config: AlgorithmConfig, name: str, value: float) -> Any:
+    """A number of the kind that the setting has."""
+    return round(value) if isinstance(getattr(config, name), int) else float(value)
+
+
+def _add_noise(member: Member, by: Mutations, spaces: Spaces, rng: np.random.Generator) -> Member:
+    """Noise on a share of what acts, the same on its slow copy."""
+    algorithm = member.algorithm(spaces)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    found = copy(member)
+    online = algorithm.layout.views(found.state.params)
+    noise = torch.zeros_like(found.state.params)
+    for name, view in algorithm.layout.views(noise).items():
+        if name in algorithm.acting.shapes:
+            scale = online[name].square().mean().sqrt() * by.strength
+            chosen = torch.rand(view.shape, generator=generator) < by.share
+            view.copy_(torch.randn(view.shape, generator=generator) * chosen * scale)
+    if not bool(noise.any()):
+        return member
+    for name in algorithm.families()[0].weights:
+        getattr(found.state, name).add_(noise)
+    return found
+
+
+def _change_activation(member: Member, by: Mutations, rng: np.random.Generator) -> Member:
+    """Another nonlinearity, in all networks."""
+    others = [a for a in by.activations if a != member.config.network.activation]
+    if not others:
+        return member
+    chosen = others[int(rng.integers(len(others)))]
+    networks: dict[str, Any] = {
+        name: replace(network, activation=chosen)
+        for name in ("network", "critic")
+        if isinstance(network := getattr(member.config, name, None), Network)
+    }
+    found = copy(member)
+    found.config = replace(member.config, **networks)
+    return found

@@ -1,0 +1,298 @@
+"""A phase in which a population evolves, generation by generation, in a run directory.
+
+Beside what every phase writes, ``lineage.jsonl`` gets a line for each member of each generation.
+A generation is one piece: a run that was killed goes on from the last complete one.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.evolution.config import Evolution, evolution_from_json
+from skillweave.evolution.population import Population
+from skillweave.evolution.stacks import Member, Origin
+from skillweave.networks.config import Network
+from skillweave.runs.directory import RunDirectory
+from skillweave.seeding import Seeds
+from skillweave.training.episodes import Tick
+from skillweave.training.phase import START, Listener, Phase, Record, train_phase
+from skillweave.types import Array
+
+
+@dataclass
+class Nothing:
+    """A population's state, for a checkpoint: its members' tensors stand beside it."""
+
+
+@dataclass
+class Best:
+    """The best member so far: its policy is what the phase ends with."""
+
+    fitness: float
+    number: int
+    generation: int
+    policy: AgentPolicy
+
+
+def evolve_phase(
+    phase: Phase,
+    run: RunDirectory,
+    seeds: Seeds,
+    listeners: tuple[Listener, ...],
+    selection: Any = None,
+) -> AgentPolicy:
+    """Like ``train_phase``; where the run's entry says so, a population evolves instead.
+
+    The settings in the run count, not those of ``phase``: a resumed run goes on as it began.
+
+    Args:
+        selection: the user's own, which the run knows by name only.
+
+    Raises:
+        SkillweaveError: every member diverged, or the selection is missing or wrong.
+    """
+    entry = run.phase(phase.name)
+    if entry.get("evolution") is None:
+        return train_phase(phase, run, seeds, listeners)
+    if entry["status"] == "done":
+        return run.load_policy(phase.name)
+    where = f"{run.path}: phase {phase.name!r}"
+    evolution = evolution_from_json(entry["evolution"], where, selection)
+    evolving = _Evolving(phase, run, seeds, listeners, evolution)
+    try:
+        while not evolving.over:
+            evolving.generation()
+    finally:
+        evolving.close()
+    return evolving.finish()
+
+
+class _Evolving:
+    """One phase's population under way."""
+
+    def __init__(
+        self,
+        phase: Phase,
+        run: RunDirectory,
+        seeds: Seeds,
+        listeners: tuple[Listener, ...],
+        evolution: Evolution,
+    ) -> None:
+        self.phase, self.run, self.seeds, self.evolution = phase, run, seeds, evolution
+        self.listeners, entry = listeners, run.phase(phase.name)
+        self.config = config_from_json(entry["algorithm"])
+        self.horizon = int(entry["budget"]) // evolution.population
+        self.arena = phase.make_env(evolution.episodes, self.config.gamma)
+        """Where fitness is measured."""
+        self.spaces = self.arena.observation_space, self.arena.action_space
+        self.best: Best | None = None
+        self.done = 0
+        """Complete generations."""
+        found = run.load_checkpoint(Nothing, phase.name)
+        if found is None:
+            at: dict[str, Any] = dict(START)
+            self.population = Population.fresh(
+                self.config, evolution, phase.make_env, self.spaces, seeds
+            )
+        else:
+            _, at, tensors = found
+            self._restore(at, tensors)
+        self.lineage = Lineage(run, at.get("lineage_bytes", entry.get("lineage_bytes")))
+        entry.setdefault("lineage_bytes", self.lineage.size)
+        self.record = Record(phase.name, run, listeners, at)
+        self._started: float = time.perf_counter() - at["seconds"]
+
+    @property
+    def over(self) -> bool:
+        """Whether all generations are complete, or the target is reached."""
+        target = self.evolution.target
+        good = self.best is not None and target is not None and self.best.fitness >= target
+        return good or self.done >= self.evolution.generations
+
+    def generation(self) -> None:
+        """Train, compare, write down, evolve, and save."""
+        before = self.record.at["steps"]
+
+        def on_tick(steps: int, tick: Tick) -> None:
+            metrics = tick.metrics
+            if self.best is not None:
+                metrics |= {"fitness": self.best.fitness}
+            update = self.record.at["update"] + 1
+            self.record.tick(update, before + steps, self._seconds, metrics)
+
+        until = self.horizon * (self.done + 1) // self.evolution.generations
+        seeds = self.seeds / "generation" / self.done
+        self.population.train(until, self.horizon, seeds, on_tick)
+        fitness = self.population.fitness(self.arena, seeds / "fitness")
+        self._note(fitness)
+        self.done += 1
+        if not self.over:
+            self.population.evolve(fitness, seeds)
+        self._save()
+
+    def finish(self) -> AgentPolicy:
+        """The phase is over."""
+        assert self.best is not None
+        entry = self.record.entry
+        entry["winner"] = {"member": self.best.number, "fitness": self.best.fitness}
+        entry["winner"] |= {"generation": self.best.generation, "generations": self.done}
+        self.record.done(self.best.policy)
+        return self.best.policy
+
+    def close(self) -> None:
+        """Release the environments."""
+        self.arena.close()
+
+    @property
+    def _seconds(self) -> float:
+        return time.perf_counter() - self._started
+
+    def _note(self, fitness: Array) -> None:
+        """Write the generation down, keep the best, and tell."""
+        members = self.population.members
+        self.lineage.write(self.phase.name, self.done, members, fitness, self.evolution)
+        lost = [str(m.number) for m, f in zip(members, fitness, strict=True) if f == -np.inf]
+        if lost:
+            self._tell(
+                f"generation {self.done + 1}: member {', '.join(lost)} diverged; it is replaced"
+            )
+        winner = members[int(fitness.argmax())]
+        score = float(fitness.max())
+        if np.isfinite(score) and (self.best is None or score > self.best.fitness):
+            policy = self.population.policy(winner)
+            self.best = Best(score, winner.number, self.done, policy)
+        shown = ", ".join(f"{k} {_short(v)}" for k, v in self._settings(winner.config).items())
+        self._tell(
+            f"generation {self.done + 1} of {self.evolution.generations}: best is member "
+            f"{winner.number} with {score:.1f} ({shown})"
+        )
+
+    def _settings(self, config: AlgorithmConfig) -> dict[str, Any]:
+        return settings_of(config, self.evolution)
+
+    def _tell(self, text: str) -> None:
+        for listener in self.listeners:
+            listener.message(f"{self.phase.name}: {text}")
+
+    def _save(self) -> None:
+        """A checkpoint of the whole population, as it is to go on."""
+        tensors: dict[str, Tensor] = {}
+        for i, member in enumerate(self.population.members):
+            tensors |= {f"{i}.{k}": v for k, v in vars(member.state).items()}
+        buffer = self.population.buffer
+        if buffer is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
+            tensors |= {f"buffer.{k}": v for k, v in buffer.state().items()}
+        header: dict[str, Any] = {
+            "generation": self.done,
+            "rounds": self.population.rounds,
+            "next_number": self.population.next_number,
+            "lineage_bytes": self.lineage.size,
+            "members": [_member_to_json(m) for m in self.population.members],
+        }
+        if self.best is not None:
+            weights, about = self.best.policy.to_file()
+            tensors |= {f"best.{k}": v for k, v in weights.items()}
+            header["best"] = {"fitness": self.best.fitness, "number": self.best.number}
+            header["best"] |= {"generation": self.best.generation, "policy": about}
+        self.run.save_checkpoint(Nothing(), self.record.header() | header, tensors)
+
+    def _restore(self, at: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+        """Stand where a checkpoint says."""
+        members = []
+        for i, told in enumerate(at["members"]):
+            member = _member_from_json(told)
+            kind: Any = make_algorithm(member.config, *self.spaces).state_type
+            member.state = kind(**{f.name: tensors[f"{i}.{f.name}"] for f in fields(kind)})
+            members.append(member)
+        self.population = Population(members, self.evolution, self.phase.make_env, self.spaces)
+        self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
+        if buffer := _under("buffer", tensors):
+            self.population.load_buffer(buffer)
+        self.done = at["generation"]
+        if best := at.get("best"):
+            weights, where = _under("best", tensors), str(self.run.path)
+            policy = AgentPolicy.from_file(weights, best["policy"], where)
+            self.best = Best(best["fitness"], best["number"], best["generation"], policy)
+
+
+class Lineage:
+    """``lineage.jsonl``: who descends from whom, what changed, and how good it was."""
+
+    def __init__(self, run: RunDirectory, size: int | None) -> None:
+        self._path = run.path / "lineage.jsonl"
+        if size is not None and self.size > size:  # what follows is about to be written again
+            with self._path.open("rb+") as file:
+                file.truncate(size)
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._path.stat().st_size if self._path.exists() else 0
+
+    def write(
+        self,
+        phase: str,
+        generation: int,
+        members: list[Member],
+        fitness: Array,
+        evolution: Evolution,
+    ) -> None:
+        """A line for each member of a generation."""
+        with self._path.open("a") as file:
+            for member, value in zip(members, fitness, strict=True):
+                origin = member.origin
+                line = {
+                    "phase": phase,
+                    "generation": generation,
+                    "member": member.number,
+                    "parent": origin.parent,
+                    "mutation": origin.mutation,
+                    "changes": {k: list(v) for k, v in origin.changes.items()},
+                    "fitness": float(value) if np.isfinite(value) else None,
+                    "diverged": not np.isfinite(value),
+                    "steps": member.steps,
+                    "settings": settings_of(member.config, evolution),
+                }
+                file.write(json.dumps(line) + "\n")
+
+
+def settings_of(config: AlgorithmConfig, evolution: Evolution) -> dict[str, Any]:
+    """What evolution may change of a member's settings, by name."""
+    ranges = evolution.mutations.ranges_of(config, start=False)
+    found: dict[str, Any] = {name: getattr(config, name) for name in ranges}
+    network: Network = config.network
+    found |= {"hidden": list(network.hidden), "activation": network.activation}
+    return found
+
+
+def _member_to_json(member: Member) -> dict[str, Any]:
+    return {
+        "number": member.number,
+        "steps": member.steps,
+        "config": config_to_json(member.config),
+        "origin": vars(member.origin),
+    }
+
+
+def _member_from_json(told: dict[str, Any]) -> Member:
+    origin = dict(told["origin"])
+    origin["changes"] = {k: tuple(v) for k, v in origin["changes"].items()}
+    config = config_from_json(told["config"])
+    return Member(told["number"], config, None, told["steps"], Origin(**origin))
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    cut = len(prefix) + 1
+    return {k[cut:]: v for k, v in tensors.items() if k.startswith(f"{prefix}.")}
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,79 @@
+"""Who is parent to whom: the protocol, tournaments, and truncation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from skillweave.evolution.config import Evolution, Tournament, Truncation
+from skillweave.types import Array, SkillweaveError
+
+
+@dataclass(frozen=True)
+class Heir:
+    """A place in the next generation: which member it comes from, and whether it may change."""
+
+    parent: int
+    mutates: bool
+
+
+class Selection(Protocol):
+    """How the next generation follows from this one's fitness; give your own to ``Evolution``."""
+
+    def select(self, fitness: Array, rng: np.random.Generator) -> list[Heir]:
+        """One heir for each member.
+
+        Args:
+            fitness: (P,); the higher the better, −inf for members that have diverged.
+            rng: the only source of chance, so that a run can be resumed.
+        """
+        ...
+
+
+def select(evolution: Evolution, fitness: Array, rng: np.random.Generator) -> list[Heir]:
+    """The next generation, by the selection asked for; nobody is heir to a diverged member.
+
+    Raises:
+        SkillweaveError: all members have diverged, or a selection of the user's own is wrong.
+    """
+    if not np.isfinite(fitness).any():
+        raise SkillweaveError(
+            "every member has diverged: lower the learning rate, or its range; the last complete "
+            "generation is saved"
+        )
+    chosen = evolution.selection
+    if isinstance(chosen, Tournament):
+        return _tournament(chosen, fitness, rng)
+    if isinstance(chosen, Truncation):
+        return _truncation(chosen, fitness, rng)
+    heirs: list[Heir] = chosen.select(fitness.copy(), rng)
+    right = len(heirs) == len(fitness) and all(0 <= h.parent < len(fitness) for h in heirs)
+    if not right or not all(np.isfinite(fitness[h.parent]) for h in heirs):
+        raise SkillweaveError(
+            f"{type(chosen).__name__}.select() must return an Heir for each of the "
+            f"{len(fitness)} members, none of a parent with fitness -inf; it returned {heirs}"
+        )
+    return heirs
+
+
+def _tournament(by: Tournament, fitness: Array, rng: np.random.Generator) -> list[Heir]:
+    able = np.flatnonzero(np.isfinite(fitness))
+    heirs = [Heir(int(fitness.argmax()), False)] if by.elitism else []
+    while len(heirs) < len(fitness):
+        drawn = rng.choice(able, min(by.size, len(able)), replace=False)
+        heirs.append(Heir(int(drawn[fitness[drawn].argmax()]), True))
+    return heirs
+
+
+def _truncation(by: Truncation, fitness: Array, rng: np.random.Generator) -> list[Heir]:
+    order = np.argsort(-fitness, kind="stable")
+    count = max(1, round(by.share * len(fitness)))
+    able = order[: min(count, int(np.isfinite(fitness).sum()))]
+    replaced = set(order[len(order) - count :].tolist()) - {int(order[0])}
+    replaced |= set(np.flatnonzero(~np.isfinite(fitness)).tolist())
+    return [
+        Heir(int(rng.choice(able)), True) if i in replaced else Heir(i, False)
+        for i in range(len(fitness))
+    ]

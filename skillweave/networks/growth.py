@@ -1,0 +1,200 @@
+"""Networks that grow and shrink: units and layers added to, or taken from, named parameters.
+
+Growth leaves the function as it was (Net2Net, Chen et al. 2016, in the form of zero outgoing
+weights): new units are read with weight zero, a new layer computes the identity.
+
+Letters in shapes: R rows, one a network (a member, or a member's critic).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from skillweave.networks.config import Activation
+from skillweave.networks.stacked import Views
+
+IDENTITY: tuple[Activation, ...] = ("relu", "elu", "silu", "gelu")
+"""Activations through which a new layer can compute the identity; through tanh it cannot."""
+PAIRED: tuple[Activation, ...] = ("silu", "gelu")
+"""For these ``f(x) − f(−x) = x``: the new layer has two units for each of the layer before."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Where a layer's units lie in a parameter: unit u from ``start + u·block`` on of an axis."""
+
+    name: str
+    axis: int  # from the end: negative
+    start: int = 0
+    block: int = 1
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units that stand side by side: what computes them, and what reads them."""
+
+    count: int
+    own: tuple[Part, ...]
+    onward: tuple[Part, ...]
+
+
+def units_of(
+    shapes: Mapping[str, tuple[int, ...]], count: int, layer: str, readers: Sequence[str]
+) -> Units:
+    """The units of a layer of weights (in, out), read by the weights named; noise goes along."""
+    names = (f"{name}{sigma}" for name in readers for sigma in ("", "_sigma"))
+    return Units(
+        count,
+        tuple(Part(name, -1) for name in shapes if name.startswith(f"{layer}.")),
+        tuple(Part(name, -2) for name in names if name in shapes),
+    )
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Where a layer can be added or taken away: behind the last hidden layer."""
+
+    prefix: str
+    depth: int
+    readers: tuple[tuple[str, str], ...]  # weight and bias of what reads it
+    kinds: tuple[str, ...]  # parameters of a layer: weight, bias, and perhaps their sigmas
+
+
+def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """Parameters that compute ``extra`` new units, by name: He-normal weights, biases zero.
+
+    The deviations of noisy weights are the mean of those that there are.
+    """
+    found = {}
+    for part in units.own:
+        old = named[part.name]
+        shape = list(old.shape)
+        shape[part.axis] = extra * part.block
+        new = torch.zeros(shape)
+        if part.name.endswith("weight"):
+            inputs = shape[-2] if part.axis == -1 else int(torch.tensor(shape[-3:]).prod())
+            new = torch.randn(shape, generator=generator) * (2.0 / inputs) ** 0.5
+        elif part.name.endswith("_sigma"):
+            new = new + old.mean()
+        found[part.name] = new
+    return found
+
+
+def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[str, Tensor]:
+    """With ``extra`` more units, which nobody reads yet; ``new`` None: of moments, zeros."""
+    found = dict(named)
+    for part in (*units.own, *units.onward):
+        old = found[part.name]
+        shape = list(old.shape)
+        shape[part.axis] = extra * part.block
+        own = new[part.name] if new is not None and part in units.own else old.new_zeros(shape)
+        end = part.start + units.count * part.block
+        before, after = old.tensor_split([end], dim=part.axis)
+        found[part.name] = torch.cat([before, own, after], dim=part.axis)
+    return found
+
+
+def most_read(named: Views, units: Units, count: int) -> Tensor:
+    """The ``count`` units with the largest outgoing weights, (R, count), in order."""
+    total: Tensor | None = None
+    for part in units.onward:
+        weight = named[part.name].abs().movedim(part.axis, 1)
+        span = units.count * part.block
+        weight = weight[:, part.start : part.start + span].flatten(2).sum(2)
+        each = weight.view(len(weight), units.count, part.block).sum(2)
+        total = each if total is None else total + each
+    assert total is not None
+    return total.topk(count, dim=1).indices.sort(dim=1).values
+
+
+def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
+    """With the units ``kept`` (R, m) alone."""
+    found = dict(named)
+    rows = len(kept)
+    for part in (*units.own, *units.onward):
+        old = found[part.name]
+        end = part.start + units.count * part.block
+        inner = part.start + kept[..., None] * part.block + torch.arange(part.block)
+        before, after = torch.arange(part.start), torch.arange(end, old.shape[part.axis])
+        index = torch.cat(
+            [before.expand(rows, -1), inner.flatten(1), after.expand(rows, -1)], dim=1
+        )
+        shape = [1] * old.ndim
+        shape[0], shape[part.axis] = rows, index.shape[1]
+        found[part.name] = torch.take_along_dim(old, index.view(shape), dim=part.axis)
+    return found
+
+
+def deepened(
+    named: Views, joint: Joint, activation: Activation, *, moments: bool
+) -> dict[str, Tensor]:
+    """With one more hidden layer, the identity; of moments, zeros where something is new."""
+    paired = activation in PAIRED
+    found = _renamed(named, joint, 1)
+    readers = [tuple(_moved(n, joint, 1) for n in pair) for pair in joint.readers]
+    width = found[readers[0][0]].shape[-2]
+    rows = len(found[readers[0][0]])
+    eye = torch.eye(width).expand(rows, -1, -1)
+    weight = torch.cat([eye, -eye], dim=-1) if paired else eye
+    bias = torch.full((rows, 1, weight.shape[-1]), float(activation == "elu"))
+    for kind in joint.kinds:
+        value = weight if kind == "weight" else bias if kind == "bias" else None
+        like = weight if kind.startswith("weight") else bias
+        if value is None or moments:
+            value = torch.zeros_like(like)
+        found[f"{joint.prefix}.{joint.depth}.{kind}"] = value
+    for name, offset in readers:
+        for sigma in ("", "_sigma") if f"{name}_sigma" in found else ("",):
+            old = found[name + sigma]
+            if activation == "elu" and not moments and not sigma:
+                # elu(x + 1) = x + 1 for all that an elu puts out; the reader takes it back.
+                found[offset] = found[offset] - old.sum(-2, keepdim=True)
+            if paired:
+                other = torch.zeros_like(old) if moments or sigma else -old
+                found[name + sigma] = torch.cat([old, other], dim=-2)
+    return found
+
+
+def shallower(named: Views, joint: Joint, *, moments: bool) -> dict[str, Tensor]:
+    """Without the last hidden layer: what read it reads the layer before, through its weights.
+
+    As if the layer were linear; of moments zeros, as the readers are new.
+    """
+    last = f"{joint.prefix}.{joint.depth - 1}"
+    weight, bias = named[f"{last}.weight"], named[f"{last}.bias"]
+    gone = {f"{last}.{kind}" for kind in joint.kinds}
+    found = {k: v for k, v in named.items() if k not in gone}
+    for name, offset in joint.readers:
+        read = named[name]
+        found[name] = weight @ read
+        found[offset] = named[offset] + bias @ read
+        if f"{name}_sigma" in named:
+            sigma = named[f"{name}_sigma"].mean((-2, -1), keepdim=True)
+            found[f"{name}_sigma"] = sigma.expand_as(found[name])
+        if moments:
+            for k in (name, offset, f"{name}_sigma", f"{offset}_sigma"):
+                if k in found:
+                    found[k] = torch.zeros_like(found[k])
+    return _renamed(found, joint, -1)
+
+
+def _renamed(named: Views, joint: Joint, by: int) -> dict[str, Tensor]:
+    return {_moved(k, joint, by): v for k, v in named.items()}
+
+
+def _moved(name: str, joint: Joint, by: int) -> str:
+    """A head counts as the layer behind the hidden ones: its number moves with their depth."""
+    head = f"{joint.prefix}.{joint.depth}."
+    if not name.startswith(head):
+        return name
+    return f"{joint.prefix}.{joint.depth + by}.{name[len(head) :]}"
+
+
+__all__ = [
+    "IDENTITY", "PAIRED", "Joint", "Part", "Units", "deepened", "fresh", "most_read",
+    "narrowed", "shallower", "units_of", "widened",
+]  # fmt: skip
