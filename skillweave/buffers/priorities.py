@@ -111,6 +111,8 @@ class Priorities:
 
     def update(self, member: Array, slot: Array, priority: Array) -> None:
         """New priorities after learning; all (K,)."""
+        # A member that has diverged gives none; it is stopped or replaced by others.
+        priority = np.nan_to_num(priority, nan=0.0, posinf=0.0)
         priority = np.maximum(priority, np.float32(FLOOR))
         np.maximum.at(self._highest, member, priority)
         self._trees.put(member, slot, priority**self._alpha)

@@ -1,0 +1,181 @@
+"""One mutation at a time: what moves, what stays, and what is written of it."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from skillweave import DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range, SkillweaveError
+from skillweave.evolution.config import KINDS
+from skillweave.evolution.mutation import check_mutations, mutate, random_config
+from skillweave.evolution.stacks import Member
+from skillweave.seeding import Seeds
+
+OBS = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
+CHOICE, FORCE = gym.spaces.Discrete(3), gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+SMALL = Network((8, 6), "relu")
+CASES: dict[str, tuple[Any, Any]] = {
+    "ppo": (PPO(network=SMALL), CHOICE),
+    "dqn": (DQN(network=SMALL), CHOICE),
+    "rainbow": (DQN.rainbow(network=SMALL), CHOICE),
+    "td3": (TD3(network=SMALL), FORCE),
+    "sac": (SAC(network=SMALL, critic=Network((7,), "relu")), FORCE),
+}
+
+
+def only(kind: str, **settings: Any) -> Mutations:
+    """Mutations of one kind alone."""
+    return Mutations(**{k: float(k == kind) for k in KINDS}, **settings)
+
+
+def member(name: str) -> tuple[Member, Any]:
+    config, action_space = CASES[name]
+    made, spaces = Member(4, config, None, 17), (OBS, action_space)
+    made.state = made.algorithm(spaces).init([Seeds(3)])
+    return made, spaces
+
+
+def same_tensors(a: Member, b: Member, but: tuple[str, ...] = ()) -> bool:
+    return all(
+        torch.equal(getattr(a.state, f.name), getattr(b.state, f.name))
+        for f in fields(a.state)
+        if f.name not in but
+    )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_none_is_a_copy_that_shares_no_memory(name):
+    parent, spaces = member(name)
+    child = mutate(parent, only("none"), spaces, np.random.default_rng(0))
+    assert child.config == parent.config
+    assert same_tensors(parent, child)
+    assert (child.origin.parent, child.origin.mutation, child.origin.changes) == (4, "none", {})
+    assert child.steps == 17
+    child.state.params.add_(1.0)
+    assert not same_tensors(parent, child)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_setting_moves_in_settings_and_state_and_is_written_down(name):
+    parent, spaces = member(name)
+    by, seen = only("hyperparameters"), set()
+    for seed in range(90):
+        child = mutate(parent, by, spaces, np.random.default_rng(seed))
+        ((moved, (old, new)),) = child.origin.changes.items()
+        assert old == getattr(parent.config, moved)
+        assert new == getattr(child.config, moved) != old
+        assert float(getattr(child.state, moved)) == pytest.approx(new)
+        assert same_tensors(parent, child, but=(moved,))
+        seen.add((moved, new > old))
+    names = by.ranges_of(parent.config)
+    assert seen == {(k, up) for k in names for up in (True, False)}
+
+
+def test_whole_numbers_grow_as_well_as_shrink_and_stay_within_their_range():
+    config = PPO(num_envs=4, n_steps=8, batch_size=16, update_epochs=2)
+    by = only("hyperparameters", ranges={"update_epochs": Range(1, 5)}, step=0.01)
+    made, spaces = Member(0, config, None), (OBS, CHOICE)
+    made.state = made.algorithm(spaces).init([Seeds(0)])
+    seen, rng = set(), np.random.default_rng(0)
+    for _ in range(80):
+        made = mutate(made, by, spaces, rng)
+        assert type(made.config.update_epochs) is int
+        seen.add(made.config.update_epochs)
+    assert seen == {1, 2, 3, 4, 5}
+
+
+def test_a_move_that_does_not_fit_the_other_settings_is_not_made():
+    config = PPO(num_envs=4, n_steps=8, batch_size=32)  # the rollout: it cannot grow
+    made, spaces = Member(0, config, None), (OBS, CHOICE)
+    made.state = made.algorithm(spaces).init([Seeds(0)])
+    by = only("hyperparameters", ranges={"batch_size": Range(16, 4096)})
+    for seed in range(10):
+        child = mutate(made, by, spaces, np.random.default_rng(seed))
+        assert child.config.batch_size < 32
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_noise_falls_on_a_share_of_what_acts_and_alike_on_its_slow_copy(name):
+    parent, spaces = member(name)
+    by = only("parameters", share=0.25, strength=0.5)
+    child = mutate(parent, by, spaces, np.random.default_rng(1))
+    algorithm = parent.algorithm(spaces)
+    moved = (child.state.params - parent.state.params)[:, : algorithm.acting.size]
+    weights = algorithm.acting.views(moved)[
+        "actor.1.weight" if "actor.1.weight" in algorithm.acting.shapes else "q.0.weight"
+    ]
+    assert 0.05 < float((weights != 0).float().mean()) < 0.5
+    rest = (child.state.params - parent.state.params)[:, algorithm.acting.size :]
+    assert not rest.any()
+    if hasattr(parent.state, "target"):
+        assert torch.equal(child.state.target - parent.state.target != 0, moved != 0)
+    critics = [f.name for f in fields(parent.state) if f.name.startswith("critic")]
+    assert all(torch.equal(getattr(parent.state, k), getattr(child.state, k)) for k in critics)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_another_activation_is_that_of_all_networks(name):
+    parent, spaces = member(name)
+    by = only("activation", activations=("relu", "elu"))
+    child = mutate(parent, by, spaces, np.random.default_rng(1))
+    assert child.config.network.activation == "elu"
+    assert getattr(child.config, "critic", None) in (None, Network((7,), "elu"))
+    assert same_tensors(parent, child)
+    stays = only("activation", activations=("relu",))
+    assert mutate(parent, stays, spaces, np.random.default_rng(1)).origin.mutation == "none"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_architecture_is_changed_and_written_down(name):
+    parent, spaces = member(name)
+    by = only("architecture", units=(4, 32))
+    child = mutate(parent, by, spaces, np.random.default_rng(0))
+    old, new = child.origin.changes["network.hidden"]
+    assert (old, new) == ((8, 6), child.config.network.hidden)
+    assert child.state.params.shape[1] == child.algorithm(spaces).layout.size
+
+
+def test_random_settings_cover_their_ranges_and_fit_together():
+    config = replace(CASES["ppo"][0], batch_size=64)
+    by = Mutations(
+        ranges={"learning_rate": Range(1e-4, 1e-2), "batch_size": Range(16, 4096),
+                "n_steps": Range(8, 128)},
+        units=(16, 64), layers=(1, 3),
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    drawn = [random_config(config, by, rng) for _ in range(300)]
+    rates = np.log10([c.learning_rate for c in drawn])
+    assert rates.min() == pytest.approx(-4, abs=0.05)
+    assert rates.max() == pytest.approx(-2, abs=0.05)
+    assert np.mean(rates) == pytest.approx(-3, abs=0.1)
+    assert {len(c.network.hidden) for c in drawn} == {1, 2, 3}
+    widths = {w for c in drawn for w in c.network.hidden}
+    assert min(widths) >= 16
+    assert max(widths) <= 64
+    assert {c.network.activation for c in drawn} == set(by.activations)
+
+
+@pytest.mark.parametrize(
+    ("config", "evolution", "said"),
+    [
+        (PPO(), Evolution(mutations=Mutations(ranges={})), "phase x: .*ranges is empty"),
+        (
+            PPO(network=Network(layer_norm=True)),
+            Evolution(),
+            r"phase x: Mutations\.architecture is 0.2, but network has layer_norm",
+        ),
+        (
+            DQN(),
+            Evolution(mutations=Mutations(ranges={"clip_coef": Range(0.1, 0.3)})),
+            "phase x: .*DQN has no setting 'clip_coef'",
+        ),
+    ],
+)
+def test_mutations_that_an_agent_does_not_have_are_refused(config, evolution, said):
+    with pytest.raises(SkillweaveError, match=said):
+        check_mutations(config, evolution, "phase x: ")

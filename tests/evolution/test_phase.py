@@ -1,0 +1,311 @@
+"""Populations in a run: generations, lineage, fitness, divergence, and going on after a kill."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from skillweave import (
+    DQN,
+    PPO,
+    SAC,
+    TD3,
+    EnvSpec,
+    Evolution,
+    Heir,
+    Hierarchy,
+    Mutations,
+    Network,
+    Range,
+    Skill,
+    SkillweaveError,
+    Truncation,
+    train_agent,
+)
+from skillweave.evolution import phase as evolving
+from skillweave.evolution.population import Population, has_diverged
+from skillweave.runs.directory import RunDirectory
+from skillweave.seeding import Seeds
+
+SMALL = Network((8, 6), "relu")
+REPLAY: dict[str, Any] = {
+    "num_envs": 2, "batch_size": 8, "buffer_size": 400, "learning_starts": 20, "network": SMALL,
+}  # fmt: skip
+CONFIGS = {
+    "ppo": PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=SMALL),
+    "dqn": DQN(**REPLAY),
+    "rainbow": DQN.rainbow(**REPLAY),
+    "td3": TD3(**REPLAY),
+    "sac": SAC(**REPLAY),
+}
+EVERYTHING = Mutations(0.1, 0.3, 0.2, 0.3, 0.1, units=(4, 16), layers=(1, 3), layer_share=0.5)
+
+
+class Aim(gym.Env[Any, Any]):
+    """Ten steps; the reward is how near a force comes to half the observation."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, choices: bool = False, render_mode: str | None = None) -> None:
+        box = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.action_space: Any = gym.spaces.Discrete(2) if choices else box
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.t = 0
+        return self._obs(), {}
+
+    def _obs(self) -> Any:
+        self.obs = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self.obs
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        force = float(np.asarray(action).reshape(-1)[0])
+        reward = -abs(force - 0.5 * self.obs[0])
+        return self._obs(), reward, False, self.t == 10, {}
+
+
+def choices(render_mode: str | None = None) -> gym.Env[Any, Any]:
+    return Aim(True)
+
+
+def forces(render_mode: str | None = None) -> gym.Env[Any, Any]:
+    return Aim()
+
+
+def spec(name: str) -> EnvSpec:
+    return EnvSpec(forces if name in ("td3", "sac") else choices, engine="sync")
+
+
+def train(name: str, path: Path, evolution: Evolution | None = None, seed: int = 0) -> Any:
+    evolution = evolution or Evolution(4, 4, 3, mutations=EVERYTHING)
+    return train_agent(
+        spec(name), CONFIGS[name], 256, path, seed=seed, quiet=True, evolve=evolution
+    )
+
+
+def lineage(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (path / "lineage.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_population_evolves_and_ends_with_the_best_member(name, tmp_path):
+    run = train(name, tmp_path / "run")
+    lines = lineage(run.path)
+    assert [line["generation"] for line in lines] == [g for g in range(4) for _ in range(4)]
+    best = max(lines, key=lambda line: line["fitness"])
+    (entry,) = run.info()["phases"]
+    assert entry["winner"]["fitness"] == best["fitness"]
+    assert entry["winner"]["generation"] == best["generation"]
+    assert entry["budget"] == 4 * 256
+    assert 4 * 256 <= entry["steps"] <= 4 * 256 + 4 * 32
+    assert entry["steps"] == sum(1 for _ in range(1)) * entry["steps"]
+    numbers = {line["member"] for line in lines}
+    for line in lines:
+        assert line["parent"] is None if line["generation"] == 0 else line["parent"] in numbers
+        assert line["steps"] >= 64 * (line["generation"] + 1)
+    # The elite goes on, under the same number.
+    for g in range(3):
+        now, then = ([x for x in lines if x["generation"] == h] for h in (g, g + 1))
+        elite = max(now, key=lambda line: line["fitness"])["member"]
+        assert [x["member"] for x in then if x["mutation"] == "goes on"] == [elite]
+    assert {x["mutation"] for x in lines} >= {"start", "goes on"}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_killed_population_ends_with_the_very_same_weights(name, tmp_path, monkeypatch):
+    whole = train(name, tmp_path / "whole", seed=3)
+    for generation in (0, 2):
+        path = tmp_path / f"killed in {generation}"
+        trained = Population.fitness
+
+        def dies(
+            self: Population, env: Any, seeds: Seeds, at: int = generation, trained: Any = trained
+        ) -> Any:
+            if seeds.path[-2] == at:
+                raise KeyboardInterrupt
+            return trained(self, env, seeds)
+
+        monkeypatch.setattr(Population, "fitness", dies)
+        with pytest.raises(KeyboardInterrupt):
+            train(name, path, seed=3)
+        monkeypatch.undo()
+        hierarchy = whole.hierarchy
+        again = hierarchy.resume(path, quiet=True)
+        assert (path / "lineage.jsonl").read_text() == (whole.path / "lineage.jsonl").read_text()
+        for key, value in whole.policy.weights.items():
+            assert torch.equal(value, again.policy.weights[key]), key
+        records = (list(RunDirectory.open(r.path).metrics()) for r in (whole, again))
+        for a, b in zip(*records, strict=True):
+            assert {**a, "seconds": 0} == {**b, "seconds": 0}
+
+
+def test_the_same_seed_gives_the_same_lineage_and_another_one_another(tmp_path):
+    first, second, other = (
+        (train("ppo", tmp_path / str(i), seed=s).path / "lineage.jsonl").read_text()
+        for i, s in enumerate((1, 1, 2))
+    )
+    assert first == second
+    assert first != other
+
+
+def test_fitness_is_measured_on_the_same_starts_for_all(tmp_path, monkeypatch):
+    starts: dict[int, set[bytes]] = {}
+    played = evolving.Population.fitness
+
+    def watch(self: Population, env: Any, seeds: Seeds) -> Any:
+        reset = env.reset
+
+        def seen(given: Seeds) -> Any:
+            obs = reset(given)
+            starts.setdefault(seeds.path[-2], set()).add(obs.tobytes())
+            return obs
+
+        monkeypatch.setattr(env, "reset", seen)
+        found = played(self, env, seeds)
+        monkeypatch.setattr(env, "reset", reset)
+        return found
+
+    monkeypatch.setattr(Population, "fitness", watch)
+    train("ppo", tmp_path / "run")
+    assert [len(s) for s in starts.values()] == [1] * 4
+    assert len(set.union(*starts.values())) == 4  # another generation, other starts
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeypatch):
+    poisoned: list[int] = []
+    trained = Population.train
+
+    def poison(self: Population, *given: Any) -> None:
+        trained(self, *given)
+        if not poisoned:
+            member = self.members[1]
+            poisoned.append(member.number)
+            member.state.params[0, 3] = float("nan")
+
+    monkeypatch.setattr(Population, "train", poison)
+    said: list[str] = []
+    monkeypatch.setattr(
+        "skillweave.reporting.progress.Progress.message", lambda self, text: said.append(text)
+    )
+    run = train(name, tmp_path / "run")
+    lines = lineage(run.path)
+    lost = [x for x in lines if x["diverged"]]
+    assert [(x["generation"], x["member"], x["fitness"]) for x in lost] == [(0, poisoned[0], None)]
+    assert all(x["parent"] != poisoned[0] for x in lines)
+    assert any(f"member {poisoned[0]} diverged" in text for text in said)
+    assert all(bool(v.isfinite().all()) for v in run.policy.weights.values())
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tmp_path):
+    config = replace(CONFIGS[name], max_grad_norm=1e30)
+    env_spec = spec(name)
+    made = env_spec.make()
+    spaces = made.observation_space, made.action_space
+    from skillweave.envs.make import make_engine
+    from skillweave.envs.skill_env import SkillEnv
+
+    def make_env(num_envs: int, gamma: Any) -> Any:
+        return SkillEnv(make_engine(env_spec, num_envs))
+
+    population = Population.fresh(config, Evolution(3, 1, 2), make_env, spaces, Seeds(0))
+    sick = population.members[1]
+    sick.state.params.fill_(float("nan"))
+    population.train(256, 256, Seeds(1), lambda steps, tick: None)
+    assert [has_diverged(m) for m in population.members] == [False, True, False]
+    env = make_env(2, 0.9)
+    fitness = population.fitness(env, Seeds(2))
+    assert np.isfinite(fitness).tolist() == [True, False, True]
+
+
+def test_it_ends_early_at_the_target(tmp_path):
+    run = train("ppo", tmp_path / "run", Evolution(3, 9, 2, target=-1e9))
+    assert run.info()["phases"][0]["winner"]["generations"] == 1
+    assert len(lineage(run.path)) == 3
+
+
+def test_truncation_and_random_starts(tmp_path):
+    by = Evolution(5, 3, 2, start="random", selection=Truncation(0.2), mutations=EVERYTHING)
+    lines = lineage(train("ppo", tmp_path / "run", by).path)
+    assert len({x["settings"]["learning_rate"] for x in lines if x["generation"] == 0}) == 5
+    for g in (1, 2):
+        now = [x for x in lines if x["generation"] == g]
+        assert sum(x["mutation"] == "goes on" for x in now) == 4
+
+
+class Copycat:
+    """Everybody descends from the best, unchanged."""
+
+    def select(self, fitness: Any, rng: Any) -> list[Heir]:
+        return [Heir(int(fitness.argmax()), False) for _ in fitness]
+
+
+def test_a_selection_of_ones_own_is_asked_for_again_when_a_run_goes_on(tmp_path, monkeypatch):
+    by = Evolution(3, 3, 2, selection=Copycat())
+
+    def dies(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Population, "fitness", dies)
+    with pytest.raises(KeyboardInterrupt):
+        train("ppo", tmp_path / "run", by)
+    monkeypatch.undo()
+    hierarchy = Hierarchy(spec("ppo"), [Skill()], algorithm=CONFIGS["ppo"], flat_steps=256)
+    hierarchy.skills[0].name = "task"
+    with pytest.raises(SkillweaveError, match="Copycat"):
+        hierarchy.resume(tmp_path / "run", quiet=True)
+    run = hierarchy.resume(tmp_path / "run", quiet=True, evolve=by)
+    assert [x["mutation"] for x in lineage(run.path)] == ["start"] * 3 + ["goes on"] * 6
+    assert len({x["member"] for x in lineage(run.path)[3:6]}) == 3
+
+
+class Left(Skill):
+    """Anything."""
+
+
+class Right(Skill):
+    """Anything else."""
+
+
+def test_skills_and_selector_evolve_each_by_its_own_plan(tmp_path):
+    hierarchy = Hierarchy(
+        spec("ppo"), [Left(), Right()], algorithm=CONFIGS["ppo"], selector=CONFIGS["dqn"],
+        skill_steps=64, selector_steps=96, call_steps=2,
+    )  # fmt: skip
+    plan = {"right": Evolution(3, 2, 2), "selector": Evolution(2, 3, 2), "left": None}
+    run = hierarchy.train(tmp_path / "run", quiet=True, evolve=plan)
+    phases = {p["name"]: p for p in run.info()["phases"]}
+    assert "winner" not in phases["left"]
+    assert phases["right"]["budget"] == 3 * 64
+    assert phases["selector"]["budget"] == 2 * 96
+    seen = {(x["phase"], x["generation"]) for x in lineage(run.path)}
+    assert seen == {("right", g) for g in range(2)} | {("selector", g) for g in range(3)}
+    assert run.evaluate(2).mean == hierarchy.load(tmp_path / "run").evaluate(2).mean
+
+
+@pytest.mark.parametrize(
+    ("plan", "said"),
+    [
+        ({"middle": Evolution()}, "no phase 'middle' is trained; there are: left, right, selector"),
+        ({"left": 3}, r"evolve\['left'\] is 3"),
+        (
+            Evolution(mutations=Mutations(ranges={"tau": Range(0.1, 1.0)})),
+            "phase 'left': .*PPO has no setting 'tau'",
+        ),
+    ],
+)
+def test_a_plan_that_does_not_fit_is_refused_before_anything_is_written(plan, said, tmp_path):
+    hierarchy = Hierarchy(spec("ppo"), [Left(), Right()], algorithm=CONFIGS["ppo"])
+    with pytest.raises(SkillweaveError, match=said):
+        hierarchy.train(tmp_path / "run", quiet=True, evolve=plan)
+    assert not (tmp_path / "run").exists()
