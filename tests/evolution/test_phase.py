@@ -107,7 +107,6 @@ def test_a_population_evolves_and_ends_with_the_best_member(name, tmp_path):
     assert entry["winner"]["generation"] == best["generation"]
     assert entry["budget"] == 4 * 256
     assert 4 * 256 <= entry["steps"] <= 4 * 256 + 4 * 32
-    assert entry["steps"] == sum(1 for _ in range(1)) * entry["steps"]
     numbers = {line["member"] for line in lines}
     for line in lines:
         assert line["parent"] is None if line["generation"] == 0 else line["parent"] in numbers
@@ -260,13 +259,16 @@ def test_a_selection_of_ones_own_is_asked_for_again_when_a_run_goes_on(tmp_path,
     with pytest.raises(KeyboardInterrupt):
         train("ppo", tmp_path / "run", by)
     monkeypatch.undo()
-    hierarchy = Hierarchy(spec("ppo"), [Skill()], algorithm=CONFIGS["ppo"], flat_steps=256)
-    hierarchy.skills[0].name = "task"
+    hierarchy = Hierarchy(spec("ppo"), [Task()], algorithm=CONFIGS["ppo"], flat_steps=256)
     with pytest.raises(SkillweaveError, match="Copycat"):
         hierarchy.resume(tmp_path / "run", quiet=True)
     run = hierarchy.resume(tmp_path / "run", quiet=True, evolve=by)
     assert [x["mutation"] for x in lineage(run.path)] == ["start"] * 3 + ["goes on"] * 6
     assert len({x["member"] for x in lineage(run.path)[3:6]}) == 3
+
+
+class Task(Skill):
+    """What ``train_agent`` declares."""
 
 
 class Left(Skill):
