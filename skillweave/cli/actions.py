@@ -10,7 +10,9 @@ from typing import Any
 from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
+from skillweave.cli.evolve import parse_evolve
 from skillweave.hierarchy.settings import apply_settings, list_settings
+from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.types import SkillweaveError
@@ -27,6 +29,8 @@ def run(command: commands.Command) -> int:
             _evaluate(command)
         case commands.Render():
             _render(command)
+        case commands.Plot():
+            _plot(command)
         case commands.List():
             _list(command)
         case commands.Info():
@@ -42,11 +46,17 @@ def _train(command: commands.Train) -> None:
     hierarchy = recipes.load(command.recipe)
     apply_settings(hierarchy, command.set)
     hierarchy.scale(command.scale)
+    evolve = parse_evolve(command.evolve, hierarchy, command.flat)
     name = Path(command.recipe).stem + ("-flat" if command.flat else "")
     path = command.out or _free(Path("runs") / f"{name}-s{command.seed}")
     try:
         trained = hierarchy.train(
-            path, seed=command.seed, flat=command.flat, quiet=command.quiet, track=command.track
+            path,
+            seed=command.seed,
+            flat=command.flat,
+            quiet=command.quiet,
+            track=command.track,
+            evolve=evolve,
         )
     except KeyboardInterrupt:
         raise _interrupted(path) from None
@@ -87,6 +97,11 @@ def _render(command: commands.Render) -> None:
     )
     returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])
     _tell(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
+
+
+def _plot(command: commands.Plot) -> None:
+    paths = [str(path) for path in plot_run(RunDirectory.open(command.run), command.out)]
+    _tell(command, {"paths": paths}, "\n".join(paths))
 
 
 def _list(command: commands.List) -> None:

@@ -37,6 +37,8 @@ class Train(Output):
     """Train one plain agent on the same number of steps instead: the baseline."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
+    evolve: UseAppendAction[tuple[str, ...]] = ()
+    """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
     track: UseAppendAction[tuple[Literal["tensorboard", "wandb"], ...]] = ()
     """Send metrics to a tracker as well."""
     scale: float = 1.0
@@ -96,6 +98,16 @@ class Render(Watched):
 
 
 @dataclass(frozen=True)
+class Plot(Output):
+    """Draw how a run's populations evolved, or its agents learnt, as PNG and SVG."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """A directory for the files; default: plots, in the run."""
+
+
+@dataclass(frozen=True)
 class List(Output):
     """List the shipped recipes, and the runs under ./runs."""
 
@@ -120,5 +132,5 @@ class Weights(Output):
     """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
-COMMANDS = (Train, Resume, Evaluate, Render, List, Info, Weights)
-Command = Train | Resume | Evaluate | Render | List | Info | Weights
+COMMANDS = (Train, Resume, Evaluate, Render, Plot, List, Info, Weights)
+Command = Train | Resume | Evaluate | Render | Plot | List | Info | Weights

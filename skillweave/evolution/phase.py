@@ -166,7 +166,8 @@ class _Evolving:
             )
         winner = members[int(fitness.argmax())]
         score = float(fitness.max())
-        if np.isfinite(score) and (self.best is None or score > self.best.fitness):
+        # Of equals the latest: it has learnt for longer.
+        if np.isfinite(score) and (self.best is None or score >= self.best.fitness):
             policy = self.population.policy(winner)
             self.best = Best(score, winner.number, self.done, policy)
         shown = ", ".join(f"{k} {_short(v)}" for k, v in self._settings(winner.config).items())

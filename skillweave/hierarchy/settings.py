@@ -58,7 +58,7 @@ def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
         config = getattr(target, field) or declaration.algorithm
         if owner in kinds:
             config = named_config(kinds[owner], f"--set {'.'.join(owner)}={kinds[owner]}")
-        setattr(target, field, _replaced(config, by_path))
+        setattr(target, field, replaced(config, by_path))
     declaration.__post_init__()
 
 
@@ -73,7 +73,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
     return found | _flatten("selector.", declaration.selector)
 
 
-def _replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
+def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
     """``config`` with the fields at these paths parsed from (full name, text)."""
     known, hints = [f.name for f in fields(config)], typing.get_type_hints(type(config))
     values: dict[str, Any] = {}
@@ -95,8 +95,8 @@ def _replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> A
             inner = parts[0]() if parts else None
         if not is_dataclass(inner):
             name = next(iter(inner_changes.values()))[0]
-            raise SkillweaveError(f"--set {name}: {field} has no parts")
-        values[field] = _replaced(inner, inner_changes)
+            raise SkillweaveError(f"{name}: {field} has no parts")
+        values[field] = replaced(inner, inner_changes)
     return replace(config, **values)
 
 
@@ -127,7 +127,7 @@ def _parse(name: str, text: str, hint: Any) -> Any:
     wanted = getattr(hint, "__name__", str(hint).replace("typing.", ""))
     if typing.get_origin(hint) is typing.Literal:
         wanted = "one of " + ", ".join(map(str, typing.get_args(hint)))
-    raise SkillweaveError(f"--set {name}={text}: expected {wanted}")
+    raise SkillweaveError(f"{name}={text}: expected {wanted}")
 
 
 def _flatten(prefix: str, config: Any) -> dict[str, Any]:

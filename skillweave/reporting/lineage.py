@@ -1,0 +1,77 @@
+"""What a run's ``lineage.jsonl`` says: generations, and the ancestors of the winner."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from skillweave.types import SkillweaveError
+
+
+@dataclass(frozen=True)
+class Born:
+    """A member in a generation."""
+
+    generation: int
+    member: int
+    parent: int | None
+    """Its number in the generation before; itself where it went on."""
+    mutation: str
+    changes: dict[str, list[Any]]
+    fitness: float | None
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Lineage:
+    """One phase's population over the generations."""
+
+    born: dict[tuple[int, int], Born]
+    """By generation and number."""
+
+    @property
+    def winner(self) -> Born:
+        """The fittest of all; of equals the latest, as the run has it."""
+        able = [b for b in self.born.values() if b.fitness is not None]
+        return max(able, key=lambda b: (b.fitness, b.generation))
+
+    def parent(self, born: Born) -> Born | None:
+        """Where a member comes from; None: from the start."""
+        if born.parent is None or born.generation == 0:
+            return None
+        return self.born.get((born.generation - 1, born.parent))
+
+    def path(self, born: Born) -> list[Born]:
+        """From the first generation to a member."""
+        found: list[Born] = []
+        at: Born | None = born
+        while at is not None:
+            found.append(at)
+            at = self.parent(at)
+        return found[::-1]
+
+
+def read_lineage(run: Path, phase: str) -> Lineage | None:
+    """The lineage of a phase, or None where nothing evolved in it.
+
+    Raises:
+        SkillweaveError: the file is damaged.
+    """
+    path = run / "lineage.jsonl"
+    if not path.exists():
+        return None
+    born: dict[tuple[int, int], Born] = {}
+    names = ("generation", "member", "parent", "mutation", "changes", "fitness", "settings")
+    for number, line in enumerate(path.read_text().splitlines(keepends=True), 1):
+        if not line.endswith("\n"):
+            continue  # half-written
+        try:
+            told = json.loads(line)
+            if told["phase"] == phase:
+                each = Born(**{k: told[k] for k in names})
+                born[each.generation, each.member] = each
+        except (ValueError, KeyError) as error:
+            raise SkillweaveError(f"{path} is damaged in line {number}: {error}") from error
+    return Lineage(born) if any(b.fitness is not None for b in born.values()) else None

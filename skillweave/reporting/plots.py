@@ -1,0 +1,171 @@
+"""Figures of a run: how a population evolved, or how an agent learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from skillweave.reporting.lineage import Born, Lineage, read_lineage
+from skillweave.reporting.palette import color_of
+from skillweave.runs.directory import RunDirectory
+from skillweave.types import MissingExtra, SkillweaveError
+
+FAINT, TEXT = "#c9c9cf", "#4a4a52"
+COMPLEMENT = ("gamma", "gae_lambda")
+"""Settings that are drawn as what they lack to one."""
+
+
+def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
+    """Draw every phase that has something to show, as PNG and SVG; returns the files.
+
+    A phase that evolved: fitness by generation with the winner's family tree, and the path of each
+    setting. Any other: its return over the steps.
+
+    Args:
+        out: a directory; None: ``plots`` in the run.
+
+    Raises:
+        SkillweaveError: nothing was trained yet, or matplotlib is missing.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("plotting", "plot") from error
+    folder, written = out or run.path / "plots", []
+    metrics = list(run.metrics())
+    for i, phase in enumerate(run.manifest["phases"]):
+        name, color = phase["name"], _hex(i)
+        if lineage := read_lineage(run.path, name):
+            figure = draw_lineage(Figure, lineage, name, color)
+        else:
+            curve = [(m["steps"], m["return"]) for m in metrics if _tells(m, name)]
+            if not curve:
+                continue
+            figure = _draw_curve(Figure, curve, name, color)
+        folder.mkdir(parents=True, exist_ok=True)
+        for suffix in (".png", ".svg"):
+            written.append(folder / f"{name}{suffix}")
+            figure.savefig(written[-1], dpi=120)
+    if not written:
+        raise SkillweaveError(f"{run.path} holds nothing to draw yet: no episode has ended")
+    return written
+
+
+def draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
+    """Fitness by generation, and below it the path of each setting that differs."""
+    path, everyone = lineage.path(lineage.winner), list(lineage.born.values())
+    shown = [k for k in lineage.winner.settings if _varies(everyone, k)]
+    rows = -(-len(shown) // 2)
+    figure = make(figsize=(10, 4.2 + 1.9 * rows), layout="constrained")
+    grid = figure.add_gridspec(1 + rows, 2, height_ratios=[4.0, *[1.8] * rows])
+    top = figure.add_subplot(grid[0, :])
+    _draw_fitness(top, lineage, path, color)
+    top.set_title(f"{name}: fitness by generation", loc="left", fontsize=12)
+    for i, setting in enumerate(shown):
+        axes = figure.add_subplot(grid[1 + i // 2, i % 2])
+        _draw_setting(axes, setting, lineage, path, color)
+    return figure
+
+
+def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str) -> None:
+    for born in lineage.born.values():
+        parent = lineage.parent(born)
+        if born.fitness is None:
+            continue
+        if parent is not None and parent.fitness is not None:
+            ends = [parent.generation, born.generation], [parent.fitness, born.fitness]
+            axes.plot(*ends, color=FAINT, linewidth=0.8, zorder=1)
+        axes.plot(born.generation, born.fitness, "o", color=FAINT, markersize=4, zorder=2)
+    line = [b.generation for b in path], [b.fitness for b in path]
+    axes.plot(*line, color=color, linewidth=2.2, marker="o", markersize=6, zorder=3)
+    for born in path:
+        if born.mutation not in ("goes on", "none", "start"):
+            at = born.generation, born.fitness
+            what = ", ".join(_change(k, *v) for k, v in born.changes.items()) or "weights"
+            axes.annotate(
+                what, at, textcoords="offset points", xytext=(4, -6), rotation=-38, fontsize=7,
+                color=TEXT, va="top",
+            )  # fmt: skip
+    winner = path[-1]
+    axes.plot(winner.generation, winner.fitness, "*", color=color, markersize=16, zorder=4)
+    label = f"member {winner.member}: {winner.fitness:.1f}"
+    axes.annotate(
+        label, (winner.generation, winner.fitness), textcoords="offset points", xytext=(-6, 9),
+        ha="right", fontsize=9, color=color, weight="bold",
+    )  # fmt: skip
+    fitness = sorted(b.fitness for b in lineage.born.values() if b.fitness is not None)
+    # One hopeless member must not squeeze all others into a line.
+    low = min(fitness[len(fitness) // 20], *(b.fitness for b in path if b.fitness is not None))
+    room = max(fitness[-1] - low, 1e-9)
+    axes.set_ylim(low - 0.25 * room, fitness[-1] + 0.15 * room)
+    _plain(axes, "mean return")
+
+
+def _draw_setting(
+    axes: Any, setting: str, lineage: Lineage, path: Sequence[Born], color: str
+) -> None:
+    words: list[str] = []
+    if any(isinstance(b.settings.get(setting), str) for b in lineage.born.values()):
+        words = sorted({b.settings[setting] for b in lineage.born.values()})
+
+    def value(born: Born) -> float:
+        told = born.settings[setting]
+        if words:
+            return words.index(told)
+        told = sum(told) if isinstance(told, list) else told
+        return 1.0 - told if setting in COMPLEMENT else told
+
+    values = [value(b) for b in lineage.born.values()]
+    for born in lineage.born.values():
+        axes.plot(born.generation, value(born), "o", color=FAINT, markersize=3, zorder=1)
+    line = [b.generation for b in path], [value(b) for b in path]
+    axes.plot(*line, color=color, linewidth=1.8, marker="o", markersize=4, zorder=2)
+    if words:
+        axes.set_yticks(range(len(words)), words)
+    elif min(values) > 0 and max(values) > 5 * min(values):
+        axes.set_yscale("log")
+    label = "hidden units, all layers" if setting == "hidden" else setting
+    _plain(axes, f"1 - {setting}" if setting in COMPLEMENT else label)
+    told = path[-1].settings[setting]
+    axes.set_title(f"winner: {_short(told)}", loc="right", fontsize=8, color=TEXT)
+
+
+def _draw_curve(make: Any, curve: list[tuple[int, float]], name: str, color: str) -> Any:
+    figure = make(figsize=(8, 4), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(*zip(*curve, strict=True), color=color, linewidth=1.8)
+    axes.set_title(f"{name}: return while training", loc="left", fontsize=12)
+    _plain(axes, "mean return of 100 episodes", "environment steps")
+    return figure
+
+
+def _plain(axes: Any, label: str, below: str = "generation") -> None:
+    axes.set_ylabel(label, fontsize=8)
+    axes.set_xlabel(below, fontsize=8)
+    axes.tick_params(which="both", labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    if below == "generation":
+        axes.xaxis.get_major_locator().set_params(integer=True)
+
+
+def _varies(born: Sequence[Born], setting: str) -> bool:
+    return len({str(b.settings.get(setting)) for b in born}) > 1
+
+
+def _tells(metrics: dict[str, Any], phase: str) -> bool:
+    return metrics.get("phase") == phase and "return" in metrics
+
+
+def _change(setting: str, old: Any, new: Any) -> str:
+    return f"{setting.removeprefix('network.')} {_short(old)} → {_short(new)}"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return "-".join(map(str, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _hex(index: int) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*color_of(index + 1))
