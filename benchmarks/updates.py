@@ -18,13 +18,18 @@ from skillweave.types import Transition
 def rollout(members: int, samples: int) -> Rollout:
     g = torch.Generator().manual_seed(0)
     lead = (members, samples, 1)
+    obs, ends = (torch.randn(*lead, 8, generator=g) for _ in range(2))
+    last = torch.rand(lead, generator=g) < 0.05
+    last[:, -1] = True
+    # What follows is the next row, except at ends.
+    following = torch.where(last[..., None], ends, obs.roll(-1, dims=1))
     transition = Transition(
-        obs=torch.randn(*lead, 8, generator=g),
+        obs=obs,
         action=torch.randint(0, 4, lead, generator=g),
         reward=torch.randn(lead, generator=g),
         discount=torch.full(lead, 0.99),
-        next_obs=torch.randn(*lead, 8, generator=g),
-        last=torch.rand(lead, generator=g) < 0.05,
+        next_obs=following,
+        last=last,
     )
     return Rollout(transition, torch.randn(*lead, 4, generator=g), None)
 

@@ -1,0 +1,167 @@
+"""What a population costs, and that its members learn what they would learn alone.
+
+    python -m benchmarks.population [--seeds 0 1 2] [--agilerl PYTHON]
+
+1. Steps/s of 8 members together against one agent with as many environments and as many samples in
+   a gradient step.
+2. The same against AgileRL's population of 8 by its own training function, in an interpreter that
+   has it (``pip install agilerl peft "gymnasium[box2d]"``): it asks for other versions than ours.
+3. One update of 16 members against the same one by one.
+5. The largest change of any output when networks grow.
+6. The largest difference of any weight between 8 members of three widths in one stack, and the
+   same members alone, after 10 updates.
+
+The numbers are those of the figures in the issue; 4 is ``benchmarks.search``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.common import median, report, table, warm_up
+from benchmarks.updates import rollout, seconds
+from skillweave import PPO, EnvSpec, Evolution, Network
+from skillweave.envs.make import make_engine
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.evolution.architecture import Change, rebuilt
+from skillweave.evolution.population import Population
+from skillweave.evolution.stacks import Member, join, split
+from skillweave.seeding import Seeds
+from skillweave.types import VecEnv
+
+LANDER = EnvSpec("LunarLander-v3")
+SPACES = LANDER.make().observation_space, LANDER.make().action_space
+MEMBERS, ENVS = 8, 16
+AGILERL = Path(__file__).with_name("agilerl_population.py")
+
+
+def make_env(num_envs: int, gamma: Any) -> VecEnv:
+    return SkillEnv(make_engine(LANDER, num_envs))
+
+
+def speed(members: int, config: PPO, steps: int, seed: int) -> float:
+    """Steps/s of a population's training, all members' steps counted."""
+    population = Population.fresh(config, Evolution(), make_env, SPACES, Seeds(seed))
+    population.members = population.members[:members]
+    started = time.perf_counter()
+    population.train(steps // members, steps // members, Seeds(seed), lambda steps, tick: None)
+    return population.steps / (time.perf_counter() - started)
+
+
+def together_and_alone(seeds: list[int], steps: int) -> tuple[list[list[Any]], float, float]:
+    """Figure 1: rows, the median ratio, and the median steps/s of the population."""
+    each = PPO(num_envs=ENVS, n_steps=64, batch_size=128)
+    whole = replace(each, num_envs=ENVS * MEMBERS, batch_size=128 * MEMBERS)
+    rows = []
+    for seed in seeds:
+        one, many = speed(1, whole, steps, seed), speed(MEMBERS, each, steps, seed)
+        rows.append([seed, round(one), round(many), round(many / one, 3)])
+    return rows, median(r[3] for r in rows), median(r[2] for r in rows)
+
+
+def agilerl(python: str, steps: int) -> float:
+    """Figure 2: steps/s of AgileRL's own population, all members' steps counted."""
+    done = subprocess.run(
+        [python, str(AGILERL), str(steps)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"AgileRL failed:\n{done.stderr[-2000:]}")
+    return float(done.stdout.split()[-1])
+
+
+def growth() -> float:
+    """Figure 5: the largest change of an output, over activations, changes and seeds."""
+    worst = 0.0
+    for activation in ("tanh", "relu", "elu", "silu", "gelu"):
+        changes = [Change("units", 0, 32), Change("units", 1, 32)]
+        changes += [Change("layer", by=1)] * (activation != "tanh")
+        for change in changes:
+            for seed in range(5):
+                member = Member(0, PPO(network=Network((64, 64), activation)), None)
+                member.state = member.algorithm(SPACES).init([Seeds(seed)])
+                after = rebuilt(member, change, SPACES, np.random.default_rng(seed))
+                worst = max(worst, float((_outputs(member) - _outputs(after)).abs().max()))
+    return worst
+
+
+def _outputs(member: Member) -> torch.Tensor:
+    algorithm: Any = member.algorithm(SPACES)
+    generator = torch.Generator().manual_seed(0)
+    inputs = {"vector": torch.randn(1, 1000, 8, generator=generator)}
+    views = algorithm.layout.views(member.state.params)
+    nets = algorithm.actor_net, algorithm.critic_net
+    return torch.cat([net(views, inputs) for net in nets], dim=-1)
+
+
+def padded() -> float:
+    """Figure 6: the largest difference of a weight after 10 updates."""
+    config = PPO(num_envs=1, n_steps=64, batch_size=64, update_epochs=1)
+
+    def members() -> list[Member]:
+        made = []
+        for i in range(MEMBERS):
+            width = (32, 48, 64)[i % 3]
+            own = replace(config, network=Network((width, width), "relu"))
+            member = Member(i, own, None)
+            member.state = member.algorithm(SPACES).init([Seeds(7) / i])
+            made.append(member)
+        return made
+
+    stacked, alone = members(), members()
+    algorithm: Any
+    algorithm, state = join(stacked, SPACES)
+    for update in range(10):
+        seeds = [Seeds(update) / m.number for m in stacked]
+        algorithm.update(state, rollout(MEMBERS, 64), 0.0, seeds)
+        for member, seed in zip(alone, seeds, strict=True):
+            data = rollout(MEMBERS, 64)
+            own = {
+                f.name: None if (v := getattr(data.transition, f.name)) is None
+                else v[member.number : member.number + 1]
+                for f in fields(data.transition)
+            }  # fmt: skip
+            part = slice(member.number, member.number + 1)
+            single: Any = member.algorithm(SPACES)
+            piece = replace(data, transition=type(data.transition)(**own), head=data.head[part])
+            single.update(member.state, piece, 0.0, [seed])
+    split(algorithm, state, stacked, SPACES)
+    return max(
+        float((a.state.params - b.state.params).abs().max())
+        for a, b in zip(stacked, alone, strict=True)
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--steps", type=int, default=800_000)
+    parser.add_argument("--agilerl", help="an interpreter that has agilerl")
+    given = parser.parse_args()
+    warm_up()
+    torch.set_num_threads(1)
+    result: dict[str, Any] = {}
+    rows, ratio, ours = together_and_alone(given.seeds, given.steps)
+    print(table(["seed", "one agent", f"{MEMBERS} members", "ratio"], rows))
+    result["1: population / one agent"] = ratio
+    if given.agilerl:
+        theirs = median(agilerl(given.agilerl, given.steps // 8) for _ in given.seeds)
+        result |= {"2: ours / AgileRL": round(ours / theirs, 2), "ours": ours, "AgileRL": theirs}
+    result["3: 16 together / one by one"] = round(
+        seconds(16, 64, 50) / (16 * seconds(1, 64, 50)), 3
+    )
+    result["5: largest change by growth"] = growth()
+    result["6: largest difference in a stack"] = padded()
+    print(table(["figure", "value"], [[k, v] for k, v in result.items()]))
+    report("population", result)
+
+
+if __name__ == "__main__":
+    main()

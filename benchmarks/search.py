@@ -1,0 +1,91 @@
+"""Evolution against random search and against the defaults, at equal environment steps.
+
+    python -m benchmarks.search [--seeds 0 1 2 3 4] [--processes 2]
+
+All members begin with settings drawn from a wide prior over learning rate, γ, λ, entropy, clip,
+width and depth. Random search draws from the same prior, with the same seeds, trains every draw to
+its end and takes the best by the same fitness; the defaults get all steps for one agent. Scores are
+100 greedy episodes of Gymnasium's environment with seeds that training never saw.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import median, report, table
+from skillweave import PPO, Evolution, Mutations, Network, Range, train_agent
+
+BUDGET, POPULATION, GENERATIONS = 4_000_000, 8, 20
+PRIOR = {
+    "learning_rate": Range(1e-5, 1e-2),
+    "gamma": Range(0.9, 0.9999, "complement"),
+    "gae_lambda": Range(0.8, 0.99, "complement"),
+    "ent_coef": Range(1e-5, 0.1),
+    "clip_coef": Range(0.05, 0.5),
+}
+MUTATIONS = Mutations(
+    none=0.2, hyperparameters=0.6, parameters=0.0, architecture=0.2, activation=0.0,
+    ranges=PRIOR, units=(16, 256), layers=(1, 3),
+)  # fmt: skip
+EVOLVED = Evolution(
+    POPULATION, GENERATIONS, episodes=20, start="random", mutations=MUTATIONS
+)  # fmt: skip
+# One generation: whoever is best at the end of training.
+RANDOM = replace(EVOLVED, generations=1)
+MEMBER = PPO(num_envs=16, n_steps=64, batch_size=128, network=Network((64, 64), "relu"))
+WAYS: dict[str, tuple[PPO, int, Evolution | None]] = {
+    "evolution": (MEMBER, BUDGET // POPULATION, EVOLVED),
+    "random search": (MEMBER, BUDGET // POPULATION, RANDOM),
+    "defaults": (PPO(), BUDGET, None),
+}
+
+
+def search(way: str, seed: int) -> dict[str, Any]:
+    config, steps, evolve = WAYS[way]
+    with tempfile.TemporaryDirectory() as folder:
+        run = train_agent(
+            "LunarLander-v3", config, steps, Path(folder) / "run", seed=seed, quiet=True,
+            evolve=evolve,
+        )  # fmt: skip
+        score = run.evaluate(100)
+        (phase,) = run.info()["phases"]
+    return {
+        "way": way,
+        "seed": seed,
+        "score": round(score.mean, 1),
+        "solved": score.solved_fraction,
+        "steps": phase["steps"],
+        "seconds": round(phase["seconds"]),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--ways", nargs="+", default=list(WAYS))
+    parser.add_argument("--processes", type=int, default=2)
+    given = parser.parse_args()
+    rows = []
+    with ProcessPoolExecutor(given.processes, get_context("spawn")) as pool:
+        jobs = [pool.submit(search, way, seed) for seed in given.seeds for way in given.ways]
+        for job in jobs:
+            rows.append(job.result())
+            print(rows[-1], flush=True)
+    print(table(list(rows[0]), [list(r.values()) for r in rows]))
+    scores = {way: [r["score"] for r in rows if r["way"] == way] for way in given.ways}
+    found = {f"{way} median": median(s) for way, s in scores.items()}
+    found |= {f"{way} worst": min(s) for way, s in scores.items()}
+    if {"evolution", "random search"} <= set(given.ways):
+        pairs = zip(scores["evolution"], scores["random search"], strict=True)
+        found["wins over random search"] = sum(a > b for a, b in pairs)
+    report("search", {"summary": found, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
