@@ -14,10 +14,10 @@ from agilerl.training.train_on_policy import train_on_policy
 from agilerl.utils.utils import create_population, make_vect_envs
 
 MEMBERS, ENVS = 8, 16
-SETTINGS = {
-    "BATCH_SIZE": 128,
-    "LR": 1e-3,
-    "LEARN_STEP": 64 * ENVS,
+SETTINGS = {  # its defaults
+    "BATCH_SIZE": 64,
+    "LR": 1e-4,
+    "LEARN_STEP": 4096,
     "GAMMA": 0.99,
     "GAE_LAMBDA": 0.95,
     "ACTION_STD_INIT": 0.6,
