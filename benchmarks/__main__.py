@@ -11,6 +11,7 @@ QUICK = (
     ["replay"],
     ["speed", "--seeds", "0"],
     ["off_policy", "--seeds", "0", "--sizes", "small"],
+    ["population", "--seeds", "0"],
     ["flat", "--seeds", "0"],
 )
 ALL = (
@@ -25,6 +26,8 @@ ALL = (
     ["off_policy"],
     ["learning"],
     ["mixed"],
+    ["population"],
+    ["search"],
 )
 
 

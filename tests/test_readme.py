@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,14 @@ def test_the_readme_examples_run_as_they_stand(
     pytest.importorskip("Box2D")
     pytest.importorskip("PIL")
     code = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    assert len(code) == 3
+    assert len(code) == 4
     train = Hierarchy.train
 
     def train_briefly(self: Hierarchy, *args: Any, **kwargs: Any) -> Any:
         self.scale(0.01)
+        if kwargs.get("evolve"):
+            small = {"generations": 2, "population": 3, "episodes": 1}
+            kwargs["evolve"] = {k: replace(v, **small) for k, v in kwargs["evolve"].items()}
         return train(self, *args, **kwargs | {"quiet": True})
 
     monkeypatch.setattr(Hierarchy, "train", train_briefly)
@@ -37,11 +41,15 @@ def test_the_readme_examples_run_as_they_stand(
     assert names["hierarchy"].selector.noisy
     names["hierarchy"].check_spaces()
 
+    exec(compile(code[2], "README.md", "exec"), names)
+    phases = names["run"].info()["phases"]
+    assert [p["name"] for p in phases if "winner" in p] == ["land"]
+
     made: list[Any] = []  # the files of foreign skills are tested where they are made
     for name in ("from_sb3", "from_onnx"):
         monkeypatch.setattr(skillweave, name, lambda *a, **k: made.append((a, k)), raising=False)
     names |= {"glide": lambda obs: obs[:, 0], "network": torch.nn.Linear(8, 4)}
-    exec(compile(code[2], "README.md", "exec"), names)
+    exec(compile(code[3], "README.md", "exec"), names)
     assert made == [(("dock.zip", "ppo"), {"trust": True}), (("hop.onnx",), {})]
 
 
