@@ -142,6 +142,11 @@ def _info(command: commands.Info) -> None:
             f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
             f"{'' if final is None else f'{final:.1f}':>8}"
         )
+        if winner := p.get("winner"):
+            lines.append(
+                f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
+                f"fitness {winner['fitness']:.1f} (skillweave plot {command.target})"
+            )
     lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
     _tell(command, m, "\n".join(lines))
 

@@ -6,7 +6,6 @@ A generation is one piece: a run that was killed goes on from the last complete 
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, fields
 from typing import Any
@@ -17,9 +16,9 @@ from torch import Tensor
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.evolution.config import Evolution, evolution_from_json
+from skillweave.evolution.lineage import Lineage, settings_of
 from skillweave.evolution.population import Population
 from skillweave.evolution.stacks import Member, Origin
-from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
@@ -222,56 +221,6 @@ class _Evolving:
             weights, where = _under("best", tensors), str(self.run.path)
             policy = AgentPolicy.from_file(weights, best["policy"], where)
             self.best = Best(best["fitness"], best["number"], best["generation"], policy)
-
-
-class Lineage:
-    """``lineage.jsonl``: who descends from whom, what changed, and how good it was."""
-
-    def __init__(self, run: RunDirectory, size: int | None) -> None:
-        self._path = run.path / "lineage.jsonl"
-        if size is not None and self.size > size:  # what follows is about to be written again
-            with self._path.open("rb+") as file:
-                file.truncate(size)
-
-    @property
-    def size(self) -> int:
-        """Bytes in the file."""
-        return self._path.stat().st_size if self._path.exists() else 0
-
-    def write(
-        self,
-        phase: str,
-        generation: int,
-        members: list[Member],
-        fitness: Array,
-        evolution: Evolution,
-    ) -> None:
-        """A line for each member of a generation."""
-        with self._path.open("a") as file:
-            for member, value in zip(members, fitness, strict=True):
-                origin = member.origin
-                line = {
-                    "phase": phase,
-                    "generation": generation,
-                    "member": member.number,
-                    "parent": origin.parent,
-                    "mutation": origin.mutation,
-                    "changes": {k: list(v) for k, v in origin.changes.items()},
-                    "fitness": float(value) if np.isfinite(value) else None,
-                    "diverged": not np.isfinite(value),
-                    "steps": member.steps,
-                    "settings": settings_of(member.config, evolution),
-                }
-                file.write(json.dumps(line) + "\n")
-
-
-def settings_of(config: AlgorithmConfig, evolution: Evolution) -> dict[str, Any]:
-    """What evolution may change of a member's settings, by name."""
-    ranges = evolution.mutations.ranges_of(config, start=False)
-    found: dict[str, Any] = {name: getattr(config, name) for name in ranges}
-    network: Network = config.network
-    found |= {"hidden": list(network.hidden), "activation": network.activation}
-    return found
 
 
 def _member_to_json(member: Member) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import PPO, AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.buffers.replay import ReplayBuffer
@@ -48,6 +49,7 @@ class Population:
         self.rounds = 0
         """Of the off-policy loop, in which all members go side by side."""
         self.buffer: ReplayBuffer | None = None
+        self._made: dict[AlgorithmConfig, Algorithm] = {}
 
     @classmethod
     def fresh(
@@ -98,7 +100,7 @@ class Population:
         spent = 0
         for i, group in enumerate(groups):
             algorithm: Any
-            algorithm, state = join(group, self.spaces)
+            algorithm, state = join(group, self.spaces, self._made)
             start, count = sum(m.steps for m in group), len(group)
             clock = _Clock(spent, start, on_tick)
             env = self._env([Stack(algorithm, state)])
@@ -122,7 +124,7 @@ class Population:
         on_tick: OnTick,
     ) -> None:
         """Off-policy: all stacks act in one environment and learn from one buffer."""
-        stacks = [Stack(*join(group, self.spaces)) for group in groups]
+        stacks = [Stack(*join(group, self.spaces, self._made)) for group in groups]
         start, count = self.steps, len(self.members)
         clock = _Clock(0, start, on_tick)
         env = self._env(stacks)

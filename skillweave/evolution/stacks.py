@@ -69,15 +69,24 @@ def grouped(members: Sequence[Member], spaces: tuple[Any, Any]) -> list[list[Mem
     return list(groups.values())
 
 
-def join(members: Sequence[Member], spaces: tuple[Any, Any]) -> tuple[Algorithm, Any]:
-    """The algorithm of the widest of all, and one state of P members; copies."""
-    first = members[0].config
-    changes: dict[str, Any] = {
+def join(
+    members: Sequence[Member],
+    spaces: tuple[Any, Any],
+    made: dict[AlgorithmConfig, Algorithm] | None = None,
+) -> tuple[Algorithm, Any]:
+    """The algorithm of the widest of all, and one state of P members; copies.
+
+    Algorithms are kept in ``made``: what one of them has compiled need not be compiled again.
+    """
+    first = members[0]
+    key = stack_key(first.config, first.algorithm(spaces).settings)
+    widest: dict[str, Any] = {
         name: _widest([getattr(m.config, name) for m in members])
         for name in ("network", "critic")
-        if isinstance(getattr(first, name, None), Network)
+        if isinstance(getattr(first.config, name, None), Network)
     }
-    algorithm = make_algorithm(replace(first, **changes), *spaces)
+    config, made = replace(key, **widest), {} if made is None else made
+    algorithm = made.setdefault(config, make_algorithm(config, *spaces))
     wide, padded = algorithm.layouts(), []
     for member in members:
         own = member.algorithm(spaces).layouts()
