@@ -38,7 +38,7 @@ NETWORKS = ("network", "critic")
 class Change:
     """What happens to the networks: to units of a layer, or to a whole one."""
 
-    kind: str  # units, channels, layer
+    kind: str  # units, channels, kernel, layer
     layer: int = 0
     by: int = 0  # units or channels; of a layer 1 or −1
 
@@ -75,10 +75,34 @@ def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> 
     for layer, count in enumerate(cnn.channels if cnn else ()):
         steps = _steps(count, max(1, count // 4), mutations.channels)
         units += [Change("channels", layer, by) for by in steps]
+    if cnn is not None and cnn.kind == "plain":
+        units += _kernels(member, cnn, mutations, spaces)
     layers = [Change("layer", by=by) for by in (1, -1) if _fits(config, by, mutations)]
     first, second = (layers, units) if rng.random() < mutations.layer_share else (units, layers)
     options = first or second
     return options[int(rng.integers(len(options)))] if options else None
+
+
+def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> list[Change]:
+    """Kernels that can change by a pixel while every layer's output keeps its size."""
+    obs, found = member.algorithm(spaces).obs, []
+    low, high = mutations.kernels
+    for layer, kernel in enumerate(cnn.kernels):
+        for by in (1, -1):
+            if not low <= kernel + by <= high:
+                continue
+            change = Change("kernel", layer, by)
+            other = changed(Network(cnn=cnn), change, cnn, False).cnn
+            try:
+                sizes = [
+                    [ImageEncoder(obs, i, c, "relu").sizes for c in (cnn, other)]
+                    for i in range(len(obs.images))
+                ]
+            except SkillweaveError:
+                continue  # larger than what is left of the image
+            if all(old == new for old, new in sizes):
+                found.append(change)
+    return found
 
 
 def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
@@ -113,6 +137,10 @@ def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) ->
         assert cnn is not None
         new = tuple(c + change.by * (i == change.layer) for i, c in enumerate(cnn.channels))
         return replace(network, cnn=replace(cnn, channels=new))
+    if change.kind == "kernel":
+        assert cnn is not None
+        kernels = tuple(k + change.by * (i == change.layer) for i, k in enumerate(cnn.kernels))
+        return replace(network, cnn=replace(cnn, kernels=kernels))
     hidden = list(network.hidden)
     behind = len(hidden) - dueling  # behind the last layer of the trunk
     if change.kind == "units":
@@ -168,6 +196,12 @@ def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
         if change.by > 0:
             return [lambda _: lambda v, m: growth.deepened(v, joint, activation, moments=m)]
         return [lambda _: lambda v, m: growth.shallower(v, joint, moments=m)] * (joint.depth > 1)
+    if change.kind == "kernel":
+        return [
+            functools.partial(_resized_kernel, f"{prefix}.{change.layer}.weight", change.by)
+            for prefix, encoder in net.encoders.items()
+            if isinstance(encoder, ImageEncoder)
+        ]
     layer = min(change.layer, len(net.network.hidden) - 1)
     groups = net.units(layer) if change.kind == "units" else net.channels(change.layer)
     return [functools.partial(_resized, units, change.by, generator) for units in groups]
@@ -180,3 +214,7 @@ def _resized(units: Units, by: int, generator: torch.Generator, online: Views) -
         return lambda v, moments: growth.widened(v, units, by, None if moments else new)
     kept = growth.most_read(online, units, max(1, units.count + by))
     return lambda v, moments: growth.narrowed(v, units, kept)
+
+
+def _resized_kernel(name: str, by: int, online: Views) -> Alter:
+    return lambda v, moments: growth.with_kernel(v, name, by)

@@ -112,6 +112,8 @@ class Mutations:
     """Fewest and most units of a hidden layer."""
     channels: tuple[int, int] = (8, 64)
     """Fewest and most channels of a convolution."""
+    kernels: tuple[int, int] = (1, 8)
+    """Smallest and largest kernel of a convolution; it changes where no output's size does."""
     activations: tuple[Activation, ...] = ("tanh", "relu", "elu", "silu")
     """Nonlinearities to choose from."""
 
@@ -126,7 +128,7 @@ class Mutations:
                 "they must sum to 1"
             )
         _check(self, "strength", self.strength >= 0.0, "at least 0")
-        for name in ("layers", "units", "channels"):
+        for name in ("layers", "units", "channels", "kernels"):
             low, high = getattr(self, name)
             _check(self, name, 1 <= low <= high, "(fewest, most), at least 1")
         known = get_args(Activation)

@@ -74,11 +74,14 @@ class ImageEncoder:
         self.cnn = cnn or (CNN() if min(height, width) >= 36 else CNN.small())
         self._activation = ACTIVATIONS[activation]
         self.shapes: dict[str, tuple[int, ...]] = {}
+        self.sizes: list[tuple[int, int]] = []
+        """Height and width after each layer, or stage."""
         if self.cnn.kind == "impala":
             for stage, out in enumerate(self.cnn.channels):
                 for part in ("in", "0.0", "0.1", "1.0", "1.1"):
                     self._layer(f"{stage}.{part}", channels if part == "in" else out, out, 3)
                 height, width, channels = (height + 1) // 2, (width + 1) // 2, out
+                self.sizes.append((height, width))
         else:
             layers = zip(self.cnn.channels, self.cnn.kernels, self.cnn.strides, strict=True)
             for i, (out, kernel, stride) in enumerate(layers):
@@ -91,6 +94,7 @@ class ImageEncoder:
                 self._layer(str(i), channels, out, kernel)
                 height, width = ((x - kernel) // stride + 1 for x in (height, width))
                 channels = out
+                self.sizes.append((height, width))
         self.size = channels * height * width
 
     def _layer(self, name: str, n_in: int, n_out: int, kernel: int) -> None:

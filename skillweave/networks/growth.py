@@ -129,6 +129,14 @@ def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
     return found
 
 
+def with_kernel(named: Views, name: str, by: int) -> dict[str, Tensor]:
+    """With filters (R, out, in, k, k) larger by rows and columns of zeros, or smaller, at the end.
+
+    Where no layer's output changes its size, larger filters compute the same.
+    """
+    return {**named, name: torch.nn.functional.pad(named[name], (0, by, 0, by))}
+
+
 def deepened(
     named: Views, joint: Joint, activation: Activation, *, moments: bool
 ) -> dict[str, Tensor]:
@@ -196,5 +204,5 @@ def _moved(name: str, joint: Joint, by: int) -> str:
 
 __all__ = [
     "IDENTITY", "PAIRED", "Joint", "Part", "Units", "deepened", "fresh", "most_read",
-    "narrowed", "shallower", "units_of", "widened",
+    "narrowed", "shallower", "units_of", "widened", "with_kernel",
 ]  # fmt: skip

@@ -119,6 +119,32 @@ def test_channels_grow_without_changing_the_function(cnn, space, layer):
         torch.testing.assert_close(value, old[key], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("space", [IMAGE, BOTH])
+def test_kernels_grow_without_changing_the_function_where_they_can(space):
+    before, spaces = member("ppo", "relu", space)
+    cnn = CNN("plain", (4, 6), (3, 2), (2, 1))  # 12 → 5 → 4 pixels: the first has one to spare
+    before.config = replace(before.config, network=replace(before.config.network, cnn=cnn))
+    before.state = before.algorithm(spaces).init([Seeds(3)])
+    by, drawn = Mutations(channels=(99, 99), units=(99, 99)), set()
+    before.config = replace(before.config, network=replace(before.config.network, hidden=(99,)))
+    before.state = before.algorithm(spaces).init([Seeds(3)])
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        change = draw_change(before, replace(by, layer_share=0.0), spaces, rng)
+        assert change is not None
+        drawn.add((change.kind, change.layer, change.by))
+    assert ("kernel", 0, 1) in drawn
+    assert not {k for k in drawn if k[0] == "kernel"} - {("kernel", 0, 1)}
+    after = rebuilt(before, Change("kernel", 0, 1), spaces, rng)
+    assert after.config.network.cnn.kernels == (4, 2)
+    old, new = outputs(before, spaces), outputs(after, spaces)
+    for key, value in old.items():
+        assert float((value - new[key]).abs().max()) <= 1e-6, key
+    back = rebuilt(after, Change("kernel", 0, -1), spaces, rng)
+    for f in fields(before.state):
+        assert torch.equal(getattr(before.state, f.name), getattr(back.state, f.name)), f.name
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_what_survives_keeps_its_moments_and_what_is_new_starts_at_zero(name):
     before, spaces = member(name, "relu")
