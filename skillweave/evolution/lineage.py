@@ -36,8 +36,9 @@ class Lineage:
         members: list[Member],
         fitness: Array,
         evolution: Evolution,
+        best: int | None,
     ) -> None:
-        """A line for each member of a generation.
+        """A line for each member of a generation; ``best``: who is the best so far, if of these.
 
         Raises:
             SkillweaveError: the disk is full or cannot be written.
@@ -54,6 +55,7 @@ class Lineage:
                 "changes": {k: list(v) for k, v in origin.changes.items()},
                 "fitness": float(value) if np.isfinite(value) else None,
                 "diverged": not np.isfinite(value),
+                "best": member.number == best,
                 "steps": member.steps,
                 "settings": settings_of(member.config, evolution),
             }

@@ -17,7 +17,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json, conf
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.lineage import Lineage, settings_of
-from skillweave.evolution.population import Population
+from skillweave.evolution.population import Population, score
 from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
@@ -33,7 +33,10 @@ class Nothing:
 
 @dataclass
 class Best:
-    """The best member so far: its policy is what the phase ends with."""
+    """The best member so far: its policy is what the phase ends with.
+
+    Fitness is that of the latest generation's episodes.
+    """
 
     fitness: float
     number: int
@@ -131,6 +134,7 @@ class _Evolving:
         seeds = self.seeds / "generation" / self.done
         self.population.train(until, self.horizon, seeds, on_tick)
         fitness = self.population.fitness(self.arena, seeds / "fitness")
+        self._keep_best(fitness, seeds / "fitness")
         self._note(fitness)
         self.done += 1
         if not self.over:
@@ -154,25 +158,31 @@ class _Evolving:
     def _seconds(self) -> float:
         return time.perf_counter() - self._started
 
+    def _keep_best(self, fitness: Array, seeds: Seeds) -> None:
+        """Keep the best policy so far: the old one plays this generation's episodes, too."""
+        if self.best is not None:
+            self.best.fitness = score(self.best.policy, self.arena, seeds)
+        # Of equals the latest: it has learnt for longer.
+        if self.best is None or fitness.max() >= self.best.fitness:
+            member = self.population.members[int(fitness.argmax())]
+            policy = self.population.policy(member)
+            self.best = Best(float(fitness.max()), member.number, self.done, policy)
+
     def _note(self, fitness: Array) -> None:
-        """Write the generation down, keep the best, and tell."""
+        """Write the generation down, and tell."""
         members = self.population.members
-        self.lineage.write(self.phase.name, self.done, members, fitness, self.evolution)
+        best = self.best.number if self.best and self.best.generation == self.done else None
+        self.lineage.write(self.phase.name, self.done, members, fitness, self.evolution, best)
         lost = [str(m.number) for m, f in zip(members, fitness, strict=True) if f == -np.inf]
         if lost:
             self._tell(
                 f"generation {self.done + 1}: member {', '.join(lost)} diverged; it is replaced"
             )
         winner = members[int(fitness.argmax())]
-        score = float(fitness.max())
-        # Of equals the latest: it has learnt for longer.
-        if np.isfinite(score) and (self.best is None or score >= self.best.fitness):
-            policy = self.population.policy(winner)
-            self.best = Best(score, winner.number, self.done, policy)
         shown = ", ".join(f"{k} {_short(v)}" for k, v in self._settings(winner.config).items())
         self._tell(
             f"generation {self.done + 1} of {self.evolution.generations}: best is member "
-            f"{winner.number} with {score:.1f} ({shown})"
+            f"{winner.number} with {fitness.max():.1f} ({shown})"
         )
 
     def _settings(self, config: AlgorithmConfig) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from skillweave.training.members import Stack
 from skillweave.training.off_policy import make_buffer, train_stacks
 from skillweave.training.on_policy import train_on_policy
 from skillweave.training.probe import MakeEnv, episode_returns
-from skillweave.types import Array, VecEnv
+from skillweave.types import Array, Policy, VecEnv
 
 NEVER = 2**62
 """Steps between cuts: a generation is one piece."""
@@ -162,17 +162,9 @@ class Population:
 
     def fitness(self, env: VecEnv, seeds: Seeds) -> Array:
         """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
-        found = np.full(len(self.members), -np.inf)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # several wait for each other, for ever on a busy machine
-        try:
-            for i, member in enumerate(self.members):
-                if not has_diverged(member):
-                    returns = episode_returns(self.policy(member), env, seeds)
-                    found[i] = returns.mean() if np.isfinite(returns).all() else -np.inf
-        finally:
-            torch.set_num_threads(threads)
-        return found
+        return np.array([
+            -np.inf if has_diverged(m) else score(self.policy(m), env, seeds) for m in self.members
+        ])  # fmt: skip
 
     def policy(self, member: Member) -> AgentPolicy:
         """What a member has learnt."""
@@ -216,6 +208,17 @@ def _count(members: list[Member], steps: int) -> None:
     """Give each of the members its part of the steps that they took together."""
     for i, member in enumerate(members):
         member.steps += (steps + i) // len(members)
+
+
+def score(policy: Policy, env: VecEnv, seeds: Seeds) -> float:
+    """Mean return of an episode in each environment; −inf if it is not finite."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # several wait for each other, for ever on a busy machine
+    try:
+        returns = episode_returns(policy, env, seeds)
+    finally:
+        torch.set_num_threads(threads)
+    return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
 
 
 def has_diverged(member: Member) -> bool:

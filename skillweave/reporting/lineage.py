@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ class Born:
     mutation: str
     changes: dict[str, list[Any]]
     fitness: float | None
+    best: bool
+    """Whether it was the best so far."""
     settings: dict[str, Any]
 
 
@@ -33,9 +35,8 @@ class Lineage:
 
     @property
     def winner(self) -> Born:
-        """The fittest of all; of equals the latest, as the run has it."""
-        able = [b for b in self.born.values() if b.fitness is not None]
-        return max(able, key=lambda b: (b.fitness, b.generation))
+        """The best of all so far."""
+        return max((b for b in self.born.values() if b.best), key=lambda b: b.generation)
 
     def parent(self, born: Born) -> Born | None:
         """Where a member comes from; None: from the start."""
@@ -63,7 +64,7 @@ def read_lineage(run: Path, phase: str) -> Lineage | None:
     if not path.exists():
         return None
     born: dict[tuple[int, int], Born] = {}
-    names = ("generation", "member", "parent", "mutation", "changes", "fitness", "settings")
+    names = [f.name for f in fields(Born)]
     for number, line in enumerate(path.read_text().splitlines(keepends=True), 1):
         if not line.endswith("\n"):
             continue  # half-written
@@ -74,4 +75,4 @@ def read_lineage(run: Path, phase: str) -> Lineage | None:
                 born[each.generation, each.member] = each
         except (ValueError, KeyError) as error:
             raise SkillweaveError(f"{path} is damaged in line {number}: {error}") from error
-    return Lineage(born) if any(b.fitness is not None for b in born.values()) else None
+    return Lineage(born) if any(b.best for b in born.values()) else None

@@ -106,7 +106,7 @@ def test_a_recipe_evolves_and_says_how_it_went(run: Path):
         lineage = read_lineage(run, name)
         assert lineage is not None
         assert lineage.winner.member == phase["winner"]["member"]
-        assert lineage.winner.fitness == phase["winner"]["fitness"]
+        assert lineage.winner.generation == phase["winner"]["generation"]
 
 
 def test_the_winners_family_tree_reaches_back_to_the_start(run: Path):

@@ -26,6 +26,7 @@ from skillweave import (
     Range,
     Skill,
     SkillweaveError,
+    Tournament,
     Truncation,
     train_agent,
 )
@@ -101,10 +102,16 @@ def test_a_population_evolves_and_ends_with_the_best_member(name, tmp_path):
     run = train(name, tmp_path / "run")
     lines = lineage(run.path)
     assert [line["generation"] for line in lines] == [g for g in range(4) for _ in range(4)]
-    best = max(lines, key=lambda line: line["fitness"])
+    best = [line for line in lines if line["best"]]
+    for line in best:
+        assert line["fitness"] == max(
+            x["fitness"] for x in lines if x["generation"] == line["generation"]
+        )
     (entry,) = run.info()["phases"]
-    assert entry["winner"]["fitness"] == best["fitness"]
-    assert entry["winner"]["generation"] == best["generation"]
+    assert entry["winner"]["member"] == best[-1]["member"]
+    assert entry["winner"]["generation"] == best[-1]["generation"]
+    if best[-1]["generation"] == 3:
+        assert entry["winner"]["fitness"] == best[-1]["fitness"]
     assert entry["budget"] == 4 * 256
     assert 4 * 256 <= entry["steps"] <= 4 * 256 + 4 * 32
     numbers = {line["member"] for line in lines}
@@ -117,6 +124,19 @@ def test_a_population_evolves_and_ends_with_the_best_member(name, tmp_path):
         elite = max(now, key=lambda line: line["fitness"])["member"]
         assert [x["member"] for x in then if x["mutation"] == "goes on"] == [elite]
     assert {x["mutation"] for x in lines} >= {"start", "goes on"}
+
+
+def test_the_best_so_far_must_hold_its_own_on_the_same_episodes(tmp_path, monkeypatch):
+    told = iter([np.array([1.0, 3.0]), np.array([9.0, 4.0]), np.array([5.0, 6.0])])
+    old = iter([9.5, 6.0])  # what the old best gets in the second and third generation
+    monkeypatch.setattr(Population, "fitness", lambda *_: next(told))
+    monkeypatch.setattr(evolving, "score", lambda *_: next(old))
+    by = Evolution(2, 3, 2, selection=Tournament(2), mutations=EVERYTHING)
+    run = train("ppo", tmp_path / "run", by)
+    flagged = [(x["generation"], x["member"]) for x in lineage(run.path) if x["best"]]
+    assert [g for g, _ in flagged] == [0, 2]  # 9.5 beats 9.0; of equals the latest
+    winner = run.info()["phases"][0]["winner"]
+    assert (winner["generation"], winner["fitness"]) == (2, 6.0)
 
 
 @pytest.mark.parametrize("name", CONFIGS)
