@@ -2,10 +2,11 @@
 
     python -m benchmarks.search [--seeds 0 1 2 3 4] [--processes 2]
 
-All members begin with settings drawn from a wide prior over learning rate, γ, λ, entropy, clip,
-width and depth. Random search draws from the same prior, with the same seeds, trains every draw to
-its end and takes the best by the same fitness; the defaults get all steps for one agent. Scores are
-100 greedy episodes of Gymnasium's environment with seeds that training never saw.
+Four members begin with settings drawn from a wide prior over learning rate, γ, λ, entropy, clip,
+width and depth, and train for a million steps each. Random search draws from the same prior, trains
+every draw to its end and takes the best by the same fitness: once the same four draws, and once
+eight draws of half as many steps. The defaults get all steps for one agent. Scores are 100 greedy
+episodes of Gymnasium's environment with seeds that training never saw.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 from benchmarks.common import median, report, table
 from skillweave import PPO, Evolution, Mutations, Network, Range, train_agent
 
-BUDGET, POPULATION, GENERATIONS = 4_000_000, 8, 20
+BUDGET, GENERATIONS = 4_000_000, 20
 PRIOR = {
     "learning_rate": Range(1e-5, 1e-2),
     "gamma": Range(0.9, 0.9999, "complement"),
@@ -33,15 +34,14 @@ MUTATIONS = Mutations(
     none=0.2, hyperparameters=0.6, parameters=0.0, architecture=0.2, activation=0.0,
     ranges=PRIOR, units=(16, 256), layers=(1, 3),
 )  # fmt: skip
-EVOLVED = Evolution(
-    POPULATION, GENERATIONS, episodes=20, start="random", mutations=MUTATIONS
-)  # fmt: skip
+EVOLVED = Evolution(4, GENERATIONS, episodes=20, start="random", mutations=MUTATIONS)
 # One generation: whoever is best at the end of training.
-RANDOM = replace(EVOLVED, generations=1)
+RANDOM = {draws: replace(EVOLVED, population=draws, generations=1) for draws in (4, 8)}
 MEMBER = PPO(num_envs=16, n_steps=64, batch_size=128, network=Network((64, 64), "relu"))
 WAYS: dict[str, tuple[PPO, int, Evolution | None]] = {
-    "evolution": (MEMBER, BUDGET // POPULATION, EVOLVED),
-    "random search": (MEMBER, BUDGET // POPULATION, RANDOM),
+    "evolution": (MEMBER, BUDGET // 4, EVOLVED),
+    "random search, 4 draws": (MEMBER, BUDGET // 4, RANDOM[4]),
+    "random search, 8 draws": (MEMBER, BUDGET // 8, RANDOM[8]),
     "defaults": (PPO(), BUDGET, None),
 }
 
@@ -81,9 +81,10 @@ def main() -> None:
     scores = {way: [r["score"] for r in rows if r["way"] == way] for way in given.ways}
     found = {f"{way} median": median(s) for way, s in scores.items()}
     found |= {f"{way} worst": min(s) for way, s in scores.items()}
-    if {"evolution", "random search"} <= set(given.ways):
-        pairs = zip(scores["evolution"], scores["random search"], strict=True)
-        found["wins over random search"] = sum(a > b for a, b in pairs)
+    for way in scores:
+        if way.startswith("random") and "evolution" in scores:
+            pairs = zip(scores["evolution"], scores[way], strict=True)
+            found[f"wins over {way}"] = sum(a > b for a, b in pairs)
     report("search", {"summary": found, "rows": rows})
 
 
