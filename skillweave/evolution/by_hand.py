@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Self, cast
 
 import numpy as np
 import torch
 
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.quick import Quick, QuickPPO, Sampled
 from skillweave.evolution.mutation import copy, with_settings
 from skillweave.evolution.stacks import Member
-from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.runs.agents import load_agent, save_agent
 from skillweave.seeding import Seeds
 from skillweave.training.by_hand import rollout_of, sample_of
 from skillweave.types import Array
@@ -102,25 +101,11 @@ class ByHand:
 
     def save(self, path: str | Path, about: dict[str, Any]) -> None:
         """Write a policy that is also all that learning needs; ``about`` is plain JSON."""
-        tensors, header = AgentPolicy.of(self.learner, self.member.state).to_file()
-        tensors = tensors | {f"state.{k}": v for k, v in vars(self.member.state).items()}
-        write_tensors(Path(path), tensors, header | {"about": about})
+        save_agent(path, self.learner, self.member.state, about)
 
     @classmethod
     def load(cls, path: str | Path, seed: int) -> tuple[Self, dict[str, Any]]:
-        """The agent of a file, and what was said about it.
-
-        Of a policy's file that holds nothing else it has the weights, and learns anew.
-
-        Raises:
-            SkillweaveError: the file is missing, damaged, or holds no agent.
-        """
-        tensors, header = read_tensors(Path(path))
-        algorithm = AgentPolicy.from_file(tensors, header, str(path)).algorithm
-        state = algorithm.init([Seeds(seed)])
-        algorithm.set_weights(state, tensors)
-        for f in fields(state):
-            if f"state.{f.name}" in tensors:
-                setattr(state, f.name, tensors[f"state.{f.name}"])
+        """The agent of a file, and what was said about it; see ``load_agent``."""
+        algorithm, state, about = load_agent(path, Seeds(seed))
         spaces = algorithm.observation_space, algorithm.action_space
-        return cls(Member(0, algorithm.config, state), spaces, seed), header.get("about", {})
+        return cls(Member(0, algorithm.config, state), spaces, seed), about
