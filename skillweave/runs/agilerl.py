@@ -45,11 +45,11 @@ def convert(path: Path, out: Path) -> str:
         )
     init = data["actor_init_dict"]
     output = init.get("mlp_output_activation")
-    if "num_inputs" not in init or init.get("rainbow") or output != _OUTPUTS[algo]:
+    if "num_inputs" not in init or output != _OUTPUTS[algo]:
+        kind = f"an MLP that ends in {output}" if "num_inputs" in init else "a CNN, or its own"
         raise SkillweaveError(
-            f"{path}: its actor has {'an MLP with' if 'num_inputs' in init else 'no MLP, but'} "
-            f"the output activation {output}; only MLPs with {_OUTPUTS[algo]} can be converted "
-            f"from {algo}"
+            f"{path}: the actor is {kind}; of {algo} only MLPs that end in {_OUTPUTS[algo]} can "
+            "be converted: no native policy computes the same as others"
         )
     try:
         algorithm, state = _agent(algo, data)
@@ -124,7 +124,7 @@ def _fill(views: Views, prefix: str, weights: Mapping[str, Tensor]) -> None:
         layer, number, what = found.groups()
         name = f"norm_{what}" if layer == "layer_norm" else what
         name = f"{prefix}.{depth if number == 'output' else number}.{name}"
-        value = value.T if layer == "linear_layer" else value
+        value = value.t() if layer == "linear_layer" else value
         if views[name][0].numel() != value.numel():
             raise ValueError(f"{key} has the shape {tuple(value.shape)}")
         views[name].copy_(value.reshape(views[name].shape))

@@ -116,6 +116,14 @@ class _Array(np.ndarray[Any, Any]):
         super().__setstate__((1, shape, dtype.real, fortran, data))
 
 
+def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
+    if make is not _Array:  # dill's way to write an array
+        raise SkillweaveError(f"refused: the pickle makes an array by {make}")
+    found = _Array(*arguments)
+    found.__setstate__(state)
+    return found
+
+
 def _encode(text: str, encoding: str) -> bytes:
     return text.encode("latin1")  # how pickles of protocol 2 write bytes
 
@@ -137,6 +145,7 @@ _ALLOWED: dict[tuple[str, str], Callable[..., Any] | type] = {
     ("builtins", "set"): set,
     ("__builtin__", "set"): set,
     ("dill._dill", "_load_type"): _load_type,
+    ("dill._dill", "_create_array"): _create_array,
     ("_codecs", "encode"): _encode,
     ("numpy", "dtype"): _DType,
     ("numpy", "ndarray"): _Array,
