@@ -145,6 +145,15 @@ class TD3(Agent):
         actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
         self._start(locals(), actions, **own)
 
+    @property
+    def lr_actor(self) -> float:
+        """The actor's learning rate."""
+        return float(self.lr_critic * self.native.member.config.actor_rate)  # type: ignore[union-attr]
+
+    @lr_actor.setter
+    def lr_actor(self, value: float) -> None:
+        self.native.set(actor_rate=float(value / self.lr_critic))
+
     def getAction(self, state: Any, epsilon: float = 0) -> Array:
         """Actions (B, A) float32: with probability ``epsilon`` any, else the actor's with noise."""
         return self.native.act(state, epsilon=epsilon)
