@@ -111,11 +111,10 @@ class RainbowDQN(Agent):
         After the five of every sample come, with ``per``, weights and indices; with ``n_step``
         the five again, summed over n steps: only these are learnt from then.
         """
-        used = experiences[-5:] if n_step else experiences[:5]
-        gamma, weights = (
-            self.gamma ** (self.n_step if n_step else 1),
-            experiences[5] if per else None,
-        )
+        used, gamma = experiences[:5], self.gamma
+        if n_step:
+            used, gamma = experiences[-5:], gamma**self.n_step
+        weights = experiences[5] if per else None
         metrics, errors = self.native.learn_sample(gamma, *used, weights)
         if not per:
             return metrics["loss"], None, None
@@ -145,14 +144,13 @@ class TD3(Agent):
         actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
         self._start(locals(), actions, **own)
 
-    @property
-    def lr_actor(self) -> float:
-        """The actor's learning rate."""
+    def _lr_actor(self) -> float:
         return float(self.lr_critic * self.native.member.config.actor_rate)  # type: ignore[union-attr]
 
-    @lr_actor.setter
-    def lr_actor(self, value: float) -> None:
+    def _set_lr_actor(self, value: float) -> None:
         self.native.set(actor_rate=float(value / self.lr_critic))
+
+    lr_actor = property(_lr_actor, _set_lr_actor, doc="The actor's learning rate.")
 
     def getAction(self, state: Any, epsilon: float = 0) -> Array:
         """Actions (B, A) float32: with probability ``epsilon`` any, else the actor's with noise."""

@@ -11,6 +11,7 @@ from skillweave.evolution.architecture import check_architecture
 from skillweave.evolution.config import KINDS, Range
 from skillweave.evolution.config import Mutations as Native
 from skillweave.evolution.mutation import mutate
+from skillweave.types import SkillweaveError
 
 _WORDS = {
     "none": "None", "architecture": "arch", "parameters": "param", "activation": "act",
@@ -34,12 +35,13 @@ class Mutations:
             "batch_size": ("batch_size", Range(min_batch_size, max_batch_size)),
             "learn_step": ("update_ratio", Range(1 / max_learn_step, 1 / min_learn_step)),
         }
+        if unknown := set(rl_hp_selection or ()) - set(known):
+            raise SkillweaveError(f"rl_hp_selection has {unknown}; there are: {', '.join(known)}")
         self._ranges = dict(known[k] for k in rl_hp_selection or ())
         self._kinds = np.array([no_mutation, rl_hp, parameters, architecture, activation], float)
         self._how: Any = {"strength": mutation_sd, "layer_share": new_layer_prob}
         self.mutate_elite = mutate_elite
-        seed = random_seed() if rand_seed is None else rand_seed
-        self.rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng(random_seed() if rand_seed is None else rand_seed)
 
     def mutation(self, population: list[Any], pre_training_mut: bool = False) -> list[Any]:
         """The same agents, each changed in at most one way, which ``mut`` says."""
@@ -55,8 +57,5 @@ class Mutations:
                 check_architecture(config, by, "Mutations: ")
                 native.become(mutate(native.member, by, native.spaces, self.rng))
                 said = native.member.origin
-                names = (
-                    list(said.changes) if said.mutation == "hyperparameters" else [said.mutation]
-                )
-                agent.mut = _WORDS[names[0]]
+                agent.mut = _WORDS.get(said.mutation) or _WORDS[next(iter(said.changes))]
         return population

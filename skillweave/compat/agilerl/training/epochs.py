@@ -33,8 +33,11 @@ class Epochs(SimpleNamespace):
         name, found = f"{self.env_name}-EvoHPO-{self.algo}", []
         self.wandb = import_wandb() if self.wb else None
         if self.wandb:
+            if self.wandb_api_key is not None:
+                self.wandb.login(key=self.wandb_api_key)
+            mode = None if self.wandb_api_key is None else "online"
             settings = {**(self.INIT_HP or {}), **(self.MUT_P or {})}
-            self.wandb.init(project="AgileRL", name=name, config=settings)
+            self.wandb.init(project="AgileRL", name=name, config=settings, mode=mode)
         for done in range(self.n_episodes):
             losses = [self._score(agent, *episode(agent, done)) for agent in self.pop]
             number = done + 1
