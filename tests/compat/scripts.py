@@ -15,7 +15,7 @@ HEADINGS = {
 CUT = {
     '"EPISODES": 1000': '"EPISODES": {episodes}',
     '"EVO_EPOCHS": 5': '"EVO_EPOCHS": 2',
-    "range(500)": "range(20)",
+    "range(500)": "range(5)",
     "episodes = 3": "episodes = 1",
     "max_steps = 100 ": "max_steps = 2 ",
     "            500  # Max": "            20  # Max",
