@@ -100,9 +100,9 @@ def test_training_makes_better():
     pop = initialPopulation("PPO", (4,), 2, False, MLP, HP | {"LR": 5e-3, "UPDATE_EPOCHS": 6})
     env.reset(seed=1)
     train_on_policy(
-        env, "CartPole-v1", "PPO", pop, n_episodes=25, max_steps=60, evo_epochs=100, verbose=False
+        env, "CartPole-v1", "PPO", pop, n_episodes=20, max_steps=100, evo_epochs=100, verbose=False
     )
-    assert np.mean(pop[0].scores[-5:]) > 1.5 * np.mean(pop[0].scores[:3])
+    assert np.mean(pop[0].scores[-5:]) > 2.0 * pop[0].scores[0]
 
 
 @pytest.mark.parametrize("algo", ["DQN", "Rainbow DQN", "DDPG", "TD3"])
