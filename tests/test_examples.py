@@ -9,20 +9,23 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 2
+COUNT = 3
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
     "foreign_skills.py": ("--steps", "3000"),
     "sb3_selector.py": ("--steps", "3000", "--episodes", "2"),
+    "tutorial.py": ("--scale", "0.01", "--episodes", "2", "--out", "{folder}/run"),
 }
 """Small budgets, for those that take long."""
 NEEDS = {
     "foreign_skills.py": ("stable_baselines3", "onnx", "onnxruntime"),
     "sb3_selector.py": ("stable_baselines3",),
+    "tutorial.py": ("Box2D", "PIL"),
 }
 SAYS = {
     "foreign_skills.py": "woven by the selector: ",
     "sb3_selector.py": "woven by the selector: ",
+    "tutorial.py": "the hierarchy: ",
 }
 
 
@@ -43,7 +46,7 @@ def test_there_are_as_many_examples_as_are_known():
 def test_an_example_runs_to_its_end(path, tmp_path):
     for module in NEEDS.get(path.name, ()):
         pytest.importorskip(module)
-    done = run(path, *SMALL.get(path.name, ()))
+    done = run(path, *(word.format(folder=tmp_path) for word in SMALL.get(path.name, ())))
     assert done.returncode == 0, done.stderr
     assert SAYS[path.name] in done.stdout
     assert "Traceback" not in done.stderr
@@ -107,3 +110,9 @@ def test_stable_baselines3s_own_checker_of_budgets_stops_at_environment_steps():
     budget = module.StepBudget(25)
     budget.locals = {"infos": [{"steps": 10}, {"steps": 2}]}
     assert [budget._on_step(), budget._on_step(), budget._on_step()] == [True, True, False]
+
+
+def test_the_tutorials_job_takes_a_third_of_its_lines():
+    old = (ROOT / "tests/compat/tutorial.txt").read_text().split("Full code\n")[1]
+    new = (ROOT / "examples/tutorial.py").read_text()
+    assert 3 * len(new.splitlines()) <= len(old.splitlines())

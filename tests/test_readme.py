@@ -54,9 +54,9 @@ def test_the_readme_examples_run_as_they_stand(
 
 
 def test_every_shell_command_of_the_readme_is_one_that_exists() -> None:
-    from skillweave.cli.commands import COMMANDS
+    from skillweave.cli.commands import COMMANDS, name_of
 
-    known = {c.__name__.lower() for c in COMMANDS}
-    used = set(re.findall(r"^skillweave (\w+)", README, flags=re.M))
+    known = {name_of(c) for c in COMMANDS}
+    used = set(re.findall(r"^skillweave ([\w-]+)", README, flags=re.M))
     assert used
     assert used <= known

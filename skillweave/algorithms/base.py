@@ -116,6 +116,15 @@ class Algorithm:
             named |= {k: getattr(state, k)[member].clone() for k in ("obs_mean", "obs_var")}
         return named
 
+    def set_weights(self, state: Any, weights: Mapping[str, Tensor]) -> None:
+        """The inverse of ``weights`` for a state of one member, in place; its slow copy follows."""
+        for name in self.families()[0].weights:
+            for k, view in self.layout.views(getattr(state, name)).items():
+                view[0].copy_(weights[k])
+        if self.normalize_obs:
+            for k in ("obs_mean", "obs_var"):
+                getattr(state, k)[0].copy_(weights[k])
+
     def actor_of(self, weights: Mapping[str, Tensor]) -> Actor:
         """The actor of one member's ``weights`` (P = 1)."""
         views = {k: weights[k][None].clone() for k in self.acting.shapes}

@@ -196,9 +196,12 @@ class TD3(OffPolicy):
     """Largest noise on the target's actions."""
     twin: bool = True
     """The smaller of two critics is the target's; else there is one critic."""
+    actor_rate: float = 1.0
+    """The actor's learning rate, as a share of the critics'."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        positive(self, "actor_rate")
         number(self, "exploration_noise", "target_noise", "target_noise_clip")
         whole(self, "policy_delay")
 

@@ -46,7 +46,7 @@ class AgentPolicy(Memoryless):
     """One trained agent; a copy of what acting needs, independent of further learning."""
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
-        self._algorithm, self.weights = algorithm, weights
+        self.algorithm, self.weights = algorithm, weights
         self._actor = algorithm.actor_of(weights)
         self.observation_space = algorithm.observation_space
         self.action_space = algorithm.action_space
@@ -58,7 +58,7 @@ class AgentPolicy(Memoryless):
 
     def start(self, n: int) -> Memory:
         """Zeros, (n, M), where the network has a memory."""
-        size = self._algorithm.memory
+        size = self.algorithm.memory
         return {"rnn": np.zeros((n, size), np.float32)} if size else {}
 
     @torch.inference_mode()
@@ -76,19 +76,19 @@ class AgentPolicy(Memoryless):
         if not deterministic:
             rng = rng or np.random.default_rng()
             generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-            noise = self._algorithm.noise([generator], 1, len(obs))[0]
+            noise = self.algorithm.noise([generator], 1, len(obs))[0]
         allowed = None if mask is None else torch.from_numpy(mask)[None]
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
         before = torch.from_numpy(memory["rnn"])[None] if memory else None
-        action, _, after = self._algorithm.act(self._actor, rows, allowed, noise, before)
+        action, _, after = self.algorithm.act(self._actor, rows, allowed, noise, before)
         memory = {} if after is None else {"rnn": after[0].numpy()}
-        return self._algorithm.to_env(action[0].numpy()), memory
+        return self.algorithm.to_env(action[0].numpy()), memory
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and the JSON that ``from_file`` needs."""
         return self.weights, {
             "kind": "agent",
-            "algorithm": config_to_json(self._algorithm.config),
+            "algorithm": config_to_json(self.algorithm.config),
             "observation_space": space_to_json(self.observation_space),
             "action_space": space_to_json(self.action_space),
         }

@@ -138,7 +138,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
         if due:
             policy = self.layout.leaves(state.params)
             policy_loss = self.policy_loss(policy, state, inputs)
-            self.step_(state, policy_loss, policy, rate)
+            self.step_(state, policy_loss, policy, rate * self.config.actor_rate)
             state.target.lerp_(state.params, state.tau[:, None])
             state.critic_target.lerp_(state.critic, state.tau[:, None, None])
             state.policy_loss = policy_loss.detach()

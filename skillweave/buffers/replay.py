@@ -134,7 +134,10 @@ class ReplayBuffer:
         ``gamma`` (P,) are their discounts.
         """
         assert self._count, "sample() before add()"
-        index, weight = self._draw(batch, rngs, beta, first)
+        return self.at(*self._draw(batch, rngs, beta, first), gamma)
+
+    def at(self, index: Array, weight: Array | None, gamma: Tensor) -> Sample:
+        """The transitions (P, B) that a sample, perhaps of another buffer, calls ``index``."""
         data, n = self._data, self._num_envs
         start = slot = index % self._slots
         factor = gamma.float().numpy()[:, None]

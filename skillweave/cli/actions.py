@@ -13,6 +13,7 @@ from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.hierarchy.settings import apply_settings, list_settings
 from skillweave.reporting.plots import plot_run
+from skillweave.runs.agilerl import convert
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.types import SkillweaveError
@@ -37,6 +38,8 @@ def run(command: commands.Command) -> int:
             _info(command)
         case commands.Weights():
             _weights(command)
+        case commands.ImportAgilerl():
+            _import_agilerl(command)
     return 0
 
 
@@ -155,6 +158,19 @@ def _weights(command: commands.Weights) -> None:
     trained = _hierarchy_of_run(command.run, command.recipe).load(command.run)
     path = trained.save_weights(command.out)
     _tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
+
+
+def _import_agilerl(command: commands.ImportAgilerl) -> None:
+    if not command.trust:
+        raise SkillweaveError(
+            f"{command.file} would be read as a pickle, and pickles can run code. This one is read "
+            "by an unpickler that admits only tensors, numbers and plain containers; if you trust "
+            "where it comes from nevertheless, say so: --trust"
+        )
+    out = command.out or command.file.with_suffix(".safetensors")
+    algo = convert(command.file, out)
+    text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"
+    _tell(command, {"path": str(out), "algorithm": algo}, text)
 
 
 def _target(command: commands.Watched) -> Run:

@@ -5,6 +5,7 @@ Nothing here imports torch or gymnasium, so that help and argument errors are in
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -132,5 +133,22 @@ class Weights(Output):
     """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
-COMMANDS = (Train, Resume, Evaluate, Render, Plot, List, Info, Weights)
-Command = Train | Resume | Evaluate | Render | Plot | List | Info | Weights
+@dataclass(frozen=True)
+class ImportAgilerl(Output):
+    """Convert a checkpoint of AgileRL 0.1 or 1.0, which is a pickle."""
+
+    file: Positional[Path] = tyro.MISSING
+    """The checkpoint."""
+    trust: bool = False
+    """You trust where it comes from; needed, although it is read without running code from it."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """The file to write; default: FILE with the suffix .safetensors."""
+
+
+COMMANDS = (Train, Resume, Evaluate, Render, Plot, List, Info, Weights, ImportAgilerl)
+Command = Train | Resume | Evaluate | Render | Plot | List | Info | Weights | ImportAgilerl
+
+
+def name_of(command: type) -> str:
+    """What a command is called: import-agilerl for ImportAgilerl."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__).lower()

@@ -16,7 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     words = sys.argv[1:] if arguments is None else arguments
     given = ["--no-deterministic" if word == "--stochastic" else word for word in words]
-    parser: dict[str, Any] = {c.__name__.lower(): c for c in commands.COMMANDS}
+    parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         parser,
         prog="skillweave",

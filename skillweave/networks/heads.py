@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import torch
@@ -89,6 +90,21 @@ class ActionHead:
             z = ((action - mean) * (-log_std).exp()).detach()
             entropy = entropy + tanh_log_det(mean + log_std.exp() * z).sum(-1)
         return log_prob, entropy
+
+    def with_log_prob(self, action: Tensor, log_prob: Tensor, log_std: Tensor | None) -> Tensor:
+        """A head of which single choices, or Box actions, have just these log-probabilities (...).
+
+        For who is told what was done and how likely it was, but not the whole distribution.
+        """
+        if self.discrete:
+            rest = torch.log1p(-log_prob.exp().clamp(max=1.0 - 1e-6))
+            rest = rest - math.log(max(1, self.codec.size - 1))
+            head = rest[..., None].expand(*rest.shape, self.codec.size)
+            return head.scatter(-1, action[..., None], log_prob[..., None])
+        assert log_std is not None
+        peak, _ = normal_stats(action, log_std.expand_as(action), action)
+        away = (2.0 * (peak - log_prob)).clamp(min=0.0) / self.codec.size
+        return action - away.sqrt()[..., None] * log_std.exp()
 
     def moments(self, head: Tensor, log_std: Tensor | None) -> tuple[Tensor, Tensor]:
         """Mean and log deviation of a Box's normal, each (..., A) or broadcast to it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -47,14 +48,12 @@ class WandB:
     def __init__(self, run: RunDirectory) -> None:
         import wandb
 
-        login = bool(os.environ.get("WANDB_API_KEY")) or _has_netrc()
-        mode: Any = os.environ.get("WANDB_MODE") or ("online" if login else "offline")
         self._run: Any = wandb.init(
             project="skillweave",
             name=run.path.name,
             dir=str(run.path),
             config=run.manifest,
-            mode=mode,
+            mode=wandb_mode(),
             settings=wandb.Settings(silent=True),
         )
 
@@ -94,6 +93,38 @@ def make_trackers(
     if run is None:
         return ()
     return tuple(TensorBoard(run) if name == "tensorboard" else WandB(run) for name in names)
+
+
+def import_wandb() -> Any:
+    """The module wandb, which stays offline without a login.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    try:
+        import wandb
+    except ImportError as error:
+        raise MissingExtra("tracking with wandb", "wandb") from error
+    stay_offline()
+    return wandb
+
+
+def stay_offline() -> None:
+    """Without a login let wandb stay offline instead of asking for one; said where it is used."""
+    if "WANDB_MODE" not in os.environ and wandb_mode() == "offline":
+        os.environ["WANDB_MODE"] = "offline"
+        _to_say.append("no login to Weights & Biases, so its runs stay offline")
+    if "wandb" in sys.modules and _to_say:
+        print(f"skillweave: {_to_say.pop()}", file=sys.stderr)
+
+
+_to_say: list[str] = []
+
+
+def wandb_mode() -> Any:
+    """What WANDB_MODE says; without it online where there is a login, else offline."""
+    login = bool(os.environ.get("WANDB_API_KEY")) or _has_netrc()
+    return os.environ.get("WANDB_MODE") or ("online" if login else "offline")
 
 
 def _has_netrc() -> bool:

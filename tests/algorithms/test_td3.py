@@ -143,3 +143,15 @@ def test_ddpg_is_td3_without_its_three_additions():
     assert (config.twin, config.policy_delay, config.target_noise) == (False, 1, 0.0)
     assert config.tau == 0.1
     assert make(twin=False)[1].critic.shape[1] == 1
+
+
+def test_the_actors_rate_is_a_share_of_the_critics():
+    moved = {}
+    for share in (1.0, 0.25):
+        algorithm, state = make(actor_rate=share, policy_delay=1)
+        before = state.params.clone(), state.critic.clone()
+        algorithm.update(state, sample(), 0.0, generators())
+        moved[share] = state.params - before[0], state.critic - before[1]
+    # Adam's first step is the rate times the gradient's sign
+    torch.testing.assert_close(moved[0.25][0], 0.25 * moved[1.0][0], rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(moved[0.25][1], moved[1.0][1])

@@ -16,7 +16,7 @@ import pytest
 from skillweave import recipes
 from skillweave.cli import main
 
-COMMANDS = ("train", "resume", "evaluate", "render", "list", "info", "weights")
+COMMANDS = ("train", "resume", "evaluate", "render", "list", "info", "weights", "import-agilerl")
 
 # The same hierarchy twice: as plain data, and with a reflex, which only code can say.
 PLAIN = '''

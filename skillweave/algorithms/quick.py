@@ -1,0 +1,93 @@
+"""Acting on a few observations: for one of them, torch's overhead is most of the time.
+
+MLPs are copied into NumPy; every other network acts in torch, by the same interface.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from skillweave.algorithms.base import Actor, Algorithm
+from skillweave.networks.net import Net
+from skillweave.networks.numpy_mlp import NumpyMLP
+from skillweave.types import Array
+
+Sampled = tuple[Array, Array, Array, Array]
+
+
+class Quick:
+    """What the first member of a state says now; made anew after learning. Not for memories."""
+
+    def __init__(self, algorithm: Algorithm, state: Any) -> None:
+        self.algorithm, self.state = algorithm, state
+        self._space: Any = algorithm.observation_space
+        self._one_hot = not np.issubdtype(self._space.dtype, np.floating)
+        family = algorithm.families()[0]
+        self._all = dict(family.nets)
+        self._views = family.layout.views(state.params[:1])
+        self._nets = {
+            field: NumpyMLP(self._views, net.name, net.network)
+            for field, net in family.nets
+            if isinstance(net, Net) and not net.encoders and NumpyMLP.fits(net.network)
+        }
+        if algorithm.normalize_obs or hasattr(self._space, "spaces"):
+            self._nets = {}
+
+    def rows(self, obs: Any) -> Array:
+        """One observation or a batch as (B, *shape) of the space's type."""
+        return np.asarray(obs, self._space.dtype).reshape(-1, *self._space.shape)
+
+    def output(self, rows: Array, field: str = "network") -> Array:
+        """What a network's head says, (B, out); ``field`` is the setting that shapes it."""
+        if field in self._nets:
+            return self._nets[field](self._vectors(rows) if self._one_hot else rows)
+        with torch.inference_mode():
+            actor = Actor({}, *self.algorithm.scaling(self.state))
+            inputs = self.algorithm.inputs(actor, torch.from_numpy(rows)[None])
+            found: Array = self._all[field](self._views, inputs)[0].numpy()
+        return found
+
+    def _vectors(self, rows: Array) -> Array:
+        vector, _ = self.algorithm.obs.split(torch.from_numpy(rows))
+        found: Array = vector.numpy()
+        return found
+
+
+class QuickPPO(Quick):
+    """PPO's actor and critic."""
+
+    def __init__(self, algorithm: Any, state: Any) -> None:
+        super().__init__(algorithm, state)
+        self._scale = np.float32((state.return_var[0, 0] + 1e-8).sqrt())
+        self._mean = np.float32(state.return_mean[0, 0])
+        self._log_std = self._views.get("actor.log_std")
+        self._choices = algorithm.head.discrete and not algorithm.codec.multi
+
+    def sample(self, rows: Array, rng: np.random.Generator) -> Sampled:
+        """Actions (B, …) in policy units, log-probabilities, entropies and values (B,) float32."""
+        head, value = self.output(rows), self.output(rows, "critic")[:, 0]
+        value = value * self._scale + self._mean
+        if not self._choices:
+            return *self._drawn(head, rng), value
+        shifted = head - head.max(-1, keepdims=True)
+        weight = np.exp(shifted)
+        running = weight.cumsum(-1)
+        total = running[:, -1:]
+        action = (running <= rng.random((len(rows), 1), np.float32) * total).sum(-1)
+        np.minimum(action, head.shape[-1] - 1, out=action)  # where rounding led past the last
+        log_p = shifted - np.log(total)
+        entropy = -(weight * log_p).sum(-1) / total[:, 0]
+        return action, log_p[np.arange(len(rows)), action], entropy, value
+
+    def _drawn(self, head: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+        """The same for all other actions, in torch."""
+        outputs, heads = torch.from_numpy(head), self.algorithm.head
+        log_std = None if self._log_std is None else self._log_std[0]
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        noise = heads.noise([generator], 1, len(head))[0, 0]
+        action = heads.act(outputs, log_std, noise)
+        log_prob, entropy = heads.stats(outputs, log_std, None, action)
+        return action.numpy(), log_prob.numpy(), entropy.expand(len(head)).numpy()

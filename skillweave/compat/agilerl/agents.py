@@ -1,0 +1,185 @@
+"""The agents: all that is said here is how AgileRL calls what the native API has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.algorithms import config
+from skillweave.compat.agilerl.agent import MLP, Agent, Setting, plain
+from skillweave.types import Array, SkillweaveError
+
+
+class PPO(Agent):
+    """A PPO agent."""
+
+    algo, kind = "PPO", config.PPO
+    lr, gae_lambda, clip_coef = map(Setting, ("learning_rate", "gae_lambda", "clip_coef"))
+    ent_coef, vf_coef, max_grad_norm = map(Setting, ("ent_coef", "vf_coef", "max_grad_norm"))
+    target_kl, update_epochs = Setting("target_kl"), Setting("update_epochs")
+
+    def __init__(
+        self, state_dim: Any, action_dim: int, one_hot: bool, discrete_actions: bool,
+        index: int = 0, net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4,
+        gamma: float = 0.99, gae_lambda: float = 0.95, mut: str | None = None,
+        action_std_init: float = 0.6, clip_coef: float = 0.2, ent_coef: float = 0.01,
+        vf_coef: float = 0.5, max_grad_norm: float = 0.5, target_kl: float | None = None,
+        update_epochs: int = 4, actor_network: Any = None, critic_network: Any = None,
+        device: Any = "cpu", accelerator: Any = None, wrap: bool = True,
+    ) -> None:  # fmt: skip
+        actions: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (action_dim,), np.float32)
+        actions = gym.spaces.Discrete(action_dim) if discrete_actions else actions
+        own = {"learning_rate": plain(lr), "learning_rate_schedule": "constant", "adam_eps": 1e-8}
+        self._start(locals(), actions, num_envs=1, n_steps=2**31, **own)
+
+    def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
+        """Sampled actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
+        if action is not None or grad:
+            raise SkillweaveError("getAction(action=, grad=) is a part of learning: use learn()")
+        return self.native.sample(state)
+
+    def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> float:
+        """Learn from T states, actions, log-probabilities, rewards, terminations and values.
+
+        Last come the observations (N, ...) after the last step. Returns the loss.
+        """
+        *steps, _, after = experiences
+        found = self.native.learn_steps(*steps, after)
+        value_part = self.vf_coef * found["value_loss"] - self.ent_coef * found["entropy"]
+        return float(found["policy_loss"] + value_part)
+
+    get_action = getAction
+
+
+class DQN(Agent):
+    """A DQN agent."""
+
+    algo, kind = "DQN", config.DQN
+    lr, double = Setting("learning_rate"), Setting("double")
+    tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
+
+    def __init__(
+        self, state_dim: Any, action_dim: int, one_hot: bool, index: int = 0,
+        net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4, learn_step: int = 5,
+        gamma: float = 0.99, tau: float = 1e-3, mut: str | None = None, double: bool = False,
+        actor_network: Any = None, device: Any = "cpu", accelerator: Any = None, wrap: bool = True,
+    ) -> None:  # fmt: skip
+        own = {"learning_rate": plain(lr), "update_ratio": 1.0 / learn_step, "loss": "mse"}
+        self._start(locals(), gym.spaces.Discrete(action_dim), **own)
+
+    def getAction(self, state: Any, epsilon: float = 0, action_mask: Any = None) -> Array:
+        """Actions (B,) int64: with probability ``epsilon`` any of those allowed, else the best."""
+        return self.native.act(state, explore=False, epsilon=epsilon, mask=action_mask)
+
+    def learn(self, experiences: Any) -> float:
+        """One gradient step; the loss."""
+        return self.native.learn_sample(self.gamma, *experiences[:5])[0]["loss"]
+
+    get_action = getAction
+
+
+class RainbowDQN(Agent):
+    """A DQN agent with every extension of Rainbow."""
+
+    algo, kind, beta, prior_eps = "Rainbow DQN", config.DQN, 0.4, 1e-6
+    lr, num_atoms, n_step = Setting("learning_rate"), Setting("n_atoms"), Setting("n_step")
+    tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
+    v_min, v_max = Setting("v_min"), Setting("v_max")
+
+    def __init__(
+        self, state_dim: Any, action_dim: int, one_hot: bool, index: int = 0,
+        net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4, learn_step: int = 5,
+        gamma: float = 0.99, tau: float = 1e-3, beta: float = 0.4, prior_eps: float = 1e-6,
+        num_atoms: int = 51, v_min: float = -10, v_max: float = 10, n_step: int = 3,
+        mut: str | None = None, actor_network: Any = None, device: Any = "cpu",
+        accelerator: Any = None, wrap: bool = True,
+    ) -> None:  # fmt: skip
+        own = {"learning_rate": plain(lr), "update_ratio": 1.0 / learn_step, "n_atoms": num_atoms}
+        own = {**vars(config.DQN.rainbow()), **own}
+        self._start(locals(), gym.spaces.Discrete(action_dim), **own)
+        self.beta, self.prior_eps = beta, prior_eps
+
+    def getAction(self, state: Any, action_mask: Any = None, training: bool = True) -> Array:
+        """The best actions (B,) int64; with noise in the weights while ``training``."""
+        return self.native.act(state, explore=training, mask=action_mask)
+
+    def learn(self, experiences: Any, n_step: bool = False, per: bool = False) -> Any:
+        """One gradient step; the loss, the samples' indices and their new priorities.
+
+        After the five of every sample come, with ``per``, weights and indices; with ``n_step``
+        the five again, summed over n steps: only these are learnt from then.
+        """
+        used, gamma = experiences[:5], self.gamma
+        if n_step:
+            used, gamma = experiences[-5:], gamma**self.n_step
+        weights = experiences[5] if per else None
+        metrics, errors = self.native.learn_sample(gamma, *used, weights)
+        if not per:
+            return metrics["loss"], None, None
+        return metrics["loss"], experiences[6], errors + self.prior_eps
+
+    get_action = getAction
+
+
+class TD3(Agent):
+    """A TD3 agent."""
+
+    algo, kind, twin = "TD3", config.TD3, True
+    lr_critic, policy_freq = Setting("learning_rate"), Setting("policy_delay")
+    tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
+
+    def __init__(
+        self, state_dim: Any, action_dim: int, one_hot: bool, max_action: float = 1,
+        min_action: float = -1, expl_noise: float = 0.1, index: int = 0, net_config: Any = MLP,
+        batch_size: int = 64, lr_actor: float = 1e-4, lr_critic: float = 1e-3, learn_step: int = 5,
+        gamma: float = 0.99, tau: float = 0.005, mut: str | None = None, policy_freq: int = 2,
+        actor_network: Any = None, critic_networks: Any = None, device: Any = "cpu",
+        accelerator: Any = None, wrap: bool = True,
+    ) -> None:  # fmt: skip
+        own = {"learning_rate": lr_critic, "actor_rate": lr_actor / lr_critic, "twin": self.twin}
+        own |= {"update_ratio": 1.0 / learn_step, "policy_delay": policy_freq}
+        own |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
+        actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
+        self._start(locals(), actions, **own)
+
+    def _lr_actor(self) -> float:
+        return float(self.lr_critic * self.native.member.config.actor_rate)  # type: ignore[union-attr]
+
+    def _set_lr_actor(self, value: float) -> None:
+        self.native.set(actor_rate=float(value / self.lr_critic))
+
+    lr_actor = property(_lr_actor, _set_lr_actor, doc="The actor's learning rate.")
+
+    def getAction(self, state: Any, epsilon: float = 0) -> Array:
+        """Actions (B, A) float32: with probability ``epsilon`` any, else the actor's with noise."""
+        return self.native.act(state, epsilon=epsilon)
+
+    def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> Any:
+        """One gradient step; the actor's loss, None where it is not its turn, and the critics'."""
+        state = self.native.member.state
+        state.target_noise.fill_(policy_noise)
+        state.target_noise_clip.fill_(noise_clip)
+        metrics, _ = self.native.learn_sample(self.gamma, *experiences[:5])
+        due = int(state.critic_count[0]) % self.policy_freq == 0
+        return metrics["policy_loss"] if due else None, metrics["critic_loss"]
+
+    get_action = getAction
+
+
+class DDPG(TD3):
+    """A DDPG agent: one critic."""
+
+    algo, twin = "DDPG", False
+
+    def __init__(
+        self, state_dim: Any, action_dim: int, one_hot: bool, max_action: float = 1,
+        min_action: float = -1, expl_noise: float = 0.1, index: int = 0, net_config: Any = MLP,
+        batch_size: int = 64, lr_actor: float = 1e-4, lr_critic: float = 1e-3, learn_step: int = 5,
+        gamma: float = 0.99, tau: float = 0.001, mut: str | None = None, policy_freq: int = 2,
+        actor_network: Any = None, critic_network: Any = None, device: Any = "cpu",
+        accelerator: Any = None, wrap: bool = True,
+    ) -> None:  # fmt: skip
+        given = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__(**{k.replace("c_network", "c_networks"): v for k, v in given.items()})

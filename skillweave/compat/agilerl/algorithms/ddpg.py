@@ -1,0 +1,3 @@
+"""AgileRL's DDPG."""
+
+from skillweave.compat.agilerl.agents import DDPG as DDPG

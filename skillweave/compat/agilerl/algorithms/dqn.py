@@ -1,0 +1,3 @@
+"""AgileRL's DQN."""
+
+from skillweave.compat.agilerl.agents import DQN as DQN

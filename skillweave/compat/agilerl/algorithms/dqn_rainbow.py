@@ -1,0 +1,3 @@
+"""AgileRL's RainbowDQN."""
+
+from skillweave.compat.agilerl.agents import RainbowDQN as RainbowDQN

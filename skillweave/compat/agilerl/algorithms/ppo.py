@@ -1,0 +1,3 @@
+"""AgileRL's PPO."""
+
+from skillweave.compat.agilerl.agents import PPO as PPO

@@ -1,0 +1,1 @@
+"""AgileRL's ``components``."""

@@ -1,0 +1,55 @@
+"""AgileRL's environments and populations."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from skillweave.compat.agilerl.agents import DDPG, DQN, PPO, TD3, RainbowDQN
+from skillweave.envs.make import EnvSpec
+from skillweave.types import SkillweaveError
+
+_KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDPG, TD3)}
+
+
+def makeVectEnvs(env_name: str, num_envs: int = 1) -> SyncVectorEnv:
+    """Environments side by side, in this process; each starts anew in the step that ends it."""
+    return _vector(EnvSpec(env_name), num_envs)
+
+
+def makeSkillVectEnvs(env_name: str, skill: Any, num_envs: int = 1) -> SyncVectorEnv:
+    """``makeVectEnvs`` with a ``Skill`` around each environment."""
+    return _vector(EnvSpec(env_name, wrappers=(skill,)), num_envs)
+
+
+def _vector(spec: EnvSpec, num_envs: int) -> SyncVectorEnv:
+    # As Gymnasium did when these scripts were written: no step is lost to a reset.
+    return SyncVectorEnv([spec.make] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def initialPopulation(
+    algo: str, state_dim: Any, action_dim: int, one_hot: bool, net_config: dict[str, Any],
+    INIT_HP: dict[str, Any], actor_network: Any = None, critic_network: Any = None,
+    population_size: int = 1, device: Any = "cpu", accelerator: Any = None,
+) -> list[Any]:  # fmt: skip
+    """Fresh agents of one kind; settings by their names in capitals from ``INIT_HP``.
+
+    Raises:
+        SkillweaveError: no such algorithm, or a setting without a default is missing.
+    """
+    given = locals() | {"critic_networks": critic_network}
+    if algo not in _KINDS:
+        raise SkillweaveError(f"no algorithm {algo!r} here; there are: {', '.join(_KINDS)}")
+    known = inspect.signature(_KINDS[algo]).parameters
+    settings = {k: INIT_HP[k.upper()] for k in known if k.upper() in INIT_HP}
+    settings |= {k: v for k, v in given.items() if k in known}
+    missing = [k.upper() for k, p in known.items() if p.default is p.empty and k not in settings]
+    if missing:
+        raise SkillweaveError(f"INIT_HP has no {', '.join(missing)}, which {algo} needs")
+    return [_KINDS[algo](**settings | {"index": i}) for i in range(population_size)]
+
+
+make_vect_envs, make_skill_vect_envs = makeVectEnvs, makeSkillVectEnvs
+create_population = initialPopulation

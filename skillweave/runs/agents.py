@@ -1,0 +1,37 @@
+"""One agent as a file: a policy, and beside it all that learning needs to go on."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.seeding import Seeds
+
+
+def save_agent(path: str | Path, algorithm: Algorithm, state: Any, about: dict[str, Any]) -> None:
+    """Write the one member of a state; ``about`` is plain JSON."""
+    tensors, header = AgentPolicy.of(algorithm, state).to_file()
+    tensors = tensors | {f"state.{k}": v for k, v in vars(state).items()}
+    write_tensors(Path(path), tensors, header | {"about": about})
+
+
+def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str, Any]]:
+    """The algorithm, its state and what was said about it.
+
+    Of a policy's file that holds nothing else it has the weights, and learns anew.
+
+    Raises:
+        SkillweaveError: the file is missing, damaged, or holds no agent.
+    """
+    tensors, header = read_tensors(Path(path))
+    algorithm = AgentPolicy.from_file(tensors, header, str(path)).algorithm
+    state = algorithm.init([seeds])
+    algorithm.set_weights(state, tensors)
+    for f in fields(state):
+        if f"state.{f.name}" in tensors:
+            setattr(state, f.name, tensors[f"state.{f.name}"])
+    return algorithm, state, header.get("about", {})

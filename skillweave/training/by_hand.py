@@ -1,0 +1,83 @@
+"""What a loop of one's own has recorded, as what algorithms learn from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
+from skillweave.types import Sample, Transition
+
+
+def rollout_of(
+    algorithm: PPOAlgorithm,
+    state: State,
+    obs: Any,
+    action: Any,
+    log_prob: Any,
+    reward: Any,
+    terminated: Any,
+    next_obs: Any,
+) -> Rollout:
+    """T steps of N environments as a rollout; each argument has T entries, of N or of none.
+
+    What followed a step is the next one's ``obs``; ``next_obs`` is what followed the last. The
+    actions, in policy units, count as drawn with just these log-probabilities.
+    """
+    rewards = _tensor(reward, np.float32)
+    lead = 1, len(rewards), max(1, rewards[0].numel())
+    before = _rows(algorithm, obs).unflatten(0, lead)
+    after = _rows(algorithm, next_obs)[None, None]
+    ended = _tensor(terminated, bool).view(lead)
+    last = ended.clone()
+    last[:, -1] = True
+    kind = np.int64 if algorithm.codec.discrete else np.float32
+    actions = _tensor(action, kind).view(*lead, *(algorithm.action_space.shape or ()))
+    discount = state.gamma[:, None, None] * ~ended
+    following = torch.cat([before[:, 1:], after], 1)
+    transition = Transition(before, actions, rewards.view(lead), discount, following, last)
+    log_std = algorithm.layout.views(state.params).get("actor.log_std")
+    log_std = None if log_std is None else log_std[:, None].clone()
+    log_probs = _tensor(log_prob, np.float32).view(lead)
+    return Rollout(transition, algorithm.head.with_log_prob(actions, log_probs, log_std), log_std)
+
+
+def sample_of(
+    algorithm: Algorithm,
+    gamma: float,
+    obs: Any,
+    action: Any,
+    reward: Any,
+    next_obs: Any,
+    terminated: Any,
+    weight: Any = None,
+) -> Sample:
+    """B transitions as a sample; actions in the environment's units, γ as of all their steps."""
+    rewards = _tensor(reward, np.float32).view(1, -1)
+    size, shape = rewards.shape[1], algorithm.action_space.shape or ()
+    units = algorithm.codec.from_env(np.asarray(action).reshape(size, *shape))
+    return Sample(
+        _rows(algorithm, obs)[None],
+        torch.from_numpy(units)[None],
+        rewards,
+        gamma * (1.0 - _tensor(terminated, np.float32).view(1, -1)),
+        _rows(algorithm, next_obs)[None],
+        None,
+        None,
+        None if weight is None else _tensor(weight, np.float32).view(1, -1),
+        np.arange(size)[None],
+    )
+
+
+def _rows(algorithm: Algorithm, obs: Any) -> Tensor:
+    """Observations, however nested, as (n, *shape) of the space's type."""
+    space = algorithm.observation_space
+    return _tensor(obs, space.dtype).view(-1, *(space.shape or ()))
+
+
+def _tensor(values: Any, kind: Any) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(np.asarray(values), kind))

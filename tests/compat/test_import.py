@@ -1,0 +1,215 @@
+"""AgileRL's pickles: refused by ``load``, converted by ``import-agilerl``, never run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from skillweave.cli import main
+from skillweave.compat.agilerl.algorithms.dqn import DQN
+from skillweave.compat.agilerl.algorithms.ppo import PPO
+from skillweave.compat.agilerl.algorithms.td3 import TD3
+from skillweave.runs.pickles import read_torch_pickle
+from skillweave.types import SkillweaveError
+
+OBS = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
+
+
+def network(outputs: int, norm: bool, activation: type[nn.Module], inputs: int = 8) -> nn.Module:
+    """An MLP whose weights have the names that AgileRL gives them."""
+    layers: OrderedDict[str, nn.Module] = OrderedDict()
+    for i, (n_in, n_out) in enumerate([(inputs, 16), (16, 12)]):
+        layers[f"linear_layer_{i}"] = nn.Linear(n_in, n_out)
+        if norm:
+            layers[f"layer_norm_{i}"] = nn.LayerNorm(n_out)
+        layers[f"activation_{i}"] = activation()
+    layers["linear_layer_output"] = nn.Linear(12, outputs)
+    whole = nn.Module()
+    whole.feature_net = nn.Sequential(layers)
+    return whole
+
+
+def init_dict(outputs: int, norm: bool, activation: str, output: str | None, inputs: int = 8):
+    return {
+        "num_inputs": inputs, "num_outputs": outputs, "hidden_size": [16, 12],
+        "mlp_activation": activation, "mlp_output_activation": output, "layer_norm": norm,
+        "device": torch.device("cpu"), "accelerator": None, "support": None,
+    }  # fmt: skip
+
+
+def common(algo: str) -> dict[str, object]:
+    return {
+        "algo": algo, "gamma": 0.97, "batch_size": 32, "one_hot": False, "index": 2, "mut": None,
+        "scores": [np.float64(1.5)], "fitness": [np.float32(2.0)], "steps": [0, np.int64(9)],
+        "state_dim": (8,), "device": torch.device("cpu"), "some_array": np.arange(3.0),
+    }  # fmt: skip
+
+
+def ppo_file(path: Path, norm: bool = True, **changes: object) -> tuple[nn.Module, nn.Module]:
+    torch.manual_seed(0)
+    actor, critic = network(4, norm, nn.Tanh), network(1, norm, nn.Tanh)
+    data = common("PPO") | {
+        "actor_init_dict": init_dict(4, norm, "Tanh", "Softmax"), "lr": 3e-4, "clip_coef": 0.1,
+        "critic_init_dict": init_dict(1, norm, "Tanh", None),
+        "actor_state_dict": actor.state_dict(), "critic_state_dict": critic.state_dict(),
+        "optimizer_state_dict": torch.optim.Adam(actor.parameters()).state_dict(),
+    }  # fmt: skip
+    torch.save(data | changes, path)
+    return actor, critic
+
+
+def command(*words: object) -> int:
+    return main(["import-agilerl", *map(str, words)])
+
+
+@pytest.mark.parametrize("norm", [False, True])
+def test_a_ppo_checkpoint_becomes_an_agent_that_computes_the_same(tmp_path, norm, capsys):
+    actor, critic = ppo_file(tmp_path / "old.pt", norm)
+    assert command(tmp_path / "old.pt", "--trust", "-o", tmp_path / "new.pt") == 0
+    assert "PPO agent" in capsys.readouterr().out
+    agent = PPO.load(tmp_path / "new.pt")
+    quick, obs = agent.native.quick, torch.from_numpy(OBS)
+    want = actor.feature_net(obs).log_softmax(-1).detach()
+    found = torch.from_numpy(quick.output(OBS)).log_softmax(-1)
+    np.testing.assert_allclose(found, want, atol=1e-5)
+    want = critic.feature_net(obs)[:, 0].detach()
+    np.testing.assert_allclose(agent.getAction(OBS)[3], want, atol=1e-5)
+    assert (agent.lr, agent.gamma, agent.clip_coef, agent.batch_size) == (3e-4, 0.97, 0.1, 32)
+    assert (agent.scores, agent.steps, agent.index) == ([1.5], [0, 9], 2)
+
+
+def test_a_dqn_checkpoint_with_a_pickled_loss(tmp_path):
+    actor = network(4, True, nn.ReLU)
+    torch.save(
+        common("DQN") | {
+            "actor_init_dict": init_dict(4, True, "ReLU", None), "lr": 1e-3, "learn_step": 5,
+            "actor_state_dict": actor.state_dict(), "criterion": nn.MSELoss(), "tau": 0.01,
+        },
+        tmp_path / "old.pt",
+    )  # fmt: skip
+    assert command(tmp_path / "old.pt", "--trust") == 0
+    agent = DQN.load(tmp_path / "old.safetensors")
+    want = actor.feature_net(torch.from_numpy(OBS)).detach()
+    np.testing.assert_allclose(agent.native.quick.output(OBS)[..., 0], want, atol=1e-5)
+    assert (agent.learn_step, agent.tau) == (5, 0.01)
+
+
+def test_a_td3_checkpoint_has_its_critics(tmp_path):
+    actor = network(2, True, nn.ReLU)
+    critics = [network(1, True, nn.ReLU, inputs=10) for _ in range(2)]
+    data = common("TD3") | {
+        "actor_init_dict": init_dict(2, True, "ReLU", "Tanh"), "lr_actor": 1e-4, "lr_critic": 1e-3,
+        "min_action": -2, "max_action": np.array([2.0, 2.0]), "policy_freq": 3, "learn_step": 2,
+        "actor_state_dict": actor.state_dict(),
+    }  # fmt: skip
+    for i, critic in enumerate(critics, 1):
+        data |= {
+            f"critic_{i}_init_dict": init_dict(1, True, "ReLU", None, inputs=10),
+            f"critic_{i}_state_dict": critic.state_dict(),
+        }
+    torch.save(data, tmp_path / "old.pt")
+    assert command(tmp_path / "old.pt", "--trust") == 0
+    agent = TD3.load(tmp_path / "old.safetensors")
+    obs = torch.from_numpy(OBS)
+    want = actor.feature_net(obs).detach()
+    np.testing.assert_allclose(agent.native.quick.output(OBS), want, atol=1e-5)
+    assert (agent.lr_actor, agent.policy_freq) == (pytest.approx(1e-4), 3)
+    learner, state = agent.native.learner, agent.native.member.state
+    action = torch.rand(5, 2)
+    found = learner.critics(
+        learner.critics.views(state.critic), {"vector": obs[None]}, action[None]
+    )
+    for i, critic in enumerate(critics):
+        want = critic.feature_net(torch.cat([obs, action], 1))
+        torch.testing.assert_close(found[0, i], want)
+
+
+def test_load_refuses_a_pickle_and_says_what_to_do(tmp_path):
+    ppo_file(tmp_path / "old.pt")
+    with pytest.raises(SkillweaveError, match=r"import-agilerl .*old\.pt --trust"):
+        PPO.load(tmp_path / "old.pt")
+
+
+def test_without_trust_nothing_is_read(tmp_path, capsys):
+    ppo_file(tmp_path / "old.pt")
+    assert command(tmp_path / "old.pt") == 1
+    assert "--trust" in capsys.readouterr().err
+    assert not (tmp_path / "old.safetensors").exists()
+
+
+class Bomb:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+class Eval:
+    def __reduce__(self):
+        return eval, ("1",)
+
+
+@pytest.mark.parametrize("what", ["bomb", "eval", "object array", "own class"])
+def test_a_pickle_that_names_anything_else_is_refused_and_does_nothing(tmp_path, capsys, what):
+    value = {
+        "bomb": Bomb(tmp_path / "boom"), "eval": Eval(), "own class": nn.Linear(2, 2),
+        "object array": np.array([{}], dtype=object),
+    }[what]  # fmt: skip
+    ppo_file(tmp_path / "old.pt", extra=value)
+    assert command(tmp_path / "old.pt", "--trust") == 1
+    assert "refused" in capsys.readouterr().err
+    assert not (tmp_path / "boom").exists()
+    assert not (tmp_path / "old.safetensors").exists()
+
+
+def test_arrays_and_numbers_come_as_they_were(tmp_path):
+    value = {
+        "f": np.arange(6.0).reshape(2, 3), "t": np.asfortranarray(np.eye(3)), "n": np.int32(4),
+        "big": np.arange(3, dtype=">i4"), "set": {1, 2}, "view": torch.arange(9.0).view(3, 3).T[1:],
+        "empty": torch.zeros(0), "bool": np.bool_(True), "text": "é",
+    }  # fmt: skip
+    torch.save(value, tmp_path / "x.pt")
+    found = read_torch_pickle(tmp_path / "x.pt")
+    assert list(found) == list(value)
+    for key, want in value.items():
+        np.testing.assert_array_equal(np.asarray(found[key]), np.asarray(want), err_msg=key)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"algo": "MADDPG"}, "MADDPG"),
+        ({"actor_init_dict": {"channel_size": [3]}}, "CNN"),
+        ({"actor_init_dict": init_dict(4, True, "Tanh", "GumbelSoftmax")}, "GumbelSoftmax"),
+        ({"actor_init_dict": init_dict(4, True, "PReLU", "Softmax")}, "PReLU"),
+        ({"actor_init_dict": init_dict(5, True, "Tanh", "Softmax")}, "shape"),
+        ({"actor_state_dict": {}}, "no weights for"),
+        ({"actor_state_dict": {"other.weight": torch.ones(1)}}, "unknown weights other.weight"),
+    ],
+)
+def test_what_cannot_be_converted_is_said(tmp_path, capsys, change, says):
+    ppo_file(tmp_path / "old.pt", **change)
+    assert command(tmp_path / "old.pt", "--trust") == 1
+    assert says in capsys.readouterr().err
+
+
+def test_missing_damaged_and_foreign_files(tmp_path, capsys):
+    (tmp_path / "text.pt").write_text("hello")
+    (tmp_path / "plain.pt").write_bytes(pickle.dumps({"a": 1}))
+    ppo_file(tmp_path / "half.pt")
+    data = (tmp_path / "half.pt").read_bytes()
+    (tmp_path / "half.pt").write_bytes(data[: len(data) // 2])
+    for name, says in {
+        "nothing.pt": "does not exist", "text.pt": "no checkpoint", "plain.pt": "no checkpoint",
+        "half.pt": "no checkpoint",
+    }.items():  # fmt: skip
+        assert command(tmp_path / name, "--trust") == 1
+        assert says in capsys.readouterr().err
