@@ -115,7 +115,9 @@ FIGURES = {
             update_ratio=0.5,
             exploration_noise=0.2,
             network=small(64, 64),
-            # Without layer norm in the critics it hovers until the time limit.
+            # Without layer norm in the critics it hovers until the time limit; and with an actor
+            # as fast as they are it does so with some seeds: 276, 273, 5, 183, 210.
+            actor_rate=0.3,
             critic=Network((128, 128), "relu", layer_norm=True),
         ),
         300_000,
