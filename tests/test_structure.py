@@ -49,7 +49,12 @@ LEAVES: dict[str, set[str]] = {
     "networks.config": {"types"},
     "algorithms.config": {"types", "networks.config", "algorithms.config_off_policy"},
     "algorithms.config_off_policy": {"types", "networks.config"},
-    "evolution.config": {"types", "networks.config", "algorithms.config"},
+    "evolution.config": {
+        "types",
+        "networks.config",
+        "algorithms.config",
+        "algorithms.config_off_policy",
+    },
 }
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from skillweave.algorithms.base import Family
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution.config import Mutations
-from skillweave.evolution.stacks import Member
+from skillweave.evolution.stacks import Member, copy, networks_of
 from skillweave.networks import growth
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
@@ -31,7 +31,6 @@ Alter = Callable[[Views, bool], dict[str, Tensor]]
 """Parameters by name, and whether they are moments, to those of the changed network."""
 Plan = Callable[[Views], Alter]
 """What learns, by name, to what is done to it and to all that goes with it."""
-NETWORKS = ("network", "critic")
 
 
 @dataclass(frozen=True)
@@ -45,17 +44,16 @@ class Change:
 
 def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str) -> None:
     """Raise a SkillweaveError where networks cannot be changed as asked for."""
-    for name in NETWORKS:
-        network = getattr(config, name, None)
-        if not isinstance(network, Network):
-            continue
-        if mutations.architecture > 0.0 and network.layer_norm:
+    if mutations.architecture == 0.0:
+        return
+    for name, network in networks_of(config).items():
+        if network.layer_norm:
             raise SkillweaveError(
                 f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has "
                 "layer_norm, with which no unit can be added without changing the function: set "
                 "it to 0, or layer_norm=False"
             )
-        if mutations.architecture > 0.0 and not network.hidden:
+        if not network.hidden:
             raise SkillweaveError(
                 f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has no "
                 "hidden layers to change: set it to 0, or give it some"
@@ -120,8 +118,8 @@ def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
     if behind < 1 or len(network.hidden) >= mutations.layers[1]:
         return False
     widest = network.hidden[behind - 1] * (1 + (network.activation in growth.PAIRED))
-    both = [n for k in NETWORKS if isinstance(n := getattr(config, k, None), Network)]
-    return widest <= mutations.units[1] and all(n.activation in growth.IDENTITY for n in both)
+    able = all(n.activation in growth.IDENTITY for n in networks_of(config).values())
+    return able and widest <= mutations.units[1]
 
 
 def _cnn(member: Member, spaces: Any) -> CNN | None:
@@ -157,15 +155,14 @@ def rebuilt(member: Member, change: Change, spaces: Any, rng: np.random.Generato
     """The member after a change: settings, weights and moments."""
     old = member.algorithm(spaces)
     cnn, dueling = _cnn(member, spaces), bool(getattr(old.config, "dueling", False))
-    networks = {
+    networks: dict[str, Any] = {
         name: changed(network, change, cnn, dueling)
-        for name in NETWORKS
-        if isinstance(network := getattr(old.config, name, None), Network)
+        for name, network in networks_of(old.config).items()
     }
     config = replace(old.config, **networks)
     new = make_algorithm(config, *spaces)
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    state = {f.name: getattr(member.state, f.name).clone() for f in fields(member.state)}
+    state = vars(copy(member).state)
     for before, after in zip(old.families(), new.families(), strict=True):
         state |= _carried(before, after, state, change, generator)
     return replace(member, config=config, state=new.state_type(**state))

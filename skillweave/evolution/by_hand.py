@@ -10,8 +10,8 @@ import torch
 
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.quick import Quick, QuickPPO, Sampled
-from skillweave.evolution.mutation import copy, with_settings
-from skillweave.evolution.stacks import Member
+from skillweave.evolution.mutation import with_settings
+from skillweave.evolution.stacks import Member, copy
 from skillweave.runs.agents import load_agent, save_agent
 from skillweave.seeding import Seeds
 from skillweave.training.by_hand import rollout_of, sample_of

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
 
 from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.config_off_policy import check, number, one_of, whole
 from skillweave.networks.config import Activation
 from skillweave.types import SkillweaveError
 
@@ -118,22 +119,20 @@ class Mutations:
     """Nonlinearities to choose from."""
 
     def __post_init__(self) -> None:
-        for name in (*KINDS, "share", "step", "layer_share"):
-            value = getattr(self, name)
-            _check(self, name, 0.0 <= value <= 1.0, "between 0 and 1")
+        number(self, *KINDS, "share", "step", "layer_share", high=1.0)
         total = sum(getattr(self, name) for name in KINDS)
         if abs(total - 1.0) > 1e-6:
             raise SkillweaveError(
                 f"Mutations: the probabilities {', '.join(KINDS)} sum to {total:g}; "
                 "they must sum to 1"
             )
-        _check(self, "strength", self.strength >= 0.0, "at least 0")
+        number(self, "strength")
         for name in ("layers", "units", "channels", "kernels"):
             low, high = getattr(self, name)
-            _check(self, name, 1 <= low <= high, "(fewest, most), at least 1")
+            check(self, name, 1 <= low <= high, "(fewest, most), at least 1")
         known = get_args(Activation)
         fits = bool(self.activations) and all(a in known for a in self.activations)
-        _check(self, "activations", fits, f"some of {', '.join(known)}")
+        check(self, "activations", fits, f"some of {', '.join(known)}")
 
     def ranges_of(self, config: AlgorithmConfig, *, start: bool = True) -> dict[str, Range]:
         """The ranges of an algorithm's settings.
@@ -175,7 +174,7 @@ class Tournament:
     """The best member goes on as it is."""
 
     def __post_init__(self) -> None:
-        _check(self, "size", type(self.size) is int and self.size >= 1, "at least 1")
+        whole(self, "size")
 
 
 @dataclass(frozen=True)
@@ -186,7 +185,7 @@ class Truncation:
     """Of the members, how many are replaced, and by how many."""
 
     def __post_init__(self) -> None:
-        _check(self, "share", 0.0 < self.share <= 0.5, "more than 0 and at most 0.5")
+        check(self, "share", 0.0 < self.share <= 0.5, "more than 0 and at most 0.5")
 
 
 @dataclass(frozen=True)
@@ -209,19 +208,17 @@ class Evolution:
     """What changes from parent to heir."""
 
     def __post_init__(self) -> None:
-        for name in ("population", "generations", "episodes"):
-            value = getattr(self, name)
-            _check(self, name, type(value) is int and value >= 1, "a whole number, at least 1")
-        _check(self, "start", self.start in ("config", "random"), "config or random")
+        whole(self, "population", "generations", "episodes")
+        one_of(self, "start", ("config", "random"))
         if isinstance(self.selection, Tournament) and self.selection.elitism:
-            _check(self, "population", self.population > 1, "at least 2 with Tournament.elitism")
+            check(self, "population", self.population > 1, "at least 2 with Tournament.elitism")
         if isinstance(self.selection, Tournament):
             fits = self.selection.size <= self.population
-            _check(self, "population", fits, f"at least Tournament.size ({self.selection.size})")
+            check(self, "population", fits, f"at least Tournament.size ({self.selection.size})")
         if not isinstance(self.selection, Tournament | Truncation):
             able = callable(getattr(self.selection, "select", None))
-            _check(self, "selection", able, "Tournament(), Truncation() or have select()")
-        _check(self, "mutations", isinstance(self.mutations, Mutations), "a Mutations()")
+            check(self, "selection", able, "Tournament(), Truncation() or have select()")
+        check(self, "mutations", isinstance(self.mutations, Mutations), "a Mutations()")
 
 
 def evolution_to_json(evolution: Evolution) -> dict[str, Any]:
@@ -257,9 +254,3 @@ def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = No
         return Evolution(**values)
     except (KeyError, TypeError) as error:
         raise SkillweaveError(f"{where}: its evolution is damaged, or newer: {error}") from error
-
-
-def _check(config: object, name: str, ok: bool, asked: str) -> None:
-    if not ok:
-        value = getattr(config, name)
-        raise SkillweaveError(f"{type(config).__name__}.{name} is {value!r}; it must be {asked}")

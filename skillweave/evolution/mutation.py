@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -10,9 +9,9 @@ import numpy as np
 import torch
 
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.evolution.architecture import draw_change, rebuilt
+from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
-from skillweave.evolution.stacks import Member, Origin
+from skillweave.evolution.stacks import Member, Origin, copy, networks_of
 from skillweave.networks.config import Network
 from skillweave.types import SkillweaveError
 
@@ -39,12 +38,6 @@ def mutate(
         changed, kind = copy(member), "none"
     changes = difference(member.config, changed.config)
     return replace(changed, origin=Origin(member.number, kind, changes))
-
-
-def copy(member: Member) -> Member:
-    """The same member with tensors of its own."""
-    state = {f.name: getattr(member.state, f.name).clone() for f in fields(member.state)}
-    return replace(member, state=type(member.state)(**state))
 
 
 def difference(old: AlgorithmConfig, new: AlgorithmConfig) -> dict[str, tuple[Any, Any]]:
@@ -81,10 +74,8 @@ def random_config(
             name: _valued(config, name, within.from_unit(rng.random()))
             for name, within in sorted(mutations.ranges_of(config, start=False).items())
         }
-        for name in ("network", "critic"):
-            network = getattr(config, name, None)
-            if isinstance(network, Network):
-                drawn[name] = _random_network(network, mutations, rng)
+        for name, network in networks_of(config).items():
+            drawn[name] = _random_network(network, mutations, rng)
         try:
             return replace(config, **drawn)
         except SkillweaveError:
@@ -107,20 +98,14 @@ def _random_network(network: Network, by: Mutations, rng: np.random.Generator) -
 
 def check_mutations(config: AlgorithmConfig, evolution: Evolution, where: str) -> None:
     """Raise a SkillweaveError where a mutation does not fit the algorithm or its network."""
-    from skillweave.evolution.architecture import check_architecture
-
     mutations = evolution.mutations
-    ranges = _named(where, mutations, config, evolution.start == "config")
+    try:
+        ranges = mutations.ranges_of(config, start=evolution.start == "config")
+    except SkillweaveError as error:
+        raise SkillweaveError(f"{where}{error}") from error
     if mutations.hyperparameters > 0.0 and not ranges:
         raise SkillweaveError(f"{where}Mutations.hyperparameters is positive, but ranges is empty")
     check_architecture(config, mutations, where)
-
-
-def _named(where: str, by: Mutations, config: AlgorithmConfig, start: bool) -> Mapping[str, Range]:
-    try:
-        return by.ranges_of(config, start=start)
-    except SkillweaveError as error:
-        raise SkillweaveError(f"{where}{error}") from error
 
 
 def _move_setting(member: Member, by: Mutations, rng: np.random.Generator) -> Member:
@@ -177,8 +162,7 @@ def _change_activation(member: Member, by: Mutations, rng: np.random.Generator) 
     chosen = others[int(rng.integers(len(others)))]
     networks: dict[str, Any] = {
         name: replace(network, activation=chosen)
-        for name in ("network", "critic")
-        if isinstance(network := getattr(member.config, name, None), Network)
+        for name, network in networks_of(member.config).items()
     }
     found = copy(member)
     found.config = replace(member.config, **networks)

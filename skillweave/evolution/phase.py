@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
+from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.evolution.config import Evolution, evolution_from_json
-from skillweave.evolution.lineage import Lineage, settings_of
+from skillweave.evolution.lineage import lineage_of, settings_of
 from skillweave.evolution.population import Population, score
 from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.directory import RunDirectory
@@ -107,8 +107,8 @@ class _Evolving:
         else:
             _, at, tensors = found
             self._restore(at, tensors)
-        self.lineage = Lineage(run, at.get("lineage_bytes", entry.get("lineage_bytes")))
-        entry.setdefault("lineage_bytes", self.lineage.size)
+        run.lineage.rewind(at.get("lineage_bytes", entry.get("lineage_bytes")))
+        entry.setdefault("lineage_bytes", run.lineage.size)
         self.record = Record(phase.name, run, listeners, at)
         self._started: float = time.perf_counter() - at["seconds"]
 
@@ -172,21 +172,21 @@ class _Evolving:
         """Write the generation down, and tell."""
         members = self.population.members
         best = self.best.number if self.best and self.best.generation == self.done else None
-        self.lineage.write(self.phase.name, self.done, members, fitness, self.evolution, best)
+        self.run.lineage.append(
+            lineage_of(self.phase.name, self.done, members, fitness, self.evolution, best)
+        )
         lost = [str(m.number) for m, f in zip(members, fitness, strict=True) if f == -np.inf]
         if lost:
             self._tell(
                 f"generation {self.done + 1}: member {', '.join(lost)} diverged; it is replaced"
             )
         winner = members[int(fitness.argmax())]
-        shown = ", ".join(f"{k} {_short(v)}" for k, v in self._settings(winner.config).items())
+        settings = settings_of(winner.config, self.evolution)
+        shown = ", ".join(f"{k} {_short(v)}" for k, v in settings.items())
         self._tell(
             f"generation {self.done + 1} of {self.evolution.generations}: best is member "
             f"{winner.number} with {fitness.max():.1f} ({shown})"
         )
-
-    def _settings(self, config: AlgorithmConfig) -> dict[str, Any]:
-        return settings_of(config, self.evolution)
 
     def _tell(self, text: str) -> None:
         for listener in self.listeners:
@@ -204,7 +204,7 @@ class _Evolving:
             "generation": self.done,
             "rounds": self.population.rounds,
             "next_number": self.population.next_number,
-            "lineage_bytes": self.lineage.size,
+            "lineage_bytes": self.run.lineage.size,
             "members": [_member_to_json(m) for m in self.population.members],
         }
         if self.best is not None:

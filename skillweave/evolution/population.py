@@ -17,9 +17,9 @@ from skillweave.algorithms.config import PPO, AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.buffers.replay import ReplayBuffer
 from skillweave.evolution.config import Evolution
-from skillweave.evolution.mutation import copy, mutate, random_config
+from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.selection import select
-from skillweave.evolution.stacks import Member, Origin, grouped, join, split
+from skillweave.evolution.stacks import Member, Origin, copy, grouped, join, split
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.members import Stack

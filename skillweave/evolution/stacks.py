@@ -46,6 +46,18 @@ class Member:
         return make_algorithm(self.config, *spaces)
 
 
+def networks_of(config: AlgorithmConfig) -> dict[str, Network]:
+    """The architectures that settings hold, by field."""
+    found = {name: getattr(config, name, None) for name in ("network", "critic")}
+    return {name: network for name, network in found.items() if isinstance(network, Network)}
+
+
+def copy(member: Member) -> Member:
+    """The same member with tensors of its own."""
+    state = {k: v.clone() for k, v in vars(member.state).items()}
+    return replace(member, state=type(member.state)(**state))
+
+
 def stack_key(config: AlgorithmConfig, settings: Sequence[str]) -> AlgorithmConfig:
     """What members must have in common to share a stack: all but ``settings`` and widths.
 
@@ -53,9 +65,8 @@ def stack_key(config: AlgorithmConfig, settings: Sequence[str]) -> AlgorithmConf
     """
     kind = type(config)
     changes: dict[str, Any] = {k: kind.__dataclass_fields__[k].default for k in settings}
-    for name in ("network", "critic"):
-        network = getattr(config, name, None)
-        if isinstance(network, Network) and not network.layer_norm:
+    for name, network in networks_of(config).items():
+        if not network.layer_norm:
             changes[name] = replace(network, hidden=(1,) * len(network.hidden))
     return replace(config, **changes)
 
@@ -82,11 +93,12 @@ def join(
     key = stack_key(first.config, first.algorithm(spaces).settings)
     widest: dict[str, Any] = {
         name: _widest([getattr(m.config, name) for m in members])
-        for name in ("network", "critic")
-        if isinstance(getattr(first.config, name, None), Network)
+        for name in networks_of(first.config)
     }
     config, made = replace(key, **widest), {} if made is None else made
-    algorithm = made.setdefault(config, make_algorithm(config, *spaces))
+    if config not in made:
+        made[config] = make_algorithm(config, *spaces)
+    algorithm = made[config]
     wide, padded = algorithm.layouts(), []
     for member in members:
         own = member.algorithm(spaces).layouts()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from skillweave.runs.lines import JsonLines
 from skillweave.types import SkillweaveError
 
 
@@ -60,19 +60,15 @@ def read_lineage(run: Path, phase: str) -> Lineage | None:
     Raises:
         SkillweaveError: the file is damaged.
     """
-    path = run / "lineage.jsonl"
-    if not path.exists():
-        return None
-    born: dict[tuple[int, int], Born] = {}
+    lines, born = JsonLines(run / "lineage.jsonl"), {}
     names = [f.name for f in fields(Born)]
-    for number, line in enumerate(path.read_text().splitlines(keepends=True), 1):
-        if not line.endswith("\n"):
-            continue  # half-written
+    for number, told in enumerate(lines.read(), 1):
         try:
-            told = json.loads(line)
             if told["phase"] == phase:
                 each = Born(**{k: told[k] for k in names})
                 born[each.generation, each.member] = each
-        except (ValueError, KeyError) as error:
-            raise SkillweaveError(f"{path} is damaged in line {number}: {error}") from error
+        except KeyError as error:
+            raise SkillweaveError(
+                f"{lines.path} is damaged in line {number}: no {error}"
+            ) from error
     return Lineage(born) if any(b.best for b in born.values()) else None

@@ -23,7 +23,7 @@ from skillweave.types import SkillweaveError
 
 _KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "DDPG": TD3, "TD3": TD3}
 _OUTPUTS = {"PPO": "Softmax", "DQN": None, "DDPG": "Tanh", "TD3": "Tanh"}
-_ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu", "GELU": "gelu"}
+ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu", "GELU": "gelu"}
 _LAYER = re.compile(r"(linear_layer|layer_norm)_(\d+|output)\.(weight|bias)$")
 
 
@@ -108,9 +108,9 @@ def _spaces(kind: type, data: Mapping[str, Any]) -> tuple[gym.Space[Any], gym.Sp
 
 def _network(init: Mapping[str, Any]) -> Network:
     name = init.get("mlp_activation") or init.get("activation")
-    if name not in _ACTIVATIONS:
-        raise ValueError(f"activation {name}; known are {', '.join(_ACTIVATIONS)}")
-    hidden, activation = tuple(int(n) for n in init["hidden_size"]), _ACTIVATIONS[name]
+    if name not in ACTIVATIONS:
+        raise ValueError(f"activation {name}; known are {', '.join(ACTIVATIONS)}")
+    hidden, activation = tuple(int(n) for n in init["hidden_size"]), ACTIVATIONS[name]
     return Network(hidden, activation, bool(init.get("layer_norm")))  # type: ignore[arg-type]
 
 

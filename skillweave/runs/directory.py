@@ -2,6 +2,7 @@
 
 run.json                     what is trained, with which settings, seeds and versions; phases
 metrics.jsonl                a line for every update
+lineage.jsonl                a line for every member of every generation, where populations evolve
 checkpoint.safetensors       the phase under way, at its latest clean cut (and the one before)
 policies/<phase>.safetensors finished phases
 policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights
@@ -9,12 +10,10 @@ policies/<skill>.*            copies of ready policies: .onnx; a torch module's 
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import fields
 from importlib import metadata
 from pathlib import Path
@@ -30,6 +29,7 @@ from skillweave.runs.files import (
     write_json,
     write_tensors,
 )
+from skillweave.runs.lines import JsonLines
 from skillweave.skills.foreign import Foreign, as_recorded
 from skillweave.types import Policy, SkillweaveError
 
@@ -41,7 +41,8 @@ class RunDirectory:
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
         self.path, self.manifest = path, manifest
-        self._metrics: Any = None
+        self._metrics = JsonLines(path / "metrics.jsonl")
+        self.lineage = JsonLines(path / "lineage.jsonl")
 
     @classmethod
     def create(cls, path: str | Path, manifest: dict[str, Any]) -> RunDirectory:
@@ -207,51 +208,24 @@ class RunDirectory:
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""
-        if self._metrics is None:
-            self._metrics = (self.path / "metrics.jsonl").open("a")
-        try:
-            self._metrics.write(json.dumps(record) + "\n")
-            self._metrics.flush()
-        except OSError as error:
-            raise SkillweaveError(
-                f"could not write {self.path / 'metrics.jsonl'}: {error.strerror}. The checkpoint "
-                f"is intact; free space, then: skillweave resume {self.path}"
-            ) from error
+        self._metrics.append([record])
 
     def rewind_metrics(self, size: int | None) -> None:
         """Drop what was written after ``size`` bytes: training is about to write it again."""
-        self.close()
-        if size is None:
-            return
-        path = self.path / "metrics.jsonl"
-        if path.exists() and path.stat().st_size > size:
-            os.truncate(path, size)
+        self._metrics.rewind(size)
 
     def metrics(self) -> Iterator[dict[str, Any]]:
         """The lines of ``metrics.jsonl``; a half-written last line is left out."""
-        path = self.path / "metrics.jsonl"
-        if not path.exists():
-            return
-        with path.open() as file:
-            for line in file:
-                if line.endswith("\n"):
-                    try:
-                        record = json.loads(line)
-                    except ValueError as error:
-                        raise SkillweaveError(f"{path} is damaged: {error}") from error
-                    yield record
+        return self._metrics.read()
 
     def close(self) -> None:
-        """Close the metrics file."""
-        if self._metrics is not None:
-            with suppress(OSError):
-                self._metrics.close()
-            self._metrics = None
+        """Close the files that lines are appended to."""
+        self._metrics.close()
+        self.lineage.close()
 
     def metrics_size(self) -> int:
         """Bytes in ``metrics.jsonl``."""
-        path = self.path / "metrics.jsonl"
-        return path.stat().st_size if path.exists() else 0
+        return self._metrics.size
 
 
 def versions() -> dict[str, str]:

@@ -14,10 +14,10 @@ import torch
 from skillweave.evolution.by_hand import ByHand
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import CNN, Network
+from skillweave.runs.agilerl import ACTIVATIONS
 from skillweave.types import SkillweaveError
 
 MLP: dict[str, Any] = {"arch": "mlp", "hidden_size": [64, 64]}
-_KNOWN = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu", "GELU": "gelu"}
 _PAST = ("scores", "fitness", "steps", "mut", "index", "beta", "prior_eps")
 
 
@@ -148,14 +148,18 @@ def _observations(given: dict[str, Any]) -> gym.Space[Any]:
 
 def _network(given: dict[str, Any], usual: str) -> Network:
     name = given.get("mlp_activation") or usual
-    if given.get("arch") not in ("mlp", "cnn") or "hidden_size" not in given or name not in _KNOWN:
+    if (
+        given.get("arch") not in ("mlp", "cnn")
+        or "hidden_size" not in given
+        or name not in ACTIVATIONS
+    ):
         raise SkillweaveError(
             f"net_config is {given}; it must have arch ('mlp' or 'cnn') and hidden_size, and "
-            f"mlp_activation, if any, be one of {', '.join(_KNOWN)}"
+            f"mlp_activation, if any, be one of {', '.join(ACTIVATIONS)}"
         )
     sizes = [tuple(given.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
     rest: Any = bool(given.get("layer_norm")), CNN("plain", *sizes) if sizes[0] else None
-    return Network(tuple(given["hidden_size"]), _KNOWN[name], *rest)  # type: ignore[arg-type]
+    return Network(tuple(given["hidden_size"]), ACTIVATIONS[name], *rest)  # type: ignore[arg-type]
 
 
 def plain(value: Any) -> Any:

@@ -1,0 +1,76 @@
+"""Files of JSON lines that a run appends to, and that a resumed run cuts back."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from skillweave.types import SkillweaveError
+
+
+class JsonLines:
+    """One such file; it is made when the first line comes."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file: Any = None
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self.path.stat().st_size if self.path.exists() else 0
+
+    def append(self, records: Iterable[Mapping[str, Any]]) -> None:
+        """Write a line for each record.
+
+        Raises:
+            SkillweaveError: the disk is full or cannot be written.
+        """
+        text = "".join(json.dumps(record) + "\n" for record in records)
+        if self._file is None:
+            self._file = self.path.open("a")
+        try:
+            self._file.write(text)
+            self._file.flush()
+        except OSError as error:
+            raise SkillweaveError(
+                f"could not write {self.path}: {error.strerror}. The checkpoint is intact; free "
+                f"space, then: skillweave resume {self.path.parent}"
+            ) from error
+
+    def rewind(self, size: int | None) -> None:
+        """Drop what was written after ``size`` bytes: training is about to write it again."""
+        self.close()
+        if size is not None and self.size > size:
+            os.truncate(self.path, size)
+
+    def read(self) -> Iterator[dict[str, Any]]:
+        """The records; a half-written last line is left out.
+
+        Raises:
+            SkillweaveError: a line is damaged.
+        """
+        if not self.path.exists():
+            return
+        with self.path.open() as file:
+            for number, line in enumerate(file, 1):
+                if not line.endswith("\n"):
+                    return
+                try:
+                    record = json.loads(line)
+                except ValueError as error:
+                    raise SkillweaveError(
+                        f"{self.path} is damaged in line {number}: {error}"
+                    ) from error
+                yield record
+
+    def close(self) -> None:
+        """Close the file; the next line opens it again."""
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            self._file = None
