@@ -10,8 +10,10 @@ import torch
 
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.quick import Quick, QuickPPO, Sampled
-from skillweave.evolution.mutation import with_settings
-from skillweave.evolution.stacks import Member, copy
+from skillweave.evolution.architecture import check_architecture
+from skillweave.evolution.config import Mutations
+from skillweave.evolution.mutation import mutate, with_settings
+from skillweave.evolution.stacks import Member, Origin, copy
 from skillweave.runs.agents import load_agent, save_agent
 from skillweave.seeding import Seeds
 from skillweave.training.by_hand import rollout_of, sample_of
@@ -47,6 +49,16 @@ class ByHand:
     def set(self, **settings: Any) -> None:
         """Change settings of the algorithm."""
         self.become(with_settings(self.member, **settings))
+
+    def mutate(self, by: Mutations, rng: np.random.Generator) -> Origin:
+        """Change in at most one way; which one.
+
+        Raises:
+            SkillweaveError: an architecture that ``by`` cannot change.
+        """
+        check_architecture(self.member.config, by, "Mutations: ")
+        self.become(mutate(self.member, by, self.spaces, rng))
+        return self.member.origin
 
     def sample(self, obs: Any) -> Sampled:
         """Of PPO, for one observation or B: actions, log-probabilities, entropies, values."""

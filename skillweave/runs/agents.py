@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
+from skillweave.types import SkillweaveError
 
 
 def save_agent(path: str | Path, algorithm: Algorithm, state: Any, about: dict[str, Any]) -> None:
@@ -25,8 +27,14 @@ def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str
     Of a policy's file that holds nothing else it has the weights, and learns anew.
 
     Raises:
-        SkillweaveError: the file is missing, damaged, or holds no agent.
+        SkillweaveError: the file is missing, damaged, a pickle, or holds no agent.
     """
+    if zipfile.is_zipfile(path):
+        raise SkillweaveError(
+            f"{path} is a pickle of torch.save's, and a pickle can run code. If it is a checkpoint "
+            "of AgileRL's and you trust where it comes from, convert it: skillweave "
+            f"import-agilerl {path} --trust"
+        )
     tensors, header = read_tensors(Path(path))
     algorithm = AgentPolicy.from_file(tensors, header, str(path)).algorithm
     state = algorithm.init([seeds])

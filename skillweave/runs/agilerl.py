@@ -14,7 +14,7 @@ from torch import Tensor
 
 from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.networks.config import Network
+from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
 from skillweave.runs.agents import save_agent
 from skillweave.runs.pickles import read_torch_pickle
@@ -53,6 +53,8 @@ def convert(path: Path, out: Path) -> str:
         )
     try:
         algorithm, state = _agent(algo, data)
+    except SkillweaveError as error:
+        raise SkillweaveError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise SkillweaveError(f"{path}: its networks are not as it describes: {error!r}") from error
     past = {k: [float(x) for x in data.get(k, ())] for k in ("scores", "fitness")}
@@ -69,7 +71,7 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     own = {f.name for f in fields(kind)}
     known = {k: v for k, v in data.items() if k in own and type(v) in (int, float, bool)}
     rate = data.get("lr", data.get("lr_critic", 1e-3))
-    config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": _network(actor)}
+    config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": network_of(actor)}
     if kind is PPO:
         config |= {"learning_rate_schedule": "constant", "num_envs": 1, "n_steps": 2**31}
     if "learn_step" in data and kind is not PPO:
@@ -78,7 +80,7 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
         config |= {"twin": algo == "TD3", "policy_delay": int(data.get("policy_freq", 2))}
         config["actor_rate"] = float(data.get("lr_actor", rate)) / float(rate)
     if kind is not DQN:
-        config["critic"] = _network(data.get("critic_init_dict") or data["critic_1_init_dict"])
+        config["critic"] = network_of(data.get("critic_init_dict") or data["critic_1_init_dict"])
     algorithm: Any = make_algorithm(kind(**config), *_spaces(kind, data))
     state = algorithm.init([Seeds(0)])
     views = algorithm.layout.views(state.params)
@@ -94,10 +96,8 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _spaces(kind: type, data: Mapping[str, Any]) -> tuple[gym.Space[Any], gym.Space[Any]]:
-    inputs, outputs = (int(data["actor_init_dict"][k]) for k in ("num_inputs", "num_outputs"))
-    seen: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
-    if data.get("one_hot"):
-        seen = gym.spaces.Discrete(inputs)
+    init = data["actor_init_dict"]
+    seen, outputs = observations_of(init["num_inputs"], data.get("one_hot")), init["num_outputs"]
     if kind is not TD3:
         return seen, gym.spaces.Discrete(outputs)
     low, high = (
@@ -106,12 +106,37 @@ def _spaces(kind: type, data: Mapping[str, Any]) -> tuple[gym.Space[Any], gym.Sp
     return seen, gym.spaces.Box(low, high)
 
 
-def _network(init: Mapping[str, Any]) -> Network:
-    name = init.get("mlp_activation") or init.get("activation")
-    if name not in ACTIVATIONS:
-        raise ValueError(f"activation {name}; known are {', '.join(ACTIVATIONS)}")
-    hidden, activation = tuple(int(n) for n in init["hidden_size"]), ACTIVATIONS[name]
-    return Network(hidden, activation, bool(init.get("layer_norm")))  # type: ignore[arg-type]
+def observations_of(
+    size: Any, one_hot: bool | None, net_config: Mapping[str, Any] | None = None
+) -> gym.Space[Any]:
+    """The space of what AgileRL calls states of this size, seen by such a network."""
+    shape, described = [int(n) for n in np.atleast_1d(size)], net_config or {}
+    if one_hot:
+        return gym.spaces.Discrete(shape[0])
+    if described.get("arch") != "cnn":
+        return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+    if described.get("normalize", True):
+        return gym.spaces.Box(0, 255, shape, np.uint8)
+    return gym.spaces.Box(0.0, 1.0, shape, np.float32)
+
+
+def network_of(described: Mapping[str, Any], usual: str | None = None) -> Network:
+    """What AgileRL describes by a ``net_config``, or by a checkpoint's ``*_init_dict``.
+
+    Raises:
+        SkillweaveError: a part is missing or unknown.
+    """
+    name = described.get("mlp_activation") or described.get("activation") or usual
+    known = described.get("arch", "mlp") in ("mlp", "cnn") and name in ACTIVATIONS
+    if not known or "hidden_size" not in described:
+        raise SkillweaveError(
+            f"a network is described by {dict(described)}; it must have a hidden_size, arch be "
+            f"'mlp' or 'cnn', and its activation be one of {', '.join(ACTIVATIONS)}"
+        )
+    sizes = [tuple(described.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
+    cnn, hidden = CNN("plain", *sizes) if sizes[0] else None, described["hidden_size"]
+    layer_norm, activation = bool(described.get("layer_norm")), ACTIVATIONS[str(name)]
+    return Network(tuple(int(n) for n in hidden), activation, layer_norm, cnn)  # type: ignore[arg-type]
 
 
 def _fill(views: Views, prefix: str, weights: Mapping[str, Tensor]) -> None:

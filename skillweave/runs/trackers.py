@@ -95,18 +95,21 @@ def make_trackers(
     return tuple(TensorBoard(run) if name == "tensorboard" else WandB(run) for name in names)
 
 
-def import_wandb() -> Any:
-    """The module wandb, which stays offline without a login.
+def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None = None) -> Any:
+    """A run of Weights & Biases in a loop of one's own; offline without a login or a key.
 
     Raises:
-        MissingExtra: it is not installed.
+        MissingExtra: wandb is not installed.
     """
     try:
         import wandb
     except ImportError as error:
         raise MissingExtra("tracking with wandb", "wandb") from error
     stay_offline()
-    return wandb
+    if key is not None:
+        wandb.login(key=key)
+    mode: Any = None if key is None else "online"
+    return wandb.init(project=project, name=name, config=config, mode=mode)
 
 
 def stay_offline() -> None:

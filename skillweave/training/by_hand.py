@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,26 @@ from torch import Tensor
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.types import Sample, Transition
+
+
+def returns_of(
+    env: Any, act: Callable[[Any], Any], episodes: int, max_steps: int
+) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Returns (episodes,), each of at most ``max_steps`` steps, by ``act(obs)``.
+
+    ``env`` may be a vector environment, of which the first environment counts.
+    """
+    returns = np.zeros(episodes)
+    for i in range(episodes):
+        obs = env.reset()[0]
+        for _ in range(max_steps):
+            action = act(obs)
+            obs, *step = env.step(action if hasattr(env, "num_envs") else action[0])
+            reward, terminated, truncated = (np.ravel(x)[0] for x in step[:3])
+            returns[i] += reward
+            if terminated or truncated:
+                break
+    return returns
 
 
 def rollout_of(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -13,8 +11,8 @@ import torch
 
 from skillweave.evolution.by_hand import ByHand
 from skillweave.evolution.stacks import Member
-from skillweave.networks.config import CNN, Network
-from skillweave.runs.agilerl import ACTIVATIONS
+from skillweave.runs.agilerl import network_of, observations_of
+from skillweave.training.by_hand import returns_of
 from skillweave.types import SkillweaveError
 
 MLP: dict[str, Any] = {"arch": "mlp", "hidden_size": [64, 64]}
@@ -22,17 +20,25 @@ _PAST = ("scores", "fitness", "steps", "mut", "index", "beta", "prior_eps")
 
 
 class Setting:
-    """An attribute that is a setting of the native agent; ``inverse``: one over it."""
+    """An attribute that is a native setting; ``inverse``: one over it; ``share``: of another."""
 
-    def __init__(self, field: str, inverse: bool = False) -> None:
-        self._field, self._inverse = field, inverse
+    def __init__(self, field: str, inverse: bool = False, share: str | None = None) -> None:
+        self.field, self.inverse, self.share = field, inverse, share
 
-    def __get__(self, agent: Agent, owner: type) -> Any:
-        value = getattr(agent.native.member.config, self._field)
-        return round(1.0 / value) if self._inverse else value
+    def __get__(self, agent: Agent | None, owner: type) -> Any:
+        if agent is None:
+            return self
+        value = getattr(agent.native.member.config, self.field)
+        value = value * getattr(agent.native.member.config, self.share) if self.share else value
+        return round(1.0 / value) if self.inverse else value
 
     def __set__(self, agent: Agent, value: Any) -> None:
-        agent.native.set(**{self._field: 1.0 / float(value) if self._inverse else plain(value)})
+        whole = getattr(agent.native.member.config, self.share) if self.share else None
+        agent.native.set(**self.native(value / whole if whole else value))
+
+    def native(self, value: Any) -> dict[str, Any]:
+        """The native setting that such a value stands for."""
+        return {self.field: 1.0 / float(value) if self.inverse else plain(value)}
 
 
 class Agent:
@@ -41,9 +47,14 @@ class Agent:
     algo: ClassVar[str]
     kind: ClassVar[type]
     getAction: Any
+    get_action: Any
     batch_size, gamma = Setting("batch_size"), Setting("gamma")
+    mut: str | None
 
-    def _start(self, given: dict[str, Any], actions: gym.Space[Any], **own: Any) -> None:
+    def __init_subclass__(cls) -> None:
+        cls.get_action = cls.getAction
+
+    def _start(self, given: Any, actions: gym.Space[Any], make: Any = None, **own: Any) -> None:
         """Begin with fresh weights; ``given`` are the constructor's arguments."""
         for name, value in given.items():
             if (name == "accelerator" or "_network" in name) and value is not None:
@@ -51,10 +62,14 @@ class Agent:
                     f"{self.algo}({name}=...) is not supported; for networks beyond net_config "
                     "see register_encoder of the native API"
                 )
-        own["network"] = _network(given["net_config"], "Tanh" if self.algo == "PPO" else "ReLU")
-        known = {f.name for f in fields(self.kind)}
-        made = self.kind(**own | {k: plain(v) for k, v in given.items() if k in known})
-        self._wrap(ByHand(Member(0, made, None), (_observations(given), actions), random_seed()))
+            if isinstance(setting := getattr(type(self), name, None), Setting):
+                own = setting.native(value) | own
+        network = given["net_config"]
+        own["network"] = network_of(network, "Tanh" if self.algo == "PPO" else "ReLU")
+        seen = observations_of(given["state_dim"], given["one_hot"], network)
+        self._wrap(
+            ByHand(Member(0, (make or self.kind)(**own), None), (seen, actions), random_seed())
+        )
         self.index, self.mut, self.device = given["index"], given["mut"], given["device"]
 
     def _wrap(self, native: ByHand) -> None:
@@ -66,24 +81,16 @@ class Agent:
         self.state_dim = seen.shape or (int(seen.n),)
         self.action_dim = int(done.shape[0] if done.shape else done.n)
 
-    mut: str | None
-
     def test(
         self, env: Any, swap_channels: bool = False, max_steps: int = 500, loop: int = 3
     ) -> float:
         """Mean return of ``loop`` episodes in the first environment; kept in ``fitness``."""
-        returns = np.zeros(loop)
-        for i in range(loop):
-            state = env.reset()[0]
-            for _ in range(max_steps):
-                action = self.getAction(np.moveaxis(state, -1, -3) if swap_channels else state)
-                action = action[0] if isinstance(action, tuple) else action
-                state, *step = env.step(action if hasattr(env, "num_envs") else action[0])
-                reward, *ends = (np.ravel(x)[0] for x in step[:3])
-                returns[i] += reward
-                if any(ends):
-                    break
-        self.fitness.append(float(returns.mean()))
+
+        def act(state: Any) -> Any:
+            action = self.getAction(swapped(state, swap_channels))
+            return action[0] if isinstance(action, tuple) else action
+
+        self.fitness.append(float(returns_of(env, act, loop, max_steps).mean()))
         return self.fitness[-1]
 
     def clone(self, index: int | None = None, wrap: bool = True) -> Self:
@@ -107,11 +114,6 @@ class Agent:
         Raises:
             SkillweaveError: the file is missing, a pickle of AgileRL's, or another algorithm's.
         """
-        if zipfile.is_zipfile(path):
-            raise SkillweaveError(
-                f"{path} is a pickle of AgileRL's, and a pickle can run code. If you trust where "
-                f"it comes from, convert it: skillweave import-agilerl {path} --trust"
-            )
         native, past = ByHand.load(path, random_seed())
         algo = past.pop("algo", self.algo)
         if not isinstance(native.member.config, self.kind) or algo != self.algo:
@@ -136,32 +138,11 @@ def random_seed() -> int:
     return int(torch.randint(2**62, ()))
 
 
-def _observations(given: dict[str, Any]) -> gym.Space[Any]:
-    size, network = [int(n) for n in np.atleast_1d(given["state_dim"])], given["net_config"]
-    if given["one_hot"]:
-        return gym.spaces.Discrete(size[0])
-    if network["arch"] == "cnn" and network.get("normalize", True):
-        return gym.spaces.Box(0, 255, size, np.uint8)
-    low, high = (0.0, 1.0) if network["arch"] == "cnn" else (-np.inf, np.inf)
-    return gym.spaces.Box(low, high, size, np.float32)
-
-
-def _network(given: dict[str, Any], usual: str) -> Network:
-    name = given.get("mlp_activation") or usual
-    if (
-        given.get("arch") not in ("mlp", "cnn")
-        or "hidden_size" not in given
-        or name not in ACTIVATIONS
-    ):
-        raise SkillweaveError(
-            f"net_config is {given}; it must have arch ('mlp' or 'cnn') and hidden_size, and "
-            f"mlp_activation, if any, be one of {', '.join(ACTIVATIONS)}"
-        )
-    sizes = [tuple(given.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
-    rest: Any = bool(given.get("layer_norm")), CNN("plain", *sizes) if sizes[0] else None
-    return Network(tuple(given["hidden_size"]), ACTIVATIONS[name], *rest)  # type: ignore[arg-type]
-
-
 def plain(value: Any) -> Any:
     """NumPy's numbers and arrays as Python's."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+
+
+def swapped(state: Any, swap: bool) -> Any:
+    """Observations with their channels first, where asked for."""
+    return np.moveaxis(state, -1, -3) if swap else state

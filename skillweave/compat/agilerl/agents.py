@@ -1,14 +1,12 @@
 """The agents: all that is said here is how AgileRL calls what the native API has."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from skillweave.algorithms import config
-from skillweave.compat.agilerl.agent import MLP, Agent, Setting, plain
+from skillweave.compat.agilerl.agent import MLP, Agent, Setting
 from skillweave.types import Array, SkillweaveError
 
 
@@ -19,6 +17,7 @@ class PPO(Agent):
     lr, gae_lambda, clip_coef = map(Setting, ("learning_rate", "gae_lambda", "clip_coef"))
     ent_coef, vf_coef, max_grad_norm = map(Setting, ("ent_coef", "vf_coef", "max_grad_norm"))
     target_kl, update_epochs = Setting("target_kl"), Setting("update_epochs")
+    action_std_init = Setting("action_std_init")
 
     def __init__(
         self, state_dim: Any, action_dim: int, one_hot: bool, discrete_actions: bool,
@@ -31,8 +30,8 @@ class PPO(Agent):
     ) -> None:  # fmt: skip
         actions: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (action_dim,), np.float32)
         actions = gym.spaces.Discrete(action_dim) if discrete_actions else actions
-        own = {"learning_rate": plain(lr), "learning_rate_schedule": "constant", "adam_eps": 1e-8}
-        self._start(locals(), actions, num_envs=1, n_steps=2**31, **own)
+        own = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
+        self._start(locals(), actions, n_steps=2**31, **own)
 
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
         """Sampled actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
@@ -50,8 +49,6 @@ class PPO(Agent):
         value_part = self.vf_coef * found["value_loss"] - self.ent_coef * found["entropy"]
         return float(found["policy_loss"] + value_part)
 
-    get_action = getAction
-
 
 class DQN(Agent):
     """A DQN agent."""
@@ -66,8 +63,7 @@ class DQN(Agent):
         gamma: float = 0.99, tau: float = 1e-3, mut: str | None = None, double: bool = False,
         actor_network: Any = None, device: Any = "cpu", accelerator: Any = None, wrap: bool = True,
     ) -> None:  # fmt: skip
-        own = {"learning_rate": plain(lr), "update_ratio": 1.0 / learn_step, "loss": "mse"}
-        self._start(locals(), gym.spaces.Discrete(action_dim), **own)
+        self._start(locals(), gym.spaces.Discrete(action_dim), loss="mse")
 
     def getAction(self, state: Any, epsilon: float = 0, action_mask: Any = None) -> Array:
         """Actions (B,) int64: with probability ``epsilon`` any of those allowed, else the best."""
@@ -76,8 +72,6 @@ class DQN(Agent):
     def learn(self, experiences: Any) -> float:
         """One gradient step; the loss."""
         return self.native.learn_sample(self.gamma, *experiences[:5])[0]["loss"]
-
-    get_action = getAction
 
 
 class RainbowDQN(Agent):
@@ -96,9 +90,7 @@ class RainbowDQN(Agent):
         mut: str | None = None, actor_network: Any = None, device: Any = "cpu",
         accelerator: Any = None, wrap: bool = True,
     ) -> None:  # fmt: skip
-        own = {"learning_rate": plain(lr), "update_ratio": 1.0 / learn_step, "n_atoms": num_atoms}
-        own = {**vars(config.DQN.rainbow()), **own}
-        self._start(locals(), gym.spaces.Discrete(action_dim), **own)
+        self._start(locals(), gym.spaces.Discrete(action_dim), config.DQN.rainbow)
         self.beta, self.prior_eps = beta, prior_eps
 
     def getAction(self, state: Any, action_mask: Any = None, training: bool = True) -> Array:
@@ -120,14 +112,13 @@ class RainbowDQN(Agent):
             return metrics["loss"], None, None
         return metrics["loss"], experiences[6], errors + self.prior_eps
 
-    get_action = getAction
-
 
 class TD3(Agent):
     """A TD3 agent."""
 
     algo, kind, twin = "TD3", config.TD3, True
     lr_critic, policy_freq = Setting("learning_rate"), Setting("policy_delay")
+    lr_actor = Setting("actor_rate", share="learning_rate")
     tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
 
     def __init__(
@@ -138,19 +129,10 @@ class TD3(Agent):
         actor_network: Any = None, critic_networks: Any = None, device: Any = "cpu",
         accelerator: Any = None, wrap: bool = True,
     ) -> None:  # fmt: skip
-        own = {"learning_rate": lr_critic, "actor_rate": lr_actor / lr_critic, "twin": self.twin}
-        own |= {"update_ratio": 1.0 / learn_step, "policy_delay": policy_freq}
+        own = {"actor_rate": lr_actor / lr_critic, "twin": self.twin}
         own |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
         actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
         self._start(locals(), actions, **own)
-
-    def _lr_actor(self) -> float:
-        return float(self.lr_critic * self.native.member.config.actor_rate)  # type: ignore[union-attr]
-
-    def _set_lr_actor(self, value: float) -> None:
-        self.native.set(actor_rate=float(value / self.lr_critic))
-
-    lr_actor = property(_lr_actor, _set_lr_actor, doc="The actor's learning rate.")
 
     def getAction(self, state: Any, epsilon: float = 0) -> Array:
         """Actions (B, A) float32: with probability ``epsilon`` any, else the actor's with noise."""
@@ -164,8 +146,6 @@ class TD3(Agent):
         metrics, _ = self.native.learn_sample(self.gamma, *experiences[:5])
         due = int(state.critic_count[0]) % self.policy_freq == 0
         return metrics["policy_loss"] if due else None, metrics["critic_loss"]
-
-    get_action = getAction
 
 
 class DDPG(TD3):

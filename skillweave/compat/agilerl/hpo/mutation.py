@@ -1,16 +1,12 @@
 """AgileRL's mutations."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
 from skillweave.compat.agilerl.agent import random_seed
-from skillweave.evolution.architecture import check_architecture
 from skillweave.evolution.config import KINDS, Range
 from skillweave.evolution.config import Mutations as Native
-from skillweave.evolution.mutation import mutate
 from skillweave.types import SkillweaveError
 
 _WORDS = {
@@ -49,13 +45,9 @@ class Mutations:
         for i, agent in enumerate(population if kinds.any() else ()):
             agent.mut = "None"
             if i > 0 or self.mutate_elite:
-                native = agent.native
-                config = native.member.config
-                ranges = {k: r for k, r in self._ranges.items() if hasattr(config, k)}
+                settings = agent.native.member.config
+                ranges = {k: r for k, r in self._ranges.items() if hasattr(settings, k)}
                 chances = dict(zip(KINDS, (kinds / kinds.sum()).tolist(), strict=True))
-                by = Native(**chances, ranges=ranges, **self._how)
-                check_architecture(config, by, "Mutations: ")
-                native.become(mutate(native.member, by, native.spaces, self.rng))
-                said = native.member.origin
+                said = agent.native.mutate(Native(**chances, ranges=ranges, **self._how), self.rng)
                 agent.mut = _WORDS.get(said.mutation) or _WORDS[next(iter(said.changes))]
         return population

@@ -1,7 +1,5 @@
 """AgileRL's tournaments."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,28 +1,27 @@
 """What both training functions share: episodes of everyone, and now and then an evaluation."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from skillweave.runs.trackers import import_wandb
+from skillweave.compat.agilerl.agent import swapped
+from skillweave.runs.trackers import start_wandb
 from skillweave.types import SkillweaveError
 
 Result = tuple[list[Any], list[list[float]]]
 
 
 class Epochs(SimpleNamespace):
-    """The arguments of a training function, which says what an episode of an agent is."""
+    """The arguments of a training function, which says what an agent learns in an episode."""
 
     env: Any
     pop: Any
 
-    def run(self, episode: Callable[[Any, int], tuple[Any, Any, Any]]) -> Result:
-        """Train; ``episode`` answers rewards and terminations (T, N), and the loss."""
+    def run(self, episode: Callable[[Any, int], Any]) -> Result:
+        """Train by episodes of ``steps`` and learning; ``episode`` answers the loss."""
         if self.accelerator is not None or not self.pop:
             raise SkillweaveError("pop must have an agent, and accelerator be None")
         if not hasattr(self.env, "num_envs"):
@@ -31,15 +30,10 @@ class Epochs(SimpleNamespace):
         if self.env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
             raise SkillweaveError("env must reset in the same step: make it with makeVectEnvs")
         name, found = f"{self.env_name}-EvoHPO-{self.algo}", []
-        self.wandb = import_wandb() if self.wb else None
-        if self.wandb:
-            if self.wandb_api_key is not None:
-                self.wandb.login(key=self.wandb_api_key)
-            mode = None if self.wandb_api_key is None else "online"
-            settings = {**(self.INIT_HP or {}), **(self.MUT_P or {})}
-            self.wandb.init(project="AgileRL", name=name, config=settings, mode=mode)
+        settings, key = {**(self.INIT_HP or {}), **(self.MUT_P or {})}, self.wandb_api_key
+        self.tracked = start_wandb("AgileRL", name, settings, key) if self.wb else None
         for done in range(self.n_episodes):
-            losses = [self._score(agent, *episode(agent, done)) for agent in self.pop]
+            losses = [self._scored(agent, episode(agent, done)) for agent in self.pop]
             number = done + 1
             if number % self.evo_epochs == 0:
                 how = self.swap_channels, self.max_steps, self.evo_loop
@@ -56,24 +50,39 @@ class Epochs(SimpleNamespace):
             if self.checkpoint is not None and number % self.checkpoint == 0:
                 for i, agent in enumerate(self.pop):
                     agent.saveCheckpoint(f"{_stem(self.checkpoint_path, name)}_{i}_{number}.pt")
-        if self.wandb:
-            self.wandb.finish()
+        if self.tracked:
+            self.tracked.finish()
         return self.pop, found
 
-    def _score(self, agent: Any, rewards: Any, ended: Any, loss: Any) -> Any:
+    def steps(self, act: Callable[[Any], Any]) -> Iterator[tuple[Any, ...]]:
+        """An episode's: state, what ``act`` answers, rewards, next state, terminations."""
+        self.rewards, self.ended = [], []
+        state = swapped(self.env.reset()[0], self.swap_channels)
+        for _ in range(self.max_steps):
+            acted = act(state)
+            after, reward, ended, _, _ = self.env.step(
+                acted[0] if isinstance(acted, tuple) else acted
+            )
+            after = swapped(after, self.swap_channels)
+            self.rewards.append(reward)
+            self.ended.append(ended)
+            yield state, acted, reward, after, ended
+            state = after
+
+    def _scored(self, agent: Any, loss: Any) -> Any:
         """Note the mean return of the first episodes of all environments."""
-        first = np.cumsum(ended, axis=0) - np.asarray(ended, int) == 0
-        agent.scores.append(float((np.array(rewards) * first).sum(0).mean()))
+        first = np.cumsum(self.ended, axis=0) - np.array(self.ended, int) == 0
+        agent.scores.append(float((np.array(self.rewards) * first).sum(0).mean()))
         agent.steps[-1] += self.max_steps
         return loss
 
     def _tell(self, number: int, tested: list[float], losses: list[Any]) -> None:
         scores = [float(np.mean(agent.scores[-self.evo_epochs :])) for agent in self.pop]
-        if self.wandb:
+        if self.tracked:
             told = {"train/mean_score": np.mean(scores), "eval/mean_fitness": np.mean(tested)}
             told |= {f"train/agent_{i}_loss": loss for i, loss in enumerate(losses)}
             steps = sum(agent.steps[-1] for agent in self.pop)
-            self.wandb.log({"global_step": steps, "eval/best_fitness": max(tested), **told})
+            self.tracked.log({"global_step": steps, "eval/best_fitness": max(tested), **told})
         for agent, score, fitness in zip(self.pop, scores, tested, strict=True):
             if self.verbose:
                 print(
@@ -81,11 +90,6 @@ class Epochs(SimpleNamespace):
                     f"steps, score {score:.2f}, fitness {fitness:.2f}, mutation {agent.mut}"
                 )
             agent.steps.append(agent.steps[-1])
-
-
-def swapped(state: Any, swap: bool) -> Any:
-    """Observations with their channels first, where asked for."""
-    return np.moveaxis(state, -1, -3) if swap else state
 
 
 def _stem(path: str | None, otherwise: str) -> str:

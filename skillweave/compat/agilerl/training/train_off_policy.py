@@ -1,12 +1,10 @@
 """AgileRL's training from a replay buffer."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
-from skillweave.compat.agilerl.training.epochs import Epochs, Result, swapped
+from skillweave.compat.agilerl.training.epochs import Epochs, Result
 
 
 def train_off_policy(
@@ -24,25 +22,17 @@ def train_off_policy(
     if mutation is not None:
         epochs.pop = mutation.mutation(pop, pre_training_mut=True)
 
-    def episode(agent: Any, done: int) -> tuple[Any, Any, Any]:
-        rewards, terminations, losses = [], [], []
-        epsilon = max(eps_end, eps_start * eps_decay**done)
-        state = swapped(epochs.env.reset()[0], swap_channels)
-        for _ in range(max_steps):
-            action = agent.getAction(state) if noisy else agent.getAction(state, epsilon)
-            after, reward, ended, _, _ = epochs.env.step(action)
-            after = swapped(after, swap_channels)
+    def episode(agent: Any, done: int) -> float:
+        losses, how = [], () if noisy else (max(eps_end, eps_start * eps_decay**done),)
+        for transition in epochs.steps(lambda state: agent.getAction(state, *how)):
             for buffer in (memory, n_step_memory):
                 if buffer is not None:
-                    buffer.save2memoryVectEnvs(state, action, reward, after, ended)
+                    buffer.save2memoryVectEnvs(*transition)
             if per:
                 agent.beta += (1.0 - agent.beta) * (done + 1) / n_episodes
             if memory.counter % agent.learn_step == 0 and len(memory) >= agent.batch_size:
                 losses.append(_learn(agent, memory, n_step_memory, n_step, per))
-            rewards.append(reward)
-            terminations.append(ended)
-            state = after
-        return rewards, terminations, float(np.mean(losses or [0.0]))
+        return float(np.mean(losses or [0.0]))
 
     return epochs.run(episode)
 

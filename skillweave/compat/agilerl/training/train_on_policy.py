@@ -1,10 +1,8 @@
 """AgileRL's training from whole episodes."""
 
-from __future__ import annotations
-
 from typing import Any
 
-from skillweave.compat.agilerl.training.epochs import Epochs, Result, swapped
+from skillweave.compat.agilerl.training.epochs import Epochs, Result
 
 
 def train_on_policy(
@@ -18,15 +16,9 @@ def train_on_policy(
     """Train agents by ``max_steps`` steps and one ``learn`` an episode; them, their fitnesses."""
     epochs = Epochs(**locals())
 
-    def episode(agent: Any, done: int) -> tuple[Any, Any, Any]:
-        record: list[Any] = []
-        state = swapped(epochs.env.reset()[0], swap_channels)
-        for _ in range(max_steps):
-            action, log_prob, _, value = agent.getAction(state)
-            after, reward, ended, _, _ = epochs.env.step(action)
-            record.append((state, action, log_prob, reward, ended, value))
-            state = swapped(after, swap_channels)
-        columns = tuple(zip(*record, strict=True))
-        return columns[3], columns[4], agent.learn((*columns, state))
+    def episode(agent: Any, done: int) -> Any:
+        states, acted, rewards, after, ended = zip(*epochs.steps(agent.getAction), strict=True)
+        actions, log_probs, _, values = zip(*acted, strict=True)
+        return agent.learn((states, actions, log_probs, rewards, ended, values, after[-1]))
 
     return epochs.run(episode)

@@ -1,7 +1,5 @@
 """AgileRL's environments and populations."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 

@@ -1,7 +1,5 @@
 """AgileRL's Skill."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym
