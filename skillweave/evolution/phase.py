@@ -92,13 +92,13 @@ class _Evolving:
         self.listeners, entry = listeners, run.phase(phase.name)
         self.config = config_from_json(entry["algorithm"])
         self.horizon = int(entry["budget"]) // evolution.population
+        found = run.load_checkpoint(Nothing, phase.name)  # may be damaged: before there is an arena
         self.arena = phase.make_env(evolution.episodes, self.config.gamma)
         """Where fitness is measured."""
         self.spaces = self.arena.observation_space, self.arena.action_space
         self.best: Best | None = None
         self.done = 0
         """Complete generations."""
-        found = run.load_checkpoint(Nothing, phase.name)
         if found is None:
             at: dict[str, Any] = dict(START)
             self.population = Population.fresh(
