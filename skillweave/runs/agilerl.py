@@ -71,7 +71,7 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     own = {f.name for f in fields(kind)}
     known = {k: v for k, v in data.items() if k in own and type(v) in (int, float, bool)}
     rate = data.get("lr", data.get("lr_critic", 1e-3))
-    config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": network_of(actor)}
+    config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": _mlp(actor)}
     if kind is PPO:
         config |= {"learning_rate_schedule": "constant", "num_envs": 1, "n_steps": 2**31}
     if "learn_step" in data and kind is not PPO:
@@ -80,7 +80,7 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
         config |= {"twin": algo == "TD3", "policy_delay": int(data.get("policy_freq", 2))}
         config["actor_rate"] = float(data.get("lr_actor", rate)) / float(rate)
     if kind is not DQN:
-        config["critic"] = network_of(data.get("critic_init_dict") or data["critic_1_init_dict"])
+        config["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])
     algorithm: Any = make_algorithm(kind(**config), *_spaces(kind, data))
     state = algorithm.init([Seeds(0)])
     views = algorithm.layout.views(state.params)
@@ -97,13 +97,18 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
 
 def _spaces(kind: type, data: Mapping[str, Any]) -> tuple[gym.Space[Any], gym.Space[Any]]:
     init = data["actor_init_dict"]
-    seen, outputs = observations_of(init["num_inputs"], data.get("one_hot")), init["num_outputs"]
+    outputs = int(init["num_outputs"])
+    seen = observations_of(init["num_inputs"], data.get("one_hot"))
     if kind is not TD3:
         return seen, gym.spaces.Discrete(outputs)
     low, high = (
         np.broadcast_to(data[k], outputs).astype(np.float32) for k in ("min_action", "max_action")
     )
     return seen, gym.spaces.Box(low, high)
+
+
+def _mlp(init: Mapping[str, Any]) -> Network:
+    return network_of({"arch": "mlp", **init})  # an ``*_init_dict`` leaves it unsaid
 
 
 def observations_of(
@@ -121,13 +126,13 @@ def observations_of(
 
 
 def network_of(described: Mapping[str, Any], usual: str | None = None) -> Network:
-    """What AgileRL describes by a ``net_config``, or by a checkpoint's ``*_init_dict``.
+    """What AgileRL describes by a ``net_config``.
 
     Raises:
         SkillweaveError: a part is missing or unknown.
     """
     name = described.get("mlp_activation") or described.get("activation") or usual
-    known = described.get("arch", "mlp") in ("mlp", "cnn") and name in ACTIVATIONS
+    known = described.get("arch") in ("mlp", "cnn") and name in ACTIVATIONS
     if not known or "hidden_size" not in described:
         raise SkillweaveError(
             f"a network is described by {dict(described)}; it must have a hidden_size, arch be "

@@ -31,9 +31,9 @@ class JsonLines:
             SkillweaveError: the disk is full or cannot be written.
         """
         text = "".join(json.dumps(record) + "\n" for record in records)
-        if self._file is None:
-            self._file = self.path.open("a")
         try:
+            if self._file is None:
+                self._file = self.path.open("a")
             self._file.write(text)
             self._file.flush()
         except OSError as error:
