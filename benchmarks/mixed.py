@@ -33,6 +33,7 @@ SELECTOR = DQN(
 # Near the ground a landing is worth +100 and a crash -100, and whether to land at all is decided by
 # how likely each is. Huber learns the median of such returns and lands half of the time (106), mse
 # their mean (239), but hovers for ever with other seeds; a distribution of returns (C51) does not.
+# A network of 64-64, which PPO learns to land with, still fails one landing in ten to four.
 SKILL = DQN(
     num_envs=64,
     update_ratio=1 / 16,
@@ -50,7 +51,7 @@ SKILL = DQN(
     v_max=120.0,
     exploration_fraction=0.4,
     exploration_final_eps=0.02,
-    network=Network((64, 64), "relu", layer_norm=True),
+    network=Network((128, 128), "relu", layer_norm=True),
     compile=True,
 )
 
