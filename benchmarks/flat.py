@@ -16,6 +16,7 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.envs.make import make_engine
 from skillweave.envs.skill_env import SkillEnv
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.evaluation import evaluate
 from skillweave.training.on_policy import Tick, train_on_policy
 
@@ -36,7 +37,7 @@ def learn(seed: int, steps: int, every: float) -> dict[str, object]:
     last: list[Tick] = []
     cut = hierarchy.cut_every
     train_on_policy(
-        algorithm, env, state, seeds, steps, cut_every=cut,
+        algorithm, Collector(env), state, seeds, steps, cut_every=cut,
         on_tick=lambda t: (on_tick(t), last.append(t)),
     )  # fmt: skip
     seconds = last[-1].seconds

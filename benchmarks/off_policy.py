@@ -23,6 +23,7 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.make import make_engine
 from skillweave.envs.skill_env import SkillEnv
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
 from skillweave.training.off_policy import train_off_policy
 
@@ -57,7 +58,7 @@ def ours(name: str, size: str, steps: int, seed: int, *, compile: bool) -> float
     seeds = Seeds(seed)
     ticks: list[Tick] = []
     train_off_policy(
-        algorithm, env, algorithm.init([seeds / "member" / 0]), seeds, steps + 1000,
+        algorithm, Collector(env), algorithm.init([seeds / "member" / 0]), seeds, steps + 1000,
         on_tick=ticks.append, cut_every=10**9,
     )  # fmt: skip
     first, last = ticks[0], ticks[-1]

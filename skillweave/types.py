@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from gymnasium import Space
@@ -18,9 +18,21 @@ if TYPE_CHECKING:
 
     from skillweave.seeding import Seeds
 
+T = TypeVar("T")
 Array: TypeAlias = NDArray[Any]
 Memory: TypeAlias = dict[str, Array]
 """What a policy remembers of each environment: arrays whose first axis is the environment."""
+
+
+def prefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
+    """Everything under another name: ``prefix.name``."""
+    return {f"{prefix}.{k}": v for k, v in named.items()}
+
+
+def unprefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
+    """What has names that begin with ``prefix.``, without it."""
+    cut = len(prefix) + 1
+    return {k[cut:]: v for k, v in named.items() if k.startswith(f"{prefix}.")}
 
 
 class SkillweaveError(Exception):
@@ -127,12 +139,53 @@ class Sample:
             yield Sample(**found)
 
 
-class VecEnv(Protocol):
+class Restorable(Protocol):
+    """What can be brought back to where it was, in another process too.
+
+    ``state`` is asked for right after ``renew``, before anything else is done.
+    """
+
+    @property
+    def steps_made(self) -> int:
+        """Steps that the environments have made together, of whatever kind."""
+        ...
+
+    def renew(self, seeds: Seeds) -> Array:
+        """Take new seeds, so that the past need not be kept.
+
+        Returns:
+            (k,) int64, environments that begin anew: their episodes were too long to be kept.
+        """
+        ...
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs."""
+        ...
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Stand where ``state`` says, open episodes included.
+
+        Returns:
+            (k,) int64, environments that begin anew: they did not repeat themselves.
+        """
+        ...
+
+    def set_gamma(self, gamma: Array) -> None:
+        """γ of one step in each environment, (N,), from now on; used where actions last longer."""
+        ...
+
+
+class VecEnv(Restorable, Protocol):
     """A vectorised environment with one auto-reset meaning; see ``envs/``."""
 
     num_envs: int
     observation_space: Space[Any]
     action_space: Space[Any]
+
+    @property
+    def obs(self) -> Array:
+        """(N, *obs_shape), what to act on next."""
+        ...
 
     def reset(self, seeds: Seeds) -> Array:
         """Start every environment anew from a node of the seed tree; (N, *obs_shape)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
+from skillweave.training.collector import Collector
 from skillweave.training.off_policy import train_off_policy
 from skillweave.training.on_policy import train_on_policy
 from skillweave.types import Array, VecStep
@@ -92,6 +94,23 @@ class Toy:
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs
         self.obs: Array = np.empty(0)
+        self.steps_made = 0
+
+    def renew(self, seeds: Seeds) -> Array:
+        return np.arange(0)
+
+    def set_gamma(self, gamma: Array) -> None:
+        pass
+
+    def state(self) -> dict[str, Array]:
+        """Everything it has: a toy is copied, not played again."""
+        return {"pickle": np.frombuffer(pickle.dumps(self.__dict__), np.uint8).copy()}
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        made = self.steps_made
+        self.__dict__ = pickle.loads(state["pickle"].tobytes())
+        self.steps_made = made  # steps are counted where they are made
+        return np.arange(0)
 
     def first(self, rows: Array) -> Array:
         """First observations of the environments ``rows``."""
@@ -113,6 +132,7 @@ class Toy:
     def step(self, action: Array) -> VecStep:
         self.t += 1
         next_obs, reward, terminated, truncated, steps = self.play(action)
+        self.steps_made += int(steps.sum())
         self.obs = next_obs.copy()
         if (rows := np.flatnonzero(terminated | truncated)).size:
             self.obs[rows] = self.first(rows)
@@ -391,4 +411,5 @@ def learn(
     seeds = Seeds(seeds) if isinstance(seeds, int) else seeds
     state = where.pop("state", None) or algorithm.init([Seeds(m) for m in members])
     train: Any = train_on_policy if isinstance(algorithm, PPOAlgorithm) else train_off_policy
-    return algorithm, train(algorithm, env, state, seeds, budget, **where)
+    collector = where.pop("collector", None) or Collector(env)
+    return algorithm, train(algorithm, collector, state, seeds, budget, **where)

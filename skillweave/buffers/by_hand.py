@@ -34,7 +34,7 @@ class Recorder:
         if self._buffer is None:
             self._buffer = self._made(before, done)
         elif not np.array_equal(before, self._after):
-            self._buffer.cut()
+            self._buffer.cut(np.arange(len(before)))
         nothing, ones = np.zeros(len(before), bool), np.ones(len(before), np.int64)
         step = VecStep(after, after, reward, ended.astype(bool), nothing, ones, None, {})
         self._buffer.add(before, None, done, step)

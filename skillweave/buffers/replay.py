@@ -112,11 +112,11 @@ class ReplayBuffer:
             rows = np.arange(self._count - 1, self._count + 1)[:, None] % self._rows
             self._priorities.turn(*(rows * self._width + np.arange(self._width)))
 
-    def cut(self) -> None:
-        """End the episodes in flight at their newest transition: the environments start anew."""
+    def cut(self, columns: Array) -> None:
+        """End the open episodes of ``columns`` (k,), whose environments begin anew."""
         if self._count:
             row, head = self._row(self._count - 1), self._row(self._count)
-            columns = (self._data["end"][row] == GOES_ON).nonzero()[0]
+            columns = columns[self._data["end"][row][columns] == GOES_ON]
             self._data["end"][row.start + columns] = CUT
             after = {name: self._data[name][head][columns] for name in self._ends}
             self._keep(row.start + columns, **after)

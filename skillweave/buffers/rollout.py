@@ -14,7 +14,7 @@ from skillweave.types import Array, Transition, VecStep
 
 
 class RolloutBuffer:
-    """Filled a step at a time, then read once as a ``Transition``.
+    """Filled a step at a time, then read once as a ``Transition``; it need not be full.
 
     N = P·B columns: the environments of member 0 first, then those of member 1, and so on.
     """
@@ -50,18 +50,19 @@ class RolloutBuffer:
 
     def read(self, gamma: Tensor) -> tuple[Transition, Tensor]:
         """The transitions, discounted by each member's γ (P,), and the heads (P, T, B, A)."""
-        self._last[self._at - 1] = True  # the end of the rollout cuts every trajectory
-        steps = self._by_member(self._steps)
-        alive = self._by_member(~self._terminated)
+        done = self._at
+        self._last[done - 1] = True  # the end of the rollout cuts every trajectory
+        steps = self._by_member(self._steps[:done])
+        alive = self._by_member(~self._terminated[:done])
         discount = gamma[:, None, None].pow(steps) * alive
-        masks = [m for m in self._mask if m is not None]
+        masks = [m for m in self._mask[:done] if m is not None]
         transition = Transition(
-            obs=self._by_member(self._obs),
+            obs=self._by_member(self._obs[:done]),
             action=torch.stack(self._action, dim=1),
-            reward=self._by_member(self._reward),
+            reward=self._by_member(self._reward[:done]),
             discount=discount,
-            next_obs=self._by_member(self._next_obs),
-            last=self._by_member(self._last),
+            next_obs=self._by_member(self._next_obs[:done]),
+            last=self._by_member(self._last[:done]),
             mask=self._by_member(self._masks(masks[0])) if masks else None,
         )
         return transition, torch.stack(self._head, dim=1)
@@ -69,7 +70,7 @@ class RolloutBuffer:
     def _masks(self, example: Array) -> Array:
         """(T, N, A) bool; a step without a mask allows everything."""
         free = np.ones_like(example)
-        return np.stack([free if m is None else m for m in self._mask])
+        return np.stack([free if m is None else m for m in self._mask[: self._at]])
 
     def _by_member(self, x: Array) -> Tensor:
         """(T, P·B, ...) to (P, T, B, ...)."""

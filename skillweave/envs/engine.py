@@ -4,13 +4,15 @@ Gymnasium resets on the next step, in the same step or never; EnvPool resets on 
 and ignores the action sent then. An ``Engine`` knows none of this: ``step`` steps the
 environments named and returns their true successors, ``reset_some`` starts those named anew.
 An environment that has ended must be reset before the next step.
+
+``state`` is what ``restore`` needs to bring the environments where they are: their seeds and what
+was done since. Only an environment whose dynamics follow from these two can be restored.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -18,8 +20,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from skillweave.envs.history import History
 from skillweave.spaces import pack
-from skillweave.types import Array, MissingExtra, SkillweaveError
+from skillweave.types import Array
+
+
+LONGEST_EPISODE = 100_000
+"""Steps after which an open episode is no longer kept for a checkpoint, but ended there."""
 
 
 @dataclass(slots=True)
@@ -39,6 +46,8 @@ class Engine(Protocol):
     num_envs: int
     observation_space: gym.Space[Any]
     action_space: gym.Space[Any]
+    steps_made: int
+    """Steps that all environments have made together."""
 
     def reset(self, seed: int) -> Array:
         """Start all anew from one seed; observations (N, *obs_shape)."""
@@ -50,6 +59,21 @@ class Engine(Protocol):
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
         """Act in some environments; the others stand still."""
+        ...
+
+    def renew(self, seed: int) -> None:
+        """Take new seeds for episodes that begin from now on, where histories grow long."""
+        ...
+
+    def state(self) -> dict[str, Array]:
+        """Seeds, and what was done since: all that ``restore`` needs."""
+        ...
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Play everything in ``state`` again; the observations (N, *obs_shape) that this led to.
+
+        The steps are not counted: they were when they were made first.
+        """
         ...
 
     def close(self) -> None:
@@ -86,7 +110,10 @@ class Pausable(gym.Wrapper[Any, Any, Any, Any]):
 
 
 class GymnasiumEngine:
-    """Gymnasium environments, in this process or in processes of their own."""
+    """Gymnasium environments, in this process or in processes of their own.
+
+    Every episode begins from a seed of its own, so that it can be played again.
+    """
 
     def __init__(self, make: Any, num_envs: int, processes: bool = False) -> None:
         makers = [lambda: Pausable(make())] * num_envs
@@ -94,7 +121,7 @@ class GymnasiumEngine:
         self._vector: Any = (
             AsyncVectorEnv(makers, **kwargs) if processes else SyncVectorEnv(makers, **kwargs)
         )
-        self.num_envs = num_envs
+        self.num_envs, self.steps_made = num_envs, 0
         self.observation_space: gym.Space[Any] = self._vector.single_observation_space
         go_and_action: Any = self._vector.single_action_space
         self.action_space: gym.Space[Any] = go_and_action[1]
@@ -102,25 +129,78 @@ class GymnasiumEngine:
         self._actions: Any = gym.vector.utils.create_empty_array(
             self.action_space, num_envs, np.zeros
         )
+        self._all = np.arange(num_envs)
+        self._root = 0
+        self._episode = np.zeros(num_envs, np.int64)  # episodes begun since the root seed
+        self._seed = np.zeros(num_envs, np.int64)  # of the open episode
+        self._history = History(num_envs, self._actions)
 
     def reset(self, seed: int) -> Array:
         """Start all anew from one seed; observations (N, *obs_shape)."""
-        seeds = np.random.SeedSequence(seed).generate_state(self.num_envs, np.uint32) >> 1
-        obs, _ = self._vector.reset(seed=[int(s) for s in seeds])
-        return pack(self.observation_space, obs)
+        self._root, self._episode[:] = seed, 0
+        return self.reset_some(self._all)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
         """Start some anew; observations (n, *obs_shape)."""
-        mask = np.zeros(self.num_envs, bool)
-        mask[ids] = True
-        each: list[int | None] = [None] * self.num_envs
-        for i, seed in zip(ids, seeds or (), strict=False):
-            each[int(i)] = int(seed)
-        obs, _ = self._vector.reset(seed=each, options={"reset_mask": mask})
-        return pack(self.observation_space, obs)[ids]
+        if seeds is None:
+            seeds = [self._next_seed(int(i)) for i in ids]
+        self._episode[ids] += 1
+        self._seed[ids] = seeds
+        self._history.forget(ids)
+        return self._begin(ids)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
         """Act in some environments; the others stand still."""
+        rows = self._all if ids is None else ids
+        self._history.add(action, rows)
+        self.steps_made += len(rows)
+        return self._act(action, ids)
+
+    def renew(self, seed: int) -> None:
+        """Nothing to do: every episode has a seed of its own."""
+
+    def state(self) -> dict[str, Array]:
+        """Seeds, and what was done since."""
+        own = {"root": np.array([self._root]), "episode": self._episode, "seed": self._seed}
+        return {k: v.copy() for k, v in own.items()} | self._history.state()
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Play the open episodes again; the observations (N, *obs_shape) that this led to."""
+        self._root = int(state["root"][0])
+        self._episode, self._seed = state["episode"].copy(), state["seed"].copy()
+        self._history.load(state)
+        obs = self._begin(self._all)
+        going = np.ones(self.num_envs, bool)
+        for _, ids, action in self._history.play():
+            # What ends before its time is no longer the episode that it was.
+            acts = going[ids]
+            if not acts.any():
+                continue
+            raw = self._act(action[acts], ids[acts])
+            obs[ids[acts]] = raw.next_obs
+            going[ids[acts]] = ~(raw.terminated | raw.truncated)
+        return obs
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._vector.close()
+
+    def _next_seed(self, row: int) -> int:
+        node = np.random.SeedSequence(self._root, spawn_key=(row, int(self._episode[row])))
+        return int(node.generate_state(1, np.uint32)[0] >> 1)
+
+    def _begin(self, ids: Array) -> Array:
+        """Reset environments ``ids`` to their seeds."""
+        mask = np.zeros(self.num_envs, bool)
+        mask[ids] = True
+        each: list[int | None] = [None] * self.num_envs
+        for i in ids:
+            each[int(i)] = int(self._seed[i])
+        options = None if mask.all() else {"reset_mask": mask}
+        obs, _ = self._vector.reset(seed=each, options=options)
+        return np.array(pack(self.observation_space, obs)[ids])
+
+    def _act(self, action: Array, ids: Array | None) -> RawStep:
         go = np.ones(self.num_envs, np.int64)
         if ids is None:
             self._actions[:] = action
@@ -140,97 +220,6 @@ class GymnasiumEngine:
         truncated = truncated & ~terminated
         return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
 
-    def close(self) -> None:
-        """Release the environments."""
-        self._vector.close()
-
-
-class EnvPoolEngine:
-    """EnvPool's environments: C++ threads, the same dynamics, several times the speed."""
-
-    def __init__(self, env_id: str, num_envs: int, threads: int, spaces: gym.Env[Any, Any]) -> None:
-        self._id, self._threads = env_id, min(threads, num_envs)
-        self._pool: Any = None
-        self.num_envs = num_envs
-        # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
-        self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
-        self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
-
-    @staticmethod
-    def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
-        """Whether EnvPool is installed and has this environment with the same spaces and limit."""
-        try:
-            envpool = _envpool()
-        except MissingExtra:
-            return False
-        if env_id not in envpool.list_all_envs():
-            return False
-        if reference.observation_space.shape is None:  # Dict, Tuple: EnvPool nests in its own way
-            return False
-        with _no_precision_warnings():
-            spec = envpool.make_spec(env_id)
-            theirs = (spec.gymnasium_observation_space, spec.gymnasium_action_space)
-        ours = (reference.observation_space, reference.action_space)
-        same = all(
-            isinstance(a, type(b))
-            and a.shape == b.shape
-            and getattr(a, "n", 0) == getattr(b, "n", 0)
-            for a, b in zip(ours, theirs, strict=True)
-        )
-        dtype = isinstance(theirs[1], gym.spaces.Discrete) or theirs[1].dtype == ours[1].dtype
-        limit = reference.spec.max_episode_steps if reference.spec else None
-        return bool(
-            same
-            and dtype
-            and theirs[0].dtype == ours[0].dtype
-            and spec.config.max_episode_steps == limit
-        )
-
-    def make_pool(self, seed: int) -> Any:
-        """A bare pool of EnvPool's."""
-        with _no_precision_warnings():
-            pool = _envpool().make_gymnasium(
-                self._id, num_envs=self.num_envs, num_threads=self._threads, seed=seed
-            )
-            _ = pool.observation_space  # made on first use, with the warning
-            return pool
-
-    def reset(self, seed: int) -> Array:
-        """Start all anew from one seed; observations (N, *obs_shape)."""
-        # A pool takes its seed only when made; making one takes milliseconds.
-        self._pool = self.make_pool(seed)
-        obs, _ = self._pool.reset()
-        return np.asarray(obs)
-
-    def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
-        """Start some anew; observations (n, *obs_shape)."""
-        if seeds is not None:
-            raise SkillweaveError("EnvPool cannot reset single environments to a seed")
-        obs, _ = self._pool.reset(ids.astype(np.int32))
-        return np.asarray(obs)
-
-    def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Act in some environments; the others stand still."""
-        if self._discrete:
-            action = action.astype(np.int32)
-        ids = None if ids is None else ids.astype(np.int32)
-        obs, reward, terminated, truncated, info = self._pool.step(action, ids)
-        # An episode that terminates on the very step of its time limit arrives as truncated:
-        # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
-        return RawStep(obs, reward, terminated, truncated, info)
-
-    def close(self) -> None:
-        """Release the environments."""
-        self._pool = None
-
-
-@contextmanager
-def _no_precision_warnings() -> Iterator[None]:
-    """EnvPool states bounds in float64 for float32 spaces, and Gymnasium warns of it each time."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*precision lowered.*")
-        yield
-
 
 def _info_rows(info: dict[str, Any], ids: Array) -> dict[str, Any]:
     """Some environments' part of Gymnasium's batched info, nested dicts included."""
@@ -240,9 +229,6 @@ def _info_rows(info: dict[str, Any], ids: Array) -> dict[str, Any]:
     }
 
 
-def _envpool() -> Any:
-    try:
-        import envpool
-    except ImportError as error:
-        raise MissingExtra("the EnvPool engine", "envpool") from error
-    return envpool
+def checksums(obs: Array) -> Array:
+    """One number for each row of observations (n, *obs_shape), (n,) int64: equal rows, equal sums."""
+    return np.array([zlib.crc32(np.ascontiguousarray(row).tobytes()) for row in obs], np.int64)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
-from skillweave.types import Array, SkillweaveError, VecStep
+from skillweave.types import Array, Restorable, SkillweaveError, VecStep
+
+
+@runtime_checkable
+class RestorableVector(Restorable, Protocol):
+    """A Gymnasium vector that can be brought back to where it was."""
+
+    def present(self) -> tuple[Any, dict[str, Any]]:
+        """What to act on next, and the info that belongs to it."""
+        ...
 
 
 class FromVectorEnv:
@@ -37,12 +46,37 @@ class FromVectorEnv:
         )
         self._ones = np.ones(self.num_envs, np.int64)
         self._mask: Array | None = None
+        self._steps_made = 0
+        self.obs: Array = np.empty(0)
+
+    @property
+    def steps_made(self) -> int:
+        """Steps that all environments have made: as the vector counts them, else as seen here."""
+        return int(getattr(self.env, "steps_made", self._steps_made))
 
     def reset(self, seeds: Seeds) -> Array:
         """Start all anew; observations (N, *obs_shape)."""
         obs, info = self.env.reset(seed=seeds.integer())
-        self._mask = info.get("action_mask")
-        return pack(self.observation_space, obs)
+        return self._see(obs, info)
+
+    def renew(self, seeds: Seeds) -> Array:
+        """Take new seeds, if the vector can; the environments that begin anew."""
+        able = self._restorable
+        return np.zeros(0, np.int64) if able is None else self._refreshed(able, able.renew(seeds))
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs; nothing, where the vector cannot be brought back."""
+        return {} if self._restorable is None else self._restorable.state()
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Stand where ``state`` says."""
+        assert self._restorable is not None, "a state comes from a vector that can be restored"
+        return self._refreshed(self._restorable, self._restorable.restore(state))
+
+    def set_gamma(self, gamma: Array) -> None:
+        """γ of one step in each environment, from now on, where the vector has one."""
+        if self._restorable is not None:
+            self._restorable.set_gamma(gamma)
 
     def mask(self) -> Array | None:
         """(N, A) bool, the actions allowed now, or None."""
@@ -51,9 +85,9 @@ class FromVectorEnv:
     def step(self, action: Array) -> VecStep:
         """One action in each environment."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        self._mask = info.get("action_mask")
-        space = self.observation_space
-        obs = pack(space, obs)
+        obs = self._see(obs, info)
+        space, steps = self.observation_space, info.get("steps", self._ones)
+        self._steps_made += int(steps.sum())
         if "next_obs" in info:
             next_obs = pack(space, info["next_obs"])
         else:
@@ -62,10 +96,23 @@ class FromVectorEnv:
                 next_obs[i] = pack(space, info["final_obs"][i])
         return VecStep(
             next_obs, obs, np.asarray(reward, np.float32), terminated,
-            truncated & ~terminated, info.get("steps", self._ones), self._mask, info,
+            truncated & ~terminated, steps, self._mask, info,
             info.get("next_action_mask"),
         )  # fmt: skip
 
     def close(self) -> None:
         """Close the vector."""
         self.env.close()
+
+    @property
+    def _restorable(self) -> RestorableVector | None:
+        return self.env if isinstance(self.env, RestorableVector) else None
+
+    def _refreshed(self, vector: RestorableVector, ids: Array) -> Array:
+        self._see(*vector.present())
+        return ids
+
+    def _see(self, obs: Any, info: dict[str, Any]) -> Array:
+        self._mask = info.get("action_mask")
+        self.obs = pack(self.observation_space, obs)
+        return self.obs

@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 import gymnasium as gym
 
-from skillweave.envs.engine import Engine, EnvPoolEngine, GymnasiumEngine
+from skillweave.envs.engine import Engine, GymnasiumEngine
+from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.types import MissingExtra, SkillweaveError
 
 EngineName = Literal["auto", "envpool", "sync", "async"]

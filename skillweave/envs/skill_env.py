@@ -6,10 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.envs.engine import Engine
+from skillweave.envs.engine import LONGEST_EPISODE, Engine, checksums
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill, apply_reflexes, checked
-from skillweave.types import Array, SkillweaveError, Step, VecStep
+from skillweave.types import (
+    Array,
+    SkillweaveError,
+    Step,
+    VecStep,
+    prefixed,
+    unprefixed,
+)
 
 _PATIENCE = 5_000  # steps of random acting in search of a state where the skill may start
 
@@ -33,19 +40,47 @@ class SkillEnv:
         self.engine, self.skill, self.reflexes = engine, skill, reflexes
         self.num_envs = engine.num_envs
         self.observation_space, self.action_space = engine.observation_space, engine.action_space
+        self.obs: Array = np.empty(0)
         self._elapsed = np.zeros(self.num_envs, np.int64)
+        self._all = np.arange(self.num_envs)
         self._ones = np.ones(self.num_envs, np.int64)
         self._never = np.zeros(self.num_envs, bool)
-        self._obs: Array = np.empty(0)
+        self._seed = 0  # of the search for states where the skill may start
         self._rng = np.random.default_rng(0)
+
+    @property
+    def steps_made(self) -> int:
+        """Steps that all environments have made, those in search of a start included."""
+        return self.engine.steps_made
 
     def reset(self, seeds: Seeds) -> Array:
         """Start all anew from a node of the seed tree; observations (N, *obs_shape)."""
-        self._rng = (seeds / "start").numpy()
+        self._search_from((seeds / "start").integer())
         self._elapsed[:] = 0
-        self._obs = self.engine.reset((seeds / "env").integer())
-        self._obs = self._startable(self._obs, np.arange(self.num_envs))
-        return self._obs
+        self.obs = self._startable(self.engine.reset((seeds / "env").integer()), self._all)
+        return self.obs
+
+    def renew(self, seeds: Seeds) -> Array:
+        """Take new seeds; environments whose episodes are too long to be kept begin anew."""
+        self._search_from((seeds / "start").integer())
+        self.engine.renew((seeds / "env").integer())
+        return self._begin(np.flatnonzero(self._elapsed > LONGEST_EPISODE))
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs, right after ``renew``."""
+        own = {"elapsed": self._elapsed.copy(), "obs": checksums(self.obs)}
+        own["seed"] = np.array([self._seed])
+        return own | prefixed("engine", self.engine.state())
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Play the open episodes again; the environments that did not repeat themselves."""
+        self._search_from(int(state["seed"][0]))
+        self._elapsed = state["elapsed"].copy()
+        self.obs = self.engine.restore(unprefixed("engine", state))
+        return self._begin(np.flatnonzero(checksums(self.obs) != state["obs"]))
+
+    def set_gamma(self, gamma: Array) -> None:
+        """Nothing to do: every action lasts one step."""
 
     def mask(self) -> Array | None:
         """All actions are allowed."""
@@ -53,7 +88,7 @@ class SkillEnv:
 
     def step(self, action: Array) -> VecStep:
         """Act in all environments. ``info`` gains the task's reward and the skill's success."""
-        obs = self._obs
+        obs = self.obs
         if self.reflexes:
             action = apply_reflexes(self.reflexes, obs, action)
         raw = self.engine.step(action)
@@ -62,21 +97,29 @@ class SkillEnv:
         if self.skill is not None:
             reward, terminated, truncated, info = self._judge(self.skill, obs, action, raw)
         ended = terminated | truncated
-        self._obs = raw.next_obs
+        self.obs = raw.next_obs
         if ended.any():
-            ids = np.flatnonzero(ended)
-            first = self.engine.reset_some(ids)
-            self._obs = raw.next_obs.copy()
-            self._obs[ids] = self._startable(first, ids)
             info = {**info, "length": self._elapsed.copy()}
-            self._elapsed[ids] = 0
+            self._begin(np.flatnonzero(ended))
         return VecStep(
-            raw.next_obs, self._obs, reward, terminated, truncated, self._ones, None, info
+            raw.next_obs, self.obs, reward, terminated, truncated, self._ones, None, info
         )
 
     def close(self) -> None:
         """Release the engine."""
         self.engine.close()
+
+    def _search_from(self, seed: int) -> None:
+        self._seed, self._rng = seed, np.random.default_rng(seed)
+
+    def _begin(self, ids: Array) -> Array:
+        """Start environments ``ids`` (n,) anew; the same ids."""
+        if len(ids):
+            first = self._startable(self.engine.reset_some(ids), ids)
+            self.obs = self.obs.copy()
+            self.obs[ids] = first
+            self._elapsed[ids] = 0
+        return ids
 
     def _judge(self, skill: Skill, obs: Array, action: Array, raw: Any) -> Any:
         """The skill's reward and ends for one step of all environments."""

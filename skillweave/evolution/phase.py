@@ -22,8 +22,15 @@ from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
-from skillweave.training.phase import START, Listener, Phase, Record, train_phase
-from skillweave.types import Array
+from skillweave.training.phase import (
+    START,
+    Listener,
+    Phase,
+    Record,
+    resume_episodes,
+    train_phase,
+)
+from skillweave.types import Array, prefixed, unprefixed
 
 
 @dataclass
@@ -91,7 +98,7 @@ class _Evolving:
         self.phase, self.run, self.seeds, self.evolution = phase, run, seeds, evolution
         self.listeners, entry = listeners, run.phase(phase.name)
         self.config = config_from_json(entry["algorithm"])
-        self.horizon = int(entry["budget"]) // evolution.population
+        self.budget = int(entry["budget"])
         found = run.load_checkpoint(Nothing, phase.name)  # may be damaged: before there is an arena
         self.arena = phase.make_env(evolution.episodes, self.config.gamma)
         """Where fitness is measured."""
@@ -99,6 +106,8 @@ class _Evolving:
         self.best: Best | None = None
         self.done = 0
         """Complete generations."""
+        self.fitness_steps = 0
+        """Environment steps that the latest measurement of fitness took."""
         if found is None:
             at: dict[str, Any] = dict(START)
             self.population = Population.fresh(
@@ -110,14 +119,17 @@ class _Evolving:
         run.lineage.rewind(at.get("lineage_bytes", entry.get("lineage_bytes")))
         entry.setdefault("lineage_bytes", run.lineage.size)
         self.record = Record(phase.name, run, listeners, at)
+        if found is not None:
+            self._resume_episodes(found[2])
         self._started: float = time.perf_counter() - at["seconds"]
 
     @property
     def over(self) -> bool:
-        """Whether all generations are complete, or the target is reached."""
+        """Whether all generations are complete, the target is reached, or the budget is spent."""
         target = self.evolution.target
         good = self.best is not None and target is not None and self.best.fitness >= target
-        return good or self.done >= self.evolution.generations
+        spent = self.done > 0 and self.record.at["steps"] >= self.budget
+        return good or spent or self.done >= self.evolution.generations
 
     def generation(self) -> None:
         """Train, compare, write down, evolve, and save."""
@@ -130,11 +142,13 @@ class _Evolving:
             update = self.record.at["update"] + 1
             self.record.tick(update, before + steps, self._seconds, metrics)
 
-        until = self.horizon * (self.done + 1) // self.evolution.generations
         seeds = self.seeds / "generation" / self.done
-        self.population.train(until, self.horizon, seeds, on_tick)
+        self.population.train(*self._until(before), seeds, on_tick)
+        before = self.arena.steps_made
         fitness = self.population.fitness(self.arena, seeds / "fitness")
         self._keep_best(fitness, seeds / "fitness")
+        self.fitness_steps = self.arena.steps_made - before
+        self.record.at["steps"] += self.fitness_steps
         self._note(fitness)
         self.done += 1
         if not self.over:
@@ -153,6 +167,18 @@ class _Evolving:
     def close(self) -> None:
         """Release the environments."""
         self.arena.close()
+        if self.population is not None:
+            self.population.close()
+
+    def _until(self, spent: int) -> tuple[int, int]:
+        """Steps of each member at this generation's end, and when schedules end.
+
+        The budget counts measuring fitness too, which takes as many steps as the last time.
+        """
+        left, members = self.evolution.generations - self.done, len(self.population.members)
+        now = self.population.steps // members
+        training = self.budget - spent - left * self.fitness_steps
+        return now + max(1, training // (left * members)), now + max(1, training // members)
 
     @property
     def _seconds(self) -> float:
@@ -194,25 +220,33 @@ class _Evolving:
 
     def _save(self) -> None:
         """A checkpoint of the whole population, as it is to go on."""
-        tensors: dict[str, Tensor] = {}
+        tensors = prefixed("collector", self.population.cut(self.seeds / "cut" / self.done))
         for i, member in enumerate(self.population.members):
-            tensors |= {f"{i}.{k}": v for k, v in vars(member.state).items()}
+            tensors |= prefixed(str(i), vars(member.state))
         buffer = self.population.buffer
         if buffer is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
-            tensors |= {f"buffer.{k}": v for k, v in buffer.state().items()}
+            tensors |= prefixed("buffer", buffer.state())
         header: dict[str, Any] = {
             "generation": self.done,
             "rounds": self.population.rounds,
+            "fitness_steps": self.fitness_steps,
             "next_number": self.population.next_number,
             "lineage_bytes": self.run.lineage.size,
             "members": [_member_to_json(m) for m in self.population.members],
         }
         if self.best is not None:
             weights, about = self.best.policy.to_file()
-            tensors |= {f"best.{k}": v for k, v in weights.items()}
+            tensors |= prefixed("best", weights)
             header["best"] = {"fitness": self.best.fitness, "number": self.best.number}
             header["best"] |= {"generation": self.best.generation, "policy": about}
         self.run.save_checkpoint(Nothing(), self.record.header() | header, tensors)
+
+    def _resume_episodes(self, tensors: dict[str, Tensor]) -> None:
+        """Bring the environments, and what was seen in them, back to where a checkpoint was."""
+        population, saved = self.population, unprefixed("collector", tensors)
+        resume_episodes(population.collector, saved, self.seeds, self.record)
+        if buffer := unprefixed("buffer", tensors):
+            population.load_buffer(buffer)
 
     def _restore(self, at: dict[str, Any], tensors: dict[str, Tensor]) -> None:
         """Stand where a checkpoint says."""
@@ -222,13 +256,13 @@ class _Evolving:
             kind: Any = make_algorithm(member.config, *self.spaces).state_type
             member.state = kind(**{f.name: tensors[f"{i}.{f.name}"] for f in fields(kind)})
             members.append(member)
-        self.population = Population(members, self.evolution, self.phase.make_env, self.spaces)
+        self.population = Population(
+            members, self.evolution, self.phase.make_env, self.spaces, self.seeds
+        )
         self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
-        if buffer := _under("buffer", tensors):
-            self.population.load_buffer(buffer)
-        self.done = at["generation"]
+        self.done, self.fitness_steps = at["generation"], at.get("fitness_steps", 0)
         if best := at.get("best"):
-            weights, where = _under("best", tensors), str(self.run.path)
+            weights, where = unprefixed("best", tensors), str(self.run.path)
             policy = AgentPolicy.from_file(weights, best["policy"], where)
             self.best = Best(best["fitness"], best["number"], best["generation"], policy)
 
@@ -247,11 +281,6 @@ def _member_from_json(told: dict[str, Any]) -> Member:
     origin["changes"] = {k: tuple(v) for k, v in origin["changes"].items()}
     config = config_from_json(told["config"])
     return Member(told["number"], config, None, told["steps"], Origin(**origin))
-
-
-def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    cut = len(prefix) + 1
-    return {k[cut:]: v for k, v in tensors.items() if k.startswith(f"{prefix}.")}
 
 
 def _short(value: Any) -> str:

@@ -16,11 +16,13 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import PPO, AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.buffers.replay import ReplayBuffer
+from skillweave.envs.joined import JoinedEnvs
 from skillweave.evolution.config import Evolution
 from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.selection import select
 from skillweave.evolution.stacks import Member, Origin, copy, grouped, join, split
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
 from skillweave.training.members import Stack
 from skillweave.training.off_policy import make_buffer, train_stacks
@@ -41,11 +43,19 @@ class Population:
     """
 
     def __init__(
-        self, members: list[Member], evolution: Evolution, make_env: MakeEnv, spaces: Any
+        self,
+        members: list[Member],
+        evolution: Evolution,
+        make_env: MakeEnv,
+        spaces: Any,
+        seeds: Seeds,
     ) -> None:
-        self.members, self.evolution = members, evolution
-        self.make_env, self.spaces = make_env, spaces
+        self.members, self.evolution, self.seeds = members, evolution, seeds
+        self.spaces = spaces
         self.next_number = len(members)
+        each, gamma = members[0].config.num_envs, members[0].config.gamma
+        self.collector = Collector(JoinedEnvs([make_env(each, gamma) for _ in members]))
+        """What they act in, place by place: an heir goes on with its place's open episodes."""
         self.rounds = 0
         """Of the off-policy loop, in which all members go side by side."""
         self.buffer: ReplayBuffer | None = None
@@ -70,7 +80,7 @@ class Population:
             member.state = member.algorithm(spaces).init([seeds / "member" / i])
             members.append(member)
         ordered = [m for group in grouped(members, spaces) for m in group]
-        return cls(ordered, evolution, make_env, spaces)
+        return cls(ordered, evolution, make_env, spaces, seeds)
 
     @property
     def steps(self) -> int:
@@ -83,6 +93,8 @@ class Population:
     def train(self, until: int, horizon: int, seeds: Seeds, on_tick: OnTick) -> None:
         """Train every member until it has ``until`` steps; schedules end at ``horizon``."""
         groups = grouped(self.members, self.spaces)
+        gamma = np.array([m.config.gamma for m in self.members])
+        self.collector.env.set_gamma(gamma.repeat(self.members[0].config.num_envs))
         if isinstance(self.members[0].config, PPO):
             self._train_one_by_one(groups, until, horizon, seeds, on_tick)
         else:
@@ -97,22 +109,20 @@ class Population:
         on_tick: OnTick,
     ) -> None:
         """On-policy: a stack's rollouts are its own, so stacks learn one after another."""
-        spent = 0
+        spent = first = 0
+        self.collector.start(self.seeds / "start")
         for i, group in enumerate(groups):
             algorithm: Any
             algorithm, state = join(group, self.spaces, self._made)
             start, count = sum(m.steps for m in group), len(group)
             clock = _Clock(spent, start, on_tick)
-            env = self._env([Stack(algorithm, state)])
-            try:
-                train_on_policy(
-                    algorithm, env, state, seeds / i, until * count, steps=start,
-                    horizon=horizon * count, tolerant=True, cut_every=NEVER, on_tick=clock,
-                )  # fmt: skip
-            finally:
-                env.close()
+            train_on_policy(
+                algorithm, self.collector.part(first, first + count), state, seeds / i,
+                until * count, steps=start, horizon=horizon * count, tolerant=True,
+                cut_every=NEVER, on_tick=clock,
+            )  # fmt: skip
             split(algorithm, state, group, self.spaces)
-            spent += clock.taken
+            spent, first = spent + clock.taken, first + count
             _count(group, clock.taken)
 
     def _train_side_by_side(
@@ -127,38 +137,38 @@ class Population:
         stacks = [Stack(*join(group, self.spaces, self._made)) for group in groups]
         start, count = self.steps, len(self.members)
         clock = _Clock(0, start, on_tick)
-        env = self._env(stacks)
-        try:
-            self.buffer = self.buffer or self._make_buffer(env)
-            train_stacks(
-                stacks, env, seeds, until * count, self.buffer, steps=start, update=self.rounds,
-                horizon=horizon * count, tolerant=True, cut_every=NEVER, on_tick=clock,
-            )  # fmt: skip
-        finally:
-            env.close()
+        self.collector.start(self.seeds / "start")
+        self.buffer = self.buffer or self._make_buffer()
+        train_stacks(
+            stacks, self.collector, seeds, until * count, self.buffer, steps=start,
+            update=self.rounds, horizon=horizon * count, tolerant=True, cut_every=NEVER,
+            on_tick=clock,
+        )  # fmt: skip
         for stack, group in zip(stacks, groups, strict=True):
             split(stack.algorithm, stack.state, group, self.spaces)
         self.rounds = clock.update
         _count(self.members, clock.taken)
 
-    def _env(self, stacks: list[Stack]) -> VecEnv:
-        """An environment for all members of some stacks, each with its own γ."""
-        each = self.members[0].config.num_envs
-        gamma = np.concatenate([s.state.gamma.numpy() for s in stacks]).repeat(each)
-        return self.make_env(len(gamma), gamma)
-
-    def _make_buffer(self, env: VecEnv) -> ReplayBuffer:
+    def _make_buffer(self) -> ReplayBuffer:
         algorithm: Any = self.members[0].algorithm(self.spaces)
-        return make_buffer(algorithm, env, len(self.members), shared=True)
+        return make_buffer(algorithm, self.collector.env, len(self.members), shared=True)
 
     def load_buffer(self, saved: dict[str, torch.Tensor]) -> None:
         """Go on with the replay buffer of a checkpoint."""
-        env = self.make_env(self.members[0].config.num_envs * len(self.members), 0.99)
-        try:
-            self.buffer = self._make_buffer(env)
-            self.buffer.load(saved)
-        finally:
-            env.close()
+        self.buffer = self._make_buffer()
+        self.buffer.load(saved)
+        self.buffer.cut(self.collector.begun_anew)
+
+    def cut(self, seeds: Seeds) -> dict[str, torch.Tensor]:
+        """Make a clean cut; what resuming from it needs of the environments."""
+        begun_anew = self.collector.cut(seeds)
+        if self.buffer is not None:
+            self.buffer.cut(begun_anew)
+        return self.collector.state()
+
+    def close(self) -> None:
+        """Release the environments."""
+        self.collector.env.close()
 
     def fitness(self, env: VecEnv, seeds: Seeds) -> Array:
         """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""

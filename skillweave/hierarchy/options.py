@@ -9,10 +9,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.envs.engine import Engine
+from skillweave.envs.engine import LONGEST_EPISODE, Engine, checksums
 from skillweave.hierarchy.calls import SkillSet
+from skillweave.seeding import Seeds
 from skillweave.spaces import unpack
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.types import Array, SkillweaveError, Step, prefixed, unprefixed
 
 
 class OptionsEnv(VectorEnv[Any, Any, Any]):
@@ -47,7 +48,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = gym.spaces.Discrete(len(skills.skills))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._gamma = np.broadcast_to(np.asarray(gamma, np.float64), (self.num_envs,))
+        self.set_gamma(np.asarray(gamma))
         self._watches = skills.watches
         self._seed = seed
         self._obs: Array = np.empty(0)
@@ -64,8 +65,55 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._memory = self.skills.start(self.num_envs)
         self._obs = self.engine.reset(self._seed)
         self._mask = self.skills.mask(self._obs)
+        self._age = np.zeros(self.num_envs, np.int64)
+        return self.present()
+
+    def present(self) -> tuple[Any, dict[str, Any]]:
+        """What to act on next, and the info that belongs to it."""
         info = {} if self._mask is None else {"action_mask": self._mask}
         return unpack(self.single_observation_space, self._obs), info
+
+    @property
+    def steps_made(self) -> int:
+        """Primitive steps that all environments have made."""
+        return self.engine.steps_made
+
+    def renew(self, seeds: Seeds) -> Array:
+        """Take new seeds; environments whose episodes are too long to be kept begin anew."""
+        self._seed = (seeds / "skills").integer()
+        self._rng = np.random.default_rng(self._seed)
+        self.engine.renew((seeds / "env").integer())
+        return self._begin(np.flatnonzero(self._age > LONGEST_EPISODE))
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs, right after ``renew``; no call is open between steps."""
+        own = {"age": self._age.copy(), "obs": checksums(self._obs), "seed": np.array([self._seed])}
+        own |= prefixed("memory", {k: v.copy() for k, v in self._memory.items()})
+        return own | prefixed("engine", self.engine.state())
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Play the open episodes again; the environments that did not repeat themselves."""
+        self._seed = int(state["seed"][0])
+        self._rng = np.random.default_rng(self._seed)
+        self._age = state["age"].copy()
+        self._memory = {k: v.copy() for k, v in unprefixed("memory", state).items()}
+        self._obs = self.engine.restore(unprefixed("engine", state))
+        return self._begin(np.flatnonzero(checksums(self._obs) != state["obs"]))
+
+    def set_gamma(self, gamma: Array) -> None:
+        """γ of one primitive step in each environment, (N,), from now on."""
+        self._gamma = np.broadcast_to(np.asarray(gamma, np.float64), (self.num_envs,))
+
+    def _begin(self, ids: Array) -> Array:
+        """Start environments ``ids`` (n,) anew; the same ids."""
+        if len(ids):
+            self._obs = self._obs.copy()
+            self._obs[ids] = self.engine.reset_some(ids)
+            self._age[ids] = 0
+            for k, v in self.skills.start(len(ids)).items():
+                self._memory[k][ids] = v
+        self._mask = self.skills.mask(self._obs)
+        return ids
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Run one call in each environment, whichever skills and however long."""
@@ -107,6 +155,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 over = over | ended
             if over.any():
                 rows = rows[~over]
+        self._age = np.where(terminated | truncated, 0, self._age + steps)
         self._obs, self._mask = obs, self.skills.mask(obs)
         info = {
             "steps": steps,

@@ -22,32 +22,37 @@ class Episodes:
     task_returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
     lengths: deque[int] = field(default_factory=lambda: deque(maxlen=WINDOW))
     successes: deque[bool] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    _sums: Array = field(default_factory=lambda: np.zeros((3, 0)))
 
-    def add(self, step: VecStep) -> None:
-        """Take one step of all environments into account."""
-        n = len(step.reward)
-        if self._sums.shape[1] != n:
-            self._sums = np.zeros((3, n))
+    def add(self, step: VecStep, sums: Array) -> None:
+        """Take one step of N environments into account.
+
+        ``sums`` (N, 3) are the open episodes' return, return of the task and length so far.
+        """
         # An options environment sums the undiscounted reward of a call apart.
-        self._sums[0] += step.info.get("call_return", step.reward)
+        sums[:, 0] += step.info.get("call_return", step.reward)
         if "task_reward" in step.info:
-            self._sums[1] += step.info["task_reward"]
-        self._sums[2] += step.steps
-        ended = step.terminated | step.truncated
+            sums[:, 1] += step.info["task_reward"]
+        sums[:, 2] += step.steps
+        ended = step.ended
         if ended.any():
             for i in np.flatnonzero(ended):
-                self.returns.append(float(self._sums[0, i]))
+                self.returns.append(float(sums[i, 0]))
                 if "task_reward" in step.info:
-                    self.task_returns.append(float(self._sums[1, i]))
-                self.lengths.append(int(self._sums[2, i]))
+                    self.task_returns.append(float(sums[i, 1]))
+                self.lengths.append(int(sums[i, 2]))
                 if "success" in step.info:
                     self.successes.append(bool(step.info["success"][i]))
-            self._sums[:, ended] = 0.0
+            sums[ended] = 0.0
 
-    def cut(self) -> None:
-        """Forget the episodes in flight."""
-        self._sums[:] = 0.0
+    def state(self) -> dict[str, Array]:
+        """The latest episodes, to go on from."""
+        return {k: np.array(v, np.float64) for k, v in vars(self).items()}
+
+    def load(self, state: dict[str, Array]) -> None:
+        """The inverse of ``state``."""
+        for name, window in vars(self).items():
+            window.clear()
+            window.extend(state[name].tolist())
 
     def summary(self) -> dict[str, float]:
         """Means over the window; empty before the first episode ended."""
@@ -70,7 +75,8 @@ class Tick:
     metrics: dict[str, float]
     state: Any
     cut: bool  # a clean cut: resuming from this state is exact
-    extra: dict[str, torch.Tensor] | None = None  # what else resuming needs: a replay buffer
+    extra: dict[str, torch.Tensor] | None = None
+    """What else resuming needs: where the environments are, and the replay buffer."""
 
 
 def to_numbers(metrics: dict[str, Any], update: int, *, tolerant: bool = False) -> dict[str, float]:

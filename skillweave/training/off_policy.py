@@ -1,8 +1,8 @@
 """The loop of every off-policy algorithm: act, remember, learn from what is remembered.
 
 A round is ``train_freq`` steps of every environment and the gradient steps that are due after
-them. Budgets count environment steps; the update ratio counts transitions, which a selector has
-one of for each decision.
+them. Budgets and ``learning_starts`` count environment steps; the update ratio counts transitions,
+which a selector has one of for each decision.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from skillweave.algorithms.config import OffPolicy
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.buffers.replay import ReplayBuffer
 from skillweave.seeding import Seeds
-from skillweave.training.episodes import Episodes, Tick, to_numbers
+from skillweave.training.collector import Collector
+from skillweave.training.episodes import Tick, to_numbers
 from skillweave.training.members import Stack, by_member, member_seeds, passed
-from skillweave.types import Array, VecEnv
+from skillweave.types import Array, VecEnv, prefixed
 
 REPORT_EVERY = 1_000
 """Environment steps between reports."""
@@ -57,7 +58,7 @@ def make_buffer(
 
 def train_off_policy(
     algorithm: OffPolicyAlgorithm,
-    env: VecEnv,
+    collector: Collector,
     state: Any,
     seeds: Seeds,
     budget: int,
@@ -70,30 +71,31 @@ def train_off_policy(
     """Train one stack until ``budget`` environment steps are spent; returns the state.
 
     Args:
-        env: P·num_envs environments.
-        saved: the replay buffer as a checkpoint left it (``Tick.extra``). Without, it is filled
-            with ``learning_starts`` transitions before learning begins, or goes on.
+        collector: P·num_envs environments, fresh or under way.
+        saved: the replay buffer as a checkpoint left it (``buffer.…`` of ``Tick.extra``). Without,
+            ``learning_starts`` steps are taken before learning begins, or goes on.
         shared: members learn from what all of them did, not from their own alone.
         on_tick, where: as of ``train_stacks``.
 
     Raises:
         SkillweaveError: parameters or losses are no longer finite.
     """
-    buffer = make_buffer(algorithm, env, len(state.params), shared=shared)
+    buffer = make_buffer(algorithm, collector.env, len(state.params), shared=shared)
     if saved:
         buffer.load(saved)
+        buffer.cut(collector.begun_anew)
 
     def tell(tick: Tick) -> None:
         if on_tick is not None:
             on_tick(replace(tick, state=state))
 
-    train_stacks([Stack(algorithm, state)], env, seeds, budget, buffer, on_tick=tell, **where)
+    train_stacks([Stack(algorithm, state)], collector, seeds, budget, buffer, on_tick=tell, **where)
     return state
 
 
 def train_stacks(
     stacks: Sequence[Stack],
-    env: VecEnv,
+    collector: Collector,
     seeds: Seeds,
     budget: int,
     buffer: ReplayBuffer,
@@ -112,11 +114,10 @@ def train_stacks(
     is that of the first stack.
 
     Args:
-        env: num_envs environments for each member, in the order of the stacks.
+        collector: num_envs environments for each member, in the order of the stacks.
         horizon: steps at which schedules end; None: the budget.
         tolerant: a member that diverges does not stop the others.
-        cut_every: environment steps between clean cuts, at which episodes in flight are
-            truncated and environments restart from a seed of their own (contract 8).
+        cut_every: environment steps between clean cuts (contract 8).
         update, steps, seconds: where a resumed run stands: rounds, and a clean cut.
         on_tick: told every thousand steps, with the stacks as its state; may raise to stop.
 
@@ -125,28 +126,26 @@ def train_stacks(
     """
     started = time.perf_counter() - seconds
     config = stacks[0].algorithm.config
-    loop = _Loop(stacks, env, seeds, horizon or budget, buffer)
+    loop = _Loop(stacks, collector, seeds, horizon or budget, buffer, steps)
     threads = torch.get_num_threads()
     torch.set_num_threads(config.threads)
     try:
-        loop.restart(update)
+        collector.start(seeds / "start")
         while steps < budget:
-            taken = loop.collect(update, steps)
+            loop.collect(update, steps)
+            taken = collector.spent()
             loop.learn(update, steps + taken)
-            cut = passed(cut_every, steps, steps + taken) or steps + taken >= budget
+            over = steps + taken >= budget
+            cut = passed(cut_every, steps, steps + taken) or over
             tick = cut or passed(REPORT_EVERY, steps, steps + taken)
             update, steps = update + 1, steps + taken
-            if cut:
-                buffer.cut()
+            # The last checkpoint needs no more: there is nothing left to learn.
+            extra = loop.cut(update) if cut and not over else None
             if tick and on_tick is not None:
                 metrics = to_numbers(loop.metrics, update, tolerant=tolerant)
-                # The last checkpoint needs no buffer: there is nothing left to learn from it.
-                extra = buffer.state() if cut and config.save_buffer and steps < budget else None
                 seconds = time.perf_counter() - started
-                metrics |= loop.episodes.summary()
+                metrics |= collector.episodes.summary()
                 on_tick(Tick(update, steps, seconds, metrics, stacks, cut, extra))
-            if cut and steps < budget:
-                loop.restart(update)
     finally:
         torch.set_num_threads(threads)
 
@@ -157,45 +156,42 @@ class _Loop:
     def __init__(
         self,
         stacks: Sequence[Stack],
-        env: VecEnv,
+        collector: Collector,
         seeds: Seeds,
         horizon: int,
         buffer: ReplayBuffer,
+        steps: int,
     ) -> None:
-        self.stacks, self.env, self.seeds = stacks, env, seeds
+        self.stacks, self.collector, self.seeds = stacks, collector, seeds
         self.horizon, self.buffer = horizon, buffer
         self.members = sum(s.members for s in stacks)
         self.config = stacks[0].algorithm.config
-        self._each = env.num_envs // self.members
+        self._each = collector.num_envs // self.members
         self._first = [0, *itertools.accumulate(s.members for s in stacks)]
-        self.episodes = Episodes()
+        self._random_until = int(self.config.learning_starts) * self.members
+        # A resumed run whose buffer was not saved fills it by what it has learnt already.
+        self._learns_from = self._random_until + (0 if len(buffer) else steps)
         self.metrics: dict[str, Tensor] = {}
-        self._obs: Array = np.empty(0)
-        self._returns = np.zeros(env.num_envs, np.float32)
+        self._returns = collector.carry("returns", np.zeros(collector.num_envs, np.float32))
 
-    def restart(self, update: int) -> None:
-        """Start every environment anew from a seed of this round's."""
-        self._obs = self.env.reset(self.seeds / "restart" / update)
-        self._returns[:] = 0.0
-        self.episodes.cut()
+    def cut(self, update: int) -> dict[str, Tensor]:
+        """Make a clean cut; what resuming from it needs besides the states."""
+        self.buffer.cut(self.collector.cut(self.seeds / "cut" / update))
+        buffer = self.buffer.state() if self.config.save_buffer else {}
+        return prefixed("collector", self.collector.state()) | prefixed("buffer", buffer)
 
     @torch.no_grad()
-    def collect(self, update: int, steps: int) -> int:
-        """Act ``train_freq`` times in every environment; the environment steps it took."""
-        env, spent = self.env, 0
+    def collect(self, update: int, steps: int) -> None:
+        """Act ``train_freq`` times in every environment."""
+        collector = self.collector
         actors = [_Actor(self, i, update, steps) for i in range(len(self.stacks))]
-        mask = env.mask()
         for at in range(self.config.train_freq):
-            obs = self._obs
+            obs, mask = collector.obs, collector.mask()
             chosen = [actor.act(obs, mask, at) for actor in actors]
             action = chosen[0] if len(chosen) == 1 else np.concatenate(chosen)
-            step = env.step(self.stacks[0].algorithm.to_env(action))
+            step = collector.step(self.stacks[0].algorithm.to_env(action))
             self.buffer.add(obs, mask, action, step)
-            self.episodes.add(step)
             self._see(obs, step)
-            self._obs, mask = step.obs, step.mask
-            spent += int(step.steps.sum())
-        return spent
 
     def rows(self, stack: int) -> slice:
         """The environments of a stack."""
@@ -206,10 +202,9 @@ class _Loop:
         members = self.stacks[stack].members
         return member_seeds(self.seeds, name, members, update, self._first[stack])
 
-    def acts_at_random(self, update: int) -> bool:
+    def acts_at_random(self, steps: int) -> bool:
         """Whether it is too early to act by what was learnt."""
-        # A resumed run whose buffer was not saved fills it by what it has learnt already.
-        return update * self._round < int(self.config.learning_starts)
+        return steps < self._random_until
 
     @property
     def _round(self) -> int:
@@ -224,15 +219,13 @@ class _Loop:
             if algorithm.config.normalize_rewards:
                 gamma = np.repeat(state.gamma.numpy(), self._each)
                 now = self._returns[part] * gamma ** step.steps[part] + step.reward[part]
-                self._returns[part] = now.astype(np.float32)  # a power of integers has 64 bits
+                self._returns[part] = now
                 algorithm.see_returns(state, by_member(self._returns[part], stack.members))
         self._returns[step.ended] = 0.0
 
     def learn(self, update: int, steps: int) -> None:
         """Make the gradient steps that are due after this round."""
-        starts = int(self.config.learning_starts)
-        own = len(self.buffer) // self.members
-        if own < min(starts, self.buffer.capacity // self.members // 2):
+        if steps <= self._learns_from:
             return
         found = [self._learn(i, update, steps) for i in range(len(self.stacks))]
         if all(found):
@@ -262,8 +255,8 @@ class _Loop:
         return metrics
 
     def _owed(self, config: OffPolicy, update: int) -> int:
-        """Gradient steps that are due once ``update`` rounds are over."""
-        return max(0, int((update * self._round - config.learning_starts) * config.update_ratio))
+        """Gradient steps that would be due once ``update`` rounds are over, had all been learnt."""
+        return int(update * self._round * config.update_ratio)
 
 
 class _Actor:
@@ -275,7 +268,7 @@ class _Actor:
         self._actor = algorithm.actor(self._stack.state, min(1.0, steps / loop.horizon))
         self._generators = [s.torch() for s in loop.seeds_of(at, "act", update)]
         self._noises = algorithm.noise(self._generators, loop.config.train_freq, loop._each)
-        self._at_random = loop.acts_at_random(update)
+        self._at_random = loop.acts_at_random(steps)
 
     def act(self, obs: Array, mask: Array | None, at: int) -> Array:
         """Actions of the stack's environments in policy units, given all environments' rows."""

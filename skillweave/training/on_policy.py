@@ -13,19 +13,21 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from skillweave.algorithms.base import Actor
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.buffers.rollout import RolloutBuffer
 from skillweave.seeding import Seeds
-from skillweave.training.episodes import Episodes, Tick, to_numbers
+from skillweave.training.collector import Collector
+from skillweave.training.episodes import Tick, to_numbers
 from skillweave.training.members import by_member, member_seeds, passed
-from skillweave.types import Array, VecEnv
+from skillweave.types import prefixed
 
 
 def train_on_policy(
     algorithm: PPOAlgorithm,
-    env: VecEnv,
+    collector: Collector,
     state: State,
     seeds: Seeds,
     budget: int,
@@ -41,35 +43,35 @@ def train_on_policy(
     """Train until ``budget`` environment steps are spent.
 
     Args:
-        env: P·num_envs environments.
+        collector: P·num_envs environments, fresh or under way.
         horizon: steps at which schedules end; None: the budget.
         tolerant: a member that diverges does not stop the others.
-        cut_every: environment steps between clean cuts, at which episodes in flight are
-            truncated and environments restart from a seed of their own (contract 8).
+        cut_every: environment steps between clean cuts (contract 8).
         update, steps, seconds: where a resumed run stands; a clean cut.
         on_tick: told after every update; may raise to stop.
 
     Raises:
         SkillweaveError: parameters or losses are no longer finite.
     """
-    loop = _Loop(algorithm, env, seeds, members=len(state.params))
+    loop = _Loop(algorithm, collector, seeds, members=len(state.params))
     started = time.perf_counter() - seconds
     learner = _Learner(algorithm, state, loop, horizon or budget, tolerant, on_tick, started)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         actor = algorithm.actor(state)
-        loop.restart(update)
+        collector.start(seeds / "start")
         while steps < budget:
-            rollout, taken = loop.collect(actor, state, update)
+            rollout = loop.collect(actor, state, update)
+            taken = collector.spent()
             actor = learner.wait(actor)
             learner.start(rollout, update, steps, steps + taken)
-            cut = passed(cut_every, steps, steps + taken) or steps + taken >= budget
+            over = steps + taken >= budget
+            cut = passed(cut_every, steps, steps + taken) or over
             update, steps = update + 1, steps + taken
             if cut or not algorithm.config.overlap:
-                actor = learner.wait(actor, cut)
-                if cut and steps < budget:
-                    loop.restart(update)
+                extra = loop.cut(update) if cut and not over else None
+                actor = learner.wait(actor, cut, extra)
     finally:
         learner.close()
         torch.set_num_threads(threads)
@@ -95,21 +97,25 @@ class _Learner:
         self._worker = ThreadPoolExecutor(1, "learner", set_threads, (algorithm.config.threads,))
         self._pending: Future[dict[str, float]] | None = None
         self._at = (0, 0)  # the pending update's number, and the steps when it is done
+        self._told: dict[str, float] = {}  # of the episodes, when its rollout was complete
 
     def start(self, rollout: Rollout, update: int, before: int, after: int) -> None:
         """Begin to learn from a rollout that was collected from step ``before`` to ``after``."""
         self._at = (update + 1, after)
+        self._told = self.loop.collector.episodes.summary()
         self._pending = self._worker.submit(self._learn, rollout, update, before / self.horizon)
 
-    def wait(self, actor: Actor, cut: bool = False) -> Actor:
+    def wait(
+        self, actor: Actor, cut: bool = False, extra: dict[str, Tensor] | None = None
+    ) -> Actor:
         """Let a pending update end, report it, and return what acts from now on."""
         if self._pending is None:
             return actor
         metrics, self._pending = self._pending.result(), None
         if self.on_tick is not None:
-            metrics |= self.loop.episodes.summary()
+            metrics |= self._told
             elapsed = time.perf_counter() - self.started
-            self.on_tick(Tick(*self._at, elapsed, metrics, self.state, cut))
+            self.on_tick(Tick(*self._at, elapsed, metrics, self.state, cut, extra))
         return self.algorithm.actor(self.state)
 
     def close(self) -> None:
@@ -123,52 +129,61 @@ class _Learner:
 
 
 class _Loop:
-    """One environment and the policy that acts in it, a rollout at a time."""
+    """Environments and the policy that acts in them, a rollout at a time."""
 
-    def __init__(self, algorithm: PPOAlgorithm, env: VecEnv, seeds: Seeds, members: int) -> None:
-        self.algorithm, self.env, self.seeds, self.members = algorithm, env, seeds, members
-        self.episodes = Episodes()
-        self._obs: Array = np.empty(0)
-        self._memory: torch.Tensor | None = None
+    def __init__(
+        self, algorithm: PPOAlgorithm, collector: Collector, seeds: Seeds, members: int
+    ) -> None:
+        self.algorithm, self.collector = algorithm, collector
+        self.seeds, self.members = seeds, members
 
     def member_seeds(self, name: str, update: int) -> list[Seeds]:
         """A node of the seed tree for each member."""
         return member_seeds(self.seeds, name, self.members, update)
 
-    def restart(self, update: int) -> None:
-        """Start every environment anew from a seed of this update's."""
-        self._obs = self.env.reset(self.seeds / "restart" / update)
-        self.episodes.cut()
-        if size := self.algorithm.memory:
-            p = self.members
-            self._memory = torch.zeros(p, self.env.num_envs // p, size)
+    def cut(self, update: int) -> dict[str, Tensor]:
+        """Make a clean cut; what resuming from it needs of the environments."""
+        self.collector.cut(self.seeds / "cut" / update)
+        return prefixed("collector", self.collector.state())
 
     @torch.inference_mode()
-    def collect(self, actor: Actor, state: State, update: int) -> tuple[Rollout, int]:
-        """A rollout and the environment steps it took."""
-        algorithm, env = self.algorithm, self.env
-        t, n, p = algorithm.config.n_steps, env.num_envs, self.members
-        buffer = RolloutBuffer(t, n, p, env.observation_space)
+    def collect(self, actor: Actor, state: State, update: int) -> Rollout:
+        """A rollout of ``n_steps`` environment steps of each environment.
+
+        Where actions last several steps it has fewer of them, and may last longer by one.
+        """
+        algorithm, collector, p = self.algorithm, self.collector, self.members
+        t, n = algorithm.config.n_steps, collector.num_envs
+        buffer = RolloutBuffer(t, n, p, collector.env.observation_space)
         generators = [s.torch() for s in self.member_seeds("act", update)]
         noises = algorithm.noise(generators, t, n // p)
-        mask, spent, before = env.mask(), 0, self._memory
+        memory = self._memory()
+        before = None if memory is None else memory.clone()
         starts = torch.zeros(p, t, n // p, dtype=torch.bool)
+        spent = 0
         for i, noise in enumerate(noises):
-            obs = self._obs
+            obs, mask = collector.obs, collector.mask()
             rows = by_member(obs, p)
             allowed = None if mask is None else by_member(mask, p)
-            action, head, memory = algorithm.act(actor, rows, allowed, noise, self._memory)
-            step = env.step(algorithm.to_env(action.flatten(0, 1).numpy()))
+            action, head, after = algorithm.act(actor, rows, allowed, noise, memory)
+            step = collector.step(algorithm.to_env(action.flatten(0, 1).numpy()))
             buffer.add(obs, mask, action, head, step)
-            self.episodes.add(step)
-            self._obs, mask = step.obs, step.mask
             spent += int(step.steps.sum())
-            if memory is not None:
+            if memory is not None and after is not None:
                 ended = torch.from_numpy(step.ended).view(p, -1)
-                self._memory = memory * ~ended[..., None]
+                memory.copy_(after * ~ended[..., None])
                 if i + 1 < t:
                     starts[:, i + 1] = ended
+            if spent >= t * n:
+                break
         transition, head = buffer.read(state.gamma)
         log_std = actor.views.get("actor.log_std")
         log_std = None if log_std is None else log_std[:, None]
-        return Rollout(transition, head, log_std, before, starts), spent
+        return Rollout(transition, head, log_std, before, starts[:, : transition.reward.shape[1]])
+
+    def _memory(self) -> Tensor | None:
+        """What the network remembers of each environment, (P, B, M), kept by the collector."""
+        if not (size := self.algorithm.memory):
+            return None
+        kept = self.collector.carry("memory", np.zeros((self.collector.num_envs, size), np.float32))
+        return by_member(kept, self.members)

@@ -5,18 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from torch import Tensor
+
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
 from skillweave.training.off_policy import train_off_policy
 from skillweave.training.on_policy import train_on_policy
 from skillweave.training.probe import MakeEnv, Probe
+from skillweave.types import unprefixed
 
-START = {"update": 0, "steps": 0, "seconds": 0.0, "metrics": {}}
+START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
 """Where a phase stands before its first update."""
 
 
@@ -76,6 +80,7 @@ class Record:
         self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: dict[str, Any]
     ) -> None:
         self.run, self.listeners, self.entry, self.at = run, listeners, run.phase(name), at
+        at.setdefault("evaluation_steps", 0)  # a checkpoint from before these were counted
         run.rewind_metrics(at.get("metrics_bytes", self.entry.get("metrics_bytes")))
         self.entry.setdefault("metrics_bytes", run.metrics_size())
         self.entry["status"] = "training"
@@ -92,10 +97,15 @@ class Record:
         for listener in self.listeners:
             listener.tick(name, steps, seconds, metrics)
 
+    def tell(self, text: str) -> None:
+        """Something that people should know."""
+        for listener in self.listeners:
+            listener.message(f"{self.entry['name']}: {text}")
+
     def header(self) -> dict[str, Any]:
         """Where the phase stands, for its checkpoint."""
         return {"phase": self.entry["name"]} | {
-            k: self.at[k] for k in ("update", "steps", "seconds", "metrics")
+            k: self.at[k] for k in ("update", "steps", "evaluation_steps", "seconds", "metrics")
         }
 
     def done(self, policy: AgentPolicy) -> None:
@@ -103,11 +113,27 @@ class Record:
         entry, at = self.entry, self.at
         self.run.save_policy(entry["name"], policy)
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
+        entry["evaluation_steps"] = at["evaluation_steps"]
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
         entry["final"] = at["metrics"]
         self.run.save()
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
+
+
+def resume_episodes(
+    collector: Collector, saved: dict[str, Tensor], seeds: Seeds, record: Record
+) -> None:
+    """Bring the environments back to where a checkpoint left them; say where that cannot be."""
+    if not saved:
+        return
+    collector.restore(saved, seeds / "restart" / record.at["update"])
+    if count := len(collector.begun_anew):
+        record.tell(
+            f"{count} of {collector.num_envs} episodes in flight begin anew, so the end may differ "
+            "from that of an undisturbed run: the environment does not repeat itself when it is "
+            "given the same seed and the same actions"
+        )
 
 
 def train_phase(
@@ -129,11 +155,14 @@ def train_phase(
         found = run.load_checkpoint(algorithm.state_type, phase.name)
         state, at, extra = found or (algorithm.init([seeds / "member" / 0]), dict(START), {})
         record = Record(phase.name, run, listeners, at)
+        collector = Collector(env)
+        resume_episodes(collector, unprefixed("collector", extra), seeds, record)
         probe.start(at["steps"])
 
         def on_tick(tick: Tick) -> None:
             metrics = tick.metrics
             metrics |= probe.look(tick.steps, lambda: AgentPolicy.of(algorithm, tick.state))
+            record.at["evaluation_steps"] += probe.spent()
             record.tick(tick.update, tick.steps, tick.seconds, metrics)
             if tick.cut:
                 run.save_checkpoint(tick.state, record.header(), tick.extra)
@@ -141,9 +170,10 @@ def train_phase(
         where: dict[str, Any] = {k: at[k] for k in ("update", "steps", "seconds")}
         where |= {"cut_every": int(run.manifest["cut_every"]), "on_tick": on_tick}
         if isinstance(algorithm, PPOAlgorithm):
-            train_on_policy(algorithm, env, state, seeds, budget, **where)
+            train_on_policy(algorithm, collector, state, seeds, budget, **where)
         elif isinstance(algorithm, OffPolicyAlgorithm):
-            train_off_policy(algorithm, env, state, seeds, budget, saved=extra, **where)
+            saved = unprefixed("buffer", extra)
+            train_off_policy(algorithm, collector, state, seeds, budget, saved=saved, **where)
     finally:
         env.close()
         probe.close()

@@ -44,6 +44,7 @@ class Probe:
         self._make: Callable[[], VecEnv] = lambda: make_env(episodes, gamma)
         self._seeds, self._every, self._last = seeds / "probe", every, 0
         self._env: VecEnv | None = None
+        self._counted = 0
 
     def start(self, steps: int) -> None:
         """Training stands at ``steps``: what was due until here is done."""
@@ -57,6 +58,12 @@ class Probe:
         self._env = self._env or self._make()
         returns = episode_returns(policy(), self._env, self._seeds)
         return {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
+
+    def spent(self) -> int:
+        """Environment steps made since this was last asked."""
+        made = 0 if self._env is None else self._env.steps_made
+        since, self._counted = made - self._counted, made
+        return since
 
     def close(self) -> None:
         """Release the environments."""

@@ -29,6 +29,7 @@ from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.on_policy import train_on_policy
 from skillweave.types import SkillweaveError
 
@@ -452,7 +453,7 @@ def watched(config: PPO, updates: int = 3) -> Watched:
     env = Echo(8, "vector", "Discrete")  # its episodes last 3 or 4 steps, a rollout 16
     algorithm = Watched(config, env.observation_space, env.action_space)
     state = algorithm.init([Seeds(0)])
-    train_on_policy(algorithm, env, state, Seeds(0), updates * 128)
+    train_on_policy(algorithm, Collector(env), state, Seeds(0), updates * 128)
     return algorithm
 
 

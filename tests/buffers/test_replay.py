@@ -55,7 +55,7 @@ def line(rewards, ends="", capacity=100, steps=None, **kwargs) -> ReplayBuffer:
             ),
         )
         if end == "c":
-            buffer.cut()
+            buffer.cut(np.arange(1))
     return buffer
 
 
@@ -103,11 +103,11 @@ def test_overwritten_steps_are_gone():
 
 def test_cutting_an_empty_or_a_cut_buffer_does_nothing():
     buffer = ReplayBuffer(10, 1, 1, SPACE, (), np.int64)
-    buffer.cut()
+    buffer.cut(np.arange(1))
     assert len(buffer) == 0
     buffer = line([1, 2], ".c")
     before = buffer.state()
-    buffer.cut()
+    buffer.cut(np.arange(1))
     after = buffer.state()
     assert all(torch.equal(after[name], before[name]) for name in before)
 
@@ -141,7 +141,7 @@ class World:
 
     def __post_init__(self) -> None:
         self.history: list[list[Kept]] = []
-        self.restart()
+        self.obs, self.mask = self.draw(), self.draw_mask()
 
     def draw(self):
         return self.rng.random((self.num_envs, 2), dtype=np.float32)
@@ -150,8 +150,15 @@ class World:
         given = self.rng.random() < self.masked
         return self.rng.random((self.num_envs, A)) < 0.5 if given else None
 
-    def restart(self) -> None:
-        self.obs, self.mask = self.draw(), self.draw_mask()
+    def restart(self, columns: np.ndarray) -> None:
+        obs, mask = self.draw(), self.draw_mask()
+        self.obs = self.obs.copy()
+        self.obs[columns] = obs[columns]
+        if len(columns) == self.num_envs:
+            self.mask = mask
+        elif self.mask is not None and mask is not None:
+            self.mask = self.mask.copy()
+            self.mask[columns] = mask[columns]
 
     def step(self) -> None:
         n, rng = self.num_envs, self.rng
@@ -181,10 +188,12 @@ class World:
         self.obs, self.mask = step.obs, mask
 
     def cut(self) -> None:
-        self.buffer.cut()
-        if self.history:
-            self.history[-1] = [replace(kept, ended=True) for kept in self.history[-1]]
-        self.restart()
+        """Some environments begin anew."""
+        columns = np.flatnonzero(self.rng.random(self.num_envs) < 0.5)
+        self.buffer.cut(columns)
+        for i in columns if self.history else ():
+            self.history[-1][i] = replace(self.history[-1][i], ended=True)
+        self.restart(columns)
 
     def expected(self, index: int, n_step: int, gamma: float) -> dict:
         t, column = divmod(index, self.num_envs)

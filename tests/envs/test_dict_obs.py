@@ -6,7 +6,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from skillweave.envs.engine import EnvPoolEngine
+from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.foreign import FromVectorEnv
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.envs.skill_env import SkillEnv

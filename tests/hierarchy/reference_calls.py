@@ -5,7 +5,9 @@ Nothing here uses ``skillweave.hierarchy`` or ``skillweave.envs``: the tests com
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -154,8 +156,9 @@ class Scalar:
     def __post_init__(self) -> None:
         self.policies = self.policies or tuple(s.policy for s in self.skills)
 
-    def reset(self, seed: int) -> Array:
-        self.obs, _ = self.env.reset(seed=int(seed))
+    def reset(self, seeds: Iterator[int]) -> Array:
+        self.seeds = seeds
+        self.obs, _ = self.env.reset(seed=next(seeds))
         return self.obs
 
     def allowed(self) -> list[bool]:
@@ -184,7 +187,7 @@ class Scalar:
                 break
         final = self.obs
         if terminated or truncated:
-            self.obs, _ = self.env.reset()
+            self.obs, _ = self.env.reset(seed=next(self.seeds))
         return Outcome(
             obs=self.obs,
             next_obs=final,
@@ -210,6 +213,12 @@ def one_step(
     )  # fmt: skip
 
 
-def seeds_of(seed: int, n: int) -> list[int]:
-    """The seeds that Gymnasium's engine gives its environments."""
-    return [int(s) >> 1 for s in np.random.SeedSequence(seed).generate_state(n, np.uint32)]
+def seeds_of(seed: int, n: int) -> list[Iterator[int]]:
+    """For each environment the seeds that Gymnasium's engine gives its episodes."""
+
+    def of(row: int) -> Iterator[int]:
+        for episode in itertools.count():
+            node = np.random.SeedSequence(seed, spawn_key=(row, episode))
+            yield int(node.generate_state(1, np.uint32)[0]) >> 1
+
+    return [of(row) for row in range(n)]

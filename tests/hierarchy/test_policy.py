@@ -1,5 +1,7 @@
 """HierarchyPolicy acts as OptionsEnv does, and remembers each environment for itself."""
 
+from collections.abc import Iterator
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -237,9 +239,9 @@ class One:
             self.running = None
 
 
-def play_one(one: One, seed: int, steps: int) -> list[tuple[int, int]]:
+def play_one(one: One, seeds: Iterator[int], steps: int) -> list[tuple[int, int]]:
     env, happened = Walk(), []
-    obs, _ = env.reset(seed=seed)
+    obs, _ = env.reset(seed=next(seeds))
     for _ in range(steps):
         action = one.act(obs)
         happened.append((one.running, action))
@@ -247,7 +249,7 @@ def play_one(one: One, seed: int, steps: int) -> list[tuple[int, int]]:
         one.observe((obs, action, next_obs, reward, terminated, truncated, info))
         obs = next_obs
         if terminated or truncated:
-            obs, _ = env.reset()
+            obs, _ = env.reset(seed=next(seeds))
             one.start()
     return happened
 

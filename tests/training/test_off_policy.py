@@ -13,9 +13,10 @@ from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
 from skillweave.training.off_policy import make_buffer, train_off_policy
-from skillweave.types import SkillweaveError
+from skillweave.types import SkillweaveError, unprefixed
 
 SETTINGS: dict[str, Any] = {
     "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 400, "gamma": 0.9,
@@ -56,7 +57,7 @@ def spied(config: DQN, budget: int, env: Any = None, members: int = 1, **where: 
     env = env or Identity(4 * members)
     spy = Spy(config, env.observation_space, env.action_space)
     state = spy.init([Seeds(m) for m in range(members)])
-    train_off_policy(spy, env, state, Seeds(0), budget, **where)
+    train_off_policy(spy, Collector(env), state, Seeds(0), budget, **where)
     return spy
 
 
@@ -92,8 +93,9 @@ def test_a_selector_learns_by_its_decisions_and_its_budget_counts_steps():
     spy = spied(CONFIG, 1000, Calls(4, (False, True)), on_tick=ticks.append)
     assert ticks[-1].steps == 1000
     assert spy.log.count("random") + spy.log.count("act") == 25
-    assert spy.log.count("learn") == 60
-    assert spy.spent == pytest.approx(np.repeat(np.arange(440, 1001, 40), 4) / 1000)
+    assert spy.log.count("random") == 1  # learning_starts counts steps, too
+    assert spy.log.count("learn") == 96
+    assert spy.spent == pytest.approx(np.repeat(np.arange(80, 1001, 40), 4) / 1000)
 
 
 def test_priorities_come_back_and_their_correction_becomes_whole():
@@ -134,14 +136,16 @@ def test_reports_come_every_thousand_steps_and_at_cuts_and_the_buffer_at_cuts_bu
     assert ticks[-1].metrics["return"] == ticks[-1].metrics["length"] == 5.0
     assert {"loss", "q", "grad_norm", "learning_rate"} <= ticks[-1].metrics.keys()
     ticks.clear()
-    learn(replace(config, save_buffer=False), Countdown(4), 2000, on_tick=ticks.append)
-    assert [t.extra for t in ticks] == [None, None]
+    once = {"cut_every": 1000, "on_tick": ticks.append}
+    learn(replace(config, save_buffer=False), Countdown(4), 2000, **once)
+    assert unprefixed("collector", ticks[0].extra)
+    assert not unprefixed("buffer", ticks[0].extra)
 
 
-def test_what_a_cut_broke_off_is_neither_an_episode_nor_learnt_as_one():
+def test_a_cut_ends_no_episode_and_nothing_is_learnt_as_an_end():
     ticks: list[Tick] = []
-    spy = spied(CONFIG, 4 * 7 * 6, Countdown(4), cut_every=4 * 7, on_tick=ticks.append)
-    assert {t.metrics["length"] for t in ticks} == {5.0}
+    spy = spied(CONFIG, 4 * 7 * 6, Countdown(4), cut_every=4 * 3, on_tick=ticks.append)
+    assert {t.metrics["length"] for t in ticks[1:]} == {5.0}
     for s in spy.samples:  # what follows the step t is t + 1, also at a cut
         assert torch.equal(s.next_obs, s.obs + 1)
         assert torch.equal(s.discount == 0.0, s.obs == 4)
@@ -178,12 +182,20 @@ def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights(name):
         learn(config, kind(4), 500, on_tick=stop_at_second_cut, **once)
     tick, state = saved[-1]
     assert (tick.update, tick.steps) == (60, 240)
-    where = {"saved": tick.extra, "update": 60, "steps": 240, **once}
+
+    def under_way() -> Collector:
+        collector = Collector(kind(4))
+        collector.restore(unprefixed("collector", tick.extra), Seeds(0))
+        return collector
+
+    where = {"saved": unprefixed("buffer", tick.extra), "update": 60, "steps": 240, **once}
+    where["collector"] = under_way()
     _, resumed = learn(config, kind(4), 500, state=copied(state), **where)
     for f in fields(state):
         assert torch.equal(getattr(resumed, f.name), getattr(whole, f.name)), f.name
     # The buffer is part of it:
-    _, without = learn(config, kind(4), 500, state=copied(state), **{**where, "saved": None})
+    where |= {"saved": None, "collector": under_way()}
+    _, without = learn(config, kind(4), 500, state=copied(state), **where)
     assert not torch.equal(without.params, whole.params)
 
 
@@ -191,10 +203,10 @@ def test_a_resumed_run_without_its_buffer_fills_it_by_what_it_has_learnt():
     env = Identity(4)
     spy = Spy(replace(CONFIG, save_buffer=False), env.observation_space, env.action_space)
     state = spy.init([Seeds(0)])
-    train_off_policy(spy, env, state, Seeds(0), 400, update=50, steps=200)
+    train_off_policy(spy, Collector(env), state, Seeds(0), 400, update=50, steps=200)
     assert "random" not in spy.log
-    assert spy.log[:10] == ["act"] * 10  # until there are 40 transitions again
-    assert spy.log[10:15] == ["learn"] * 4 + ["act"]
+    assert spy.log[:11] == ["act"] * 11  # until there are more than 40 transitions again
+    assert spy.log[11:16] == ["learn"] * 4 + ["act"]
 
 
 @pytest.mark.parametrize("kind", [DQN, SAC, TD3])

@@ -22,8 +22,9 @@ from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.envs.skill_env import SkillEnv
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.on_policy import Tick, train_on_policy
-from skillweave.types import SkillweaveError
+from skillweave.types import SkillweaveError, unprefixed
 
 CONFIG = PPO(
     num_envs=16, n_steps=16, batch_size=64, learning_rate=5e-3, gamma=0.9, ent_coef=0.0,
@@ -42,7 +43,8 @@ def train(
     """Train for so many updates where an action lasts one step."""
     algorithm, state = start(env, config)
     budget = updates * config.n_steps * env.num_envs
-    return algorithm, train_on_policy(algorithm, env, state, Seeds(seed), budget, **kwargs)
+    collector = Collector(env)
+    return algorithm, train_on_policy(algorithm, collector, state, Seeds(seed), budget, **kwargs)
 
 
 def greedy(algorithm: PPOAlgorithm, state: State, obs: np.ndarray, mask=None) -> np.ndarray:
@@ -116,7 +118,7 @@ def test_the_value_of_calls_discounts_by_their_length(allowed, value):
     env = Calls(16, allowed)
     algorithm, state = start(env)
     budget = 60 * 16 * 16 * (1 if allowed[0] else 10)
-    state = train_on_policy(algorithm, env, state, Seeds(0), budget)
+    state = train_on_policy(algorithm, Collector(env), state, Seeds(0), budget)
     assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(value, rel=0.05)
 
 
@@ -124,7 +126,7 @@ def test_the_value_of_calls_discounts_by_their_length(allowed, value):
 def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_step(overlap):
     env = Calls(16)  # without γ^τ the long call would look three times as good
     algorithm, state = start(env, replace(CONFIG, overlap=overlap))
-    state = train_on_policy(algorithm, env, state, Seeds(0), 40_000)
+    state = train_on_policy(algorithm, Collector(env), state, Seeds(0), 40_000)
     assert greedy(algorithm, state, np.zeros((1, 1), np.float32)).tolist() == [0]
     assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(10.0, rel=0.1)
 
@@ -132,8 +134,8 @@ def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_ste
 def test_a_budget_counts_the_steps_of_calls_and_not_the_calls():
     env, ticks = Calls(16, (False, True)), []
     algorithm, state = start(env)
-    train_on_policy(algorithm, env, state, Seeds(0), 5000, on_tick=ticks.append)
-    assert [t.steps for t in ticks] == [2560, 5120]
+    train_on_policy(algorithm, Collector(env), state, Seeds(0), 5000, on_tick=ticks.append)
+    assert ticks[-1].steps == 5120
 
 
 @pytest.mark.parametrize("overlap", [True, False])
@@ -143,14 +145,14 @@ def test_a_stack_of_three_trains_like_three_single_members(overlap):
     env = Clockwork(range(12))
     algorithm, state = start(env, config, members=3)
     stack = train_on_policy(
-        algorithm, env, state, Seeds(5), updates * 12 * 16, cut_every=2 * 12 * 16
+        algorithm, Collector(env), state, Seeds(5), updates * 12 * 16, cut_every=2 * 12 * 16
     )
     for m in range(3):
         env = Clockwork(range(4 * m, 4 * m + 4))
         single = algorithm.init([Seeds(m)])
         seeds = SeedsOfMember(Seeds(5), m)
         single = train_on_policy(
-            algorithm, env, single, seeds, updates * 4 * 16, cut_every=2 * 4 * 16
+            algorithm, Collector(env), single, seeds, updates * 4 * 16, cut_every=2 * 4 * 16
         )
         assert single.count.tolist() == [updates * 16]
         torch.testing.assert_close(stack.params[m], single.params[0], rtol=1e-3, atol=1e-4)
@@ -187,7 +189,8 @@ class Spy(PPOAlgorithm):
 def test_data_is_one_update_old_with_overlap_but_fresh_after_a_cut(overlap, lags):
     env = Identity(16)
     spy = Spy(replace(CONFIG, overlap=overlap), env.observation_space, env.action_space)
-    train_on_policy(spy, env, spy.init([Seeds(0)]), Seeds(0), 6 * 256, cut_every=3 * 256)
+    state = spy.init([Seeds(0)])
+    train_on_policy(spy, Collector(env), state, Seeds(0), 6 * 256, cut_every=3 * 256)
     assert spy.lags == lags
 
 
@@ -231,9 +234,10 @@ def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights(overlap):
     assert (tick.update, tick.steps) == (6, 6 * rollout)
     env = Identity(16)
     algorithm, _ = start(env, config)
-    resumed = train_on_policy(
-        algorithm, env, state, Seeds(0), 10 * rollout, update=tick.update, steps=tick.steps, **once
-    )
+    collector = Collector(env)
+    collector.restore(unprefixed("collector", tick.extra), Seeds(0))
+    at = {"update": tick.update, "steps": tick.steps}
+    resumed = train_on_policy(algorithm, collector, state, Seeds(0), 10 * rollout, **at, **once)
     for f in fields(State):
         assert torch.equal(getattr(resumed, f.name), getattr(whole, f.name)), f.name
 
@@ -255,14 +259,22 @@ def test_reported_returns_and_lengths_are_those_of_whole_episodes():
     assert ticks[-1].metrics["length"] == 5.0
 
 
-def test_what_a_cut_broke_off_is_not_counted_into_the_next_episode():
+def test_a_cut_ends_no_episode():
     ticks: list[Tick] = []
-    # rollouts of 7 steps, each cut: one episode of 5 steps, and 2 of the next
-    config = replace(CONFIG, n_steps=7)
-    train(Countdown(16), 3, config, cut_every=7 * 16, on_tick=ticks.append)
-    assert [t.cut for t in ticks] == [True] * 3
-    assert [t.metrics["return"] for t in ticks] == [5.0] * 3
-    assert [t.metrics["length"] for t in ticks] == [5.0] * 3
+    # rollouts of 3 steps, each cut, and episodes of 5
+    config = replace(CONFIG, n_steps=3, batch_size=48)
+    train(Countdown(16), 5, config, cut_every=3 * 16, on_tick=ticks.append)
+    assert [t.cut for t in ticks] == [True] * 5
+    assert ["return" in t.metrics for t in ticks] == [False, True, True, True, True]
+    assert {t.metrics["length"] for t in ticks[1:]} == {5.0}
+
+
+def test_a_rollout_is_full_when_its_environment_steps_are_made():
+    env, ticks = Calls(16, (False, True)), []  # calls of 10 steps, where a rollout has 16
+    algorithm, state = start(env)
+    train_on_policy(algorithm, Collector(env), state, Seeds(0), 3 * 320, on_tick=ticks.append)
+    assert [t.steps for t in ticks] == [320, 640, 960]
+    assert [t.metrics["samples"] for t in ticks] == [32, 32, 32]
 
 
 def test_learning_that_diverges_is_an_error_that_says_what_where_and_when():

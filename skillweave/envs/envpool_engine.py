@@ -1,0 +1,203 @@
+"""EnvPool as an engine: C++ threads, the same dynamics, several times the speed."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.envs.engine import RawStep
+from skillweave.envs.history import History
+from skillweave.types import Array, MissingExtra, SkillweaveError
+
+RENEW_AFTER = 100_000
+"""Steps since their seeds after which environments get new ones, as their episodes end."""
+
+
+class EnvPoolEngine:
+    """EnvPool's environments.
+
+    A pool takes its seeds when it is made, so an environment can be played again only from there.
+    To keep that short, ``renew`` makes a second pool now and then, in which environments go on
+    whose episodes have ended in the first one.
+    """
+
+    def __init__(self, env_id: str, num_envs: int, threads: int, spaces: gym.Env[Any, Any]) -> None:
+        self._id, self._threads = env_id, min(threads, num_envs)
+        self.num_envs, self.steps_made = num_envs, 0
+        # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
+        self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
+        self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
+        self._all = np.arange(num_envs)
+        self._pools: list[Any] = []
+        self._seeds: list[int] = []  # of the pools
+        self._place = np.zeros(num_envs, np.int64)  # in which pool each environment is
+        example: Any = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
+        self._history = History(num_envs, example)
+
+    @staticmethod
+    def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
+        """Whether EnvPool is installed and has this environment with the same spaces and limit."""
+        try:
+            envpool = _envpool()
+        except MissingExtra:
+            return False
+        if env_id not in envpool.list_all_envs():
+            return False
+        if reference.observation_space.shape is None:  # Dict, Tuple: EnvPool nests in its own way
+            return False
+        with _no_precision_warnings():
+            spec = envpool.make_spec(env_id)
+            theirs = (spec.gymnasium_observation_space, spec.gymnasium_action_space)
+        ours = (reference.observation_space, reference.action_space)
+        same = all(
+            isinstance(a, type(b))
+            and a.shape == b.shape
+            and getattr(a, "n", 0) == getattr(b, "n", 0)
+            for a, b in zip(ours, theirs, strict=True)
+        )
+        dtype = isinstance(theirs[1], gym.spaces.Discrete) or theirs[1].dtype == ours[1].dtype
+        limit = reference.spec.max_episode_steps if reference.spec else None
+        return bool(
+            same
+            and dtype
+            and theirs[0].dtype == ours[0].dtype
+            and spec.config.max_episode_steps == limit
+        )
+
+    def make_pool(self, seed: int) -> Any:
+        """A bare pool of EnvPool's."""
+        with _no_precision_warnings():
+            pool = _envpool().make_gymnasium(
+                self._id, num_envs=self.num_envs, num_threads=self._threads, seed=seed
+            )
+            _ = pool.observation_space  # made on first use, with the warning
+            return pool
+
+    def reset(self, seed: int) -> Array:
+        """Start all anew from one seed; observations (N, *obs_shape)."""
+        self._pools, self._seeds = [self.make_pool(seed)], [seed]
+        self._place[:] = 0
+        self._history.forget(self._all)
+        return self._begin(self._all)
+
+    def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
+        """Start some anew; observations (n, *obs_shape)."""
+        if seeds is not None:
+            raise SkillweaveError("EnvPool cannot reset single environments to a seed")
+        newest = len(self._pools) - 1
+        moves = self._place[ids] != newest
+        self._history.begin(ids[~moves])
+        self._history.forget(ids[moves])
+        self._place[ids] = newest
+        if newest and self._place.all():
+            del self._pools[0], self._seeds[0]
+            self._place[:] = 0
+        return self._begin(ids)
+
+    def step(self, action: Array, ids: Array | None = None) -> RawStep:
+        """Act in some environments; the others stand still."""
+        rows = self._all if ids is None else ids
+        self._history.add(action, rows)
+        self.steps_made += len(rows)
+        return self._act(action, rows)
+
+    def renew(self, seed: int) -> None:
+        """Make a second pool from this seed, where the histories have grown long."""
+        if len(self._pools) == 1 and self._history.total >= RENEW_AFTER:
+            self._pools.append(self.make_pool(seed))
+            self._seeds.append(seed)
+
+    def state(self) -> dict[str, Array]:
+        """Seeds, and what was done since."""
+        own = {"seeds": np.array(self._seeds), "place": self._place.copy()}
+        return own | self._history.state()
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Play everything again; the observations (N, *obs_shape) that this led to."""
+        self._seeds = [int(seed) for seed in state["seeds"]]
+        self._pools = [self.make_pool(seed) for seed in self._seeds]
+        self._place = state["place"].copy()
+        self._history.load(state)
+        obs = np.array(self._begin(self._all))
+        for begins, ids, action in self._history.play():
+            if len(begins):
+                obs[begins] = self._begin(begins)
+            if len(ids):
+                obs[ids] = self._act(action, ids).next_obs
+        return obs
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._pools = []
+
+    def _begin(self, ids: Array) -> Array:
+        def reset(pool: Any, part: Array) -> tuple[Any, ...]:
+            obs, _ = pool.reset(ids[part].astype(np.int32))
+            return (np.asarray(obs),)
+
+        obs: Array = self._in_pools(ids, reset)[0]
+        return obs
+
+    def _act(self, action: Array, ids: Array) -> RawStep:
+        if self._discrete:
+            action = action.astype(np.int32)
+
+        def step(pool: Any, part: Array) -> tuple[Any, ...]:
+            found: tuple[Any, ...] = pool.step(action[part], ids[part].astype(np.int32))
+            return found
+
+        # An episode that terminates on the very step of its time limit arrives as truncated:
+        # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
+        return RawStep(*self._in_pools(ids, step))
+
+    def _in_pools(
+        self, ids: Array, ask: Callable[[Any, Array], tuple[Any, ...]]
+    ) -> tuple[Any, ...]:
+        """What the pools answer for environments ``ids``, in the order of the ids.
+
+        ``ask`` is given a pool and which of the ids are in it.
+        """
+        if len(self._pools) == 1:
+            return ask(self._pools[0], np.arange(len(ids)))
+        parts = [np.flatnonzero(self._place[ids] == k) for k in range(len(self._pools))]
+        answers = [
+            (part, ask(pool, part))
+            for pool, part in zip(self._pools, parts, strict=True)
+            if len(part)
+        ]
+        return tuple(
+            _joined([(part, answer[i]) for part, answer in answers], len(ids))
+            for i in range(len(answers[0][1]))
+        )
+
+
+def _joined(parts: list[tuple[Array, Any]], n: int) -> Any:
+    """Arrays, or dicts of arrays, of some rows each, as arrays of all n rows."""
+    _, first = parts[0]
+    if isinstance(first, dict):
+        return {k: _joined([(rows, part[k]) for rows, part in parts], n) for k in first}
+    found = np.empty((n, *first.shape[1:]), first.dtype)
+    for rows, part in parts:
+        found[rows] = part
+    return found
+
+
+@contextmanager
+def _no_precision_warnings() -> Iterator[None]:
+    """EnvPool states bounds in float64 for float32 spaces, and Gymnasium warns of it each time."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*precision lowered.*")
+        yield
+
+
+def _envpool() -> Any:
+    try:
+        import envpool
+    except ImportError as error:
+        raise MissingExtra("the EnvPool engine", "envpool") from error
+    return envpool

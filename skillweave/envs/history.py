@@ -1,0 +1,85 @@
+"""What was done in each environment since it was seeded, so that it can be brought there again.
+
+An environment cannot be copied, but it can be played again: the same seed and the same actions
+lead to the same state. That is how open episodes survive in a checkpoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from skillweave.types import Array
+
+
+class History:
+    """The actions of N environments since their seeds, and where episodes began among them.
+
+    Args:
+        num_envs: N.
+        action: an example of N actions, (N, *action_shape), for their shape and type.
+    """
+
+    def __init__(self, num_envs: int, action: Array) -> None:
+        self.length = np.zeros(num_envs, np.int64)
+        """(N,) actions since the seed."""
+        self._action = np.zeros((64, *action.shape), action.dtype)  # (capacity, N, *action_shape)
+        self._begins = np.zeros((64, num_envs), bool)  # an episode begins before this action
+
+    @property
+    def total(self) -> int:
+        """Actions of all environments together."""
+        return int(self.length.sum())
+
+    def forget(self, ids: Array) -> None:
+        """Environments ``ids`` (n,) have been seeded: their history begins."""
+        self._begins[: int(self.length[ids].max(initial=0)) + 1, ids] = False
+        self.length[ids] = 0
+
+    def begin(self, ids: Array) -> None:
+        """An episode begins in environments ``ids`` (n,), without a new seed."""
+        self._begins[self.length[ids], ids] = True
+
+    def add(self, action: Array, ids: Array) -> None:
+        """Actions (n, *action_shape) in environments ``ids`` (n,)."""
+        at = self.length[ids]
+        self._action[at, ids] = action
+        self.length[ids] = at + 1
+        if int(at.max()) + 2 > len(self._action):  # there is always a row for what begins next
+            self._action = np.concatenate([self._action, np.zeros_like(self._action)])
+            self._begins = np.concatenate([self._begins, np.zeros_like(self._begins)])
+
+    def play(self) -> Iterator[tuple[Array, Array, Array]]:
+        """The history of all at once, action by action.
+
+        Yields:
+            ids (b,) of environments in which an episode begins first, ids (n,) of those that act
+            then, and their actions (n, *action_shape). None acts after the last beginnings.
+        """
+        for t in range(int(self.length.max(initial=0)) + 1):
+            here = self.length >= t
+            acts = np.flatnonzero(self.length > t)
+            yield np.flatnonzero(self._begins[t] & here), acts, self._action[t, acts]
+
+    def state(self) -> dict[str, Array]:
+        """Arrays for a file: no longer than what was done."""
+        longest = int(self.length.max(initial=0))
+        done = np.arange(longest)[:, None] < self.length
+        begins = np.argwhere(self._begins & (np.arange(len(self._begins))[:, None] <= self.length))
+        return {
+            "length": self.length.copy(),
+            "action": self._action[:longest][done],
+            "begins": begins.astype(np.int64),
+        }
+
+    def load(self, state: dict[str, Array]) -> None:
+        """The inverse of ``state``."""
+        self.length = state["length"].astype(np.int64)
+        longest = int(self.length.max(initial=0))
+        capacity = max(64, 1 << (longest + 1).bit_length())
+        self._action = np.zeros((capacity, *self._action.shape[1:]), self._action.dtype)
+        self._begins = np.zeros((capacity, len(self.length)), bool)
+        done = np.arange(longest)[:, None] < self.length
+        self._action[:longest][done] = state["action"]
+        self._begins[tuple(state["begins"].T)] = True
