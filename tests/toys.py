@@ -317,7 +317,7 @@ class Echo(Toy):
         super().__init__(len(self.columns))
         self.shows, self.observation_space = shows, SHOWS[shows]
         self.action_space, self.wanted = ASKS[asks]
-        self.state = np.zeros(self.num_envs, np.int64)
+        self.shown = np.zeros(self.num_envs, np.int64)
 
     def show(self, state: Array) -> Array:
         """States (n,) as observations."""
@@ -348,12 +348,12 @@ class Echo(Toy):
         return super().reset(seeds)
 
     def first(self, rows: Array) -> Array:
-        self.state[rows] = [self.rngs[i].integers(4) for i in rows]
-        return self.show(self.state[rows])
+        self.shown[rows] = [self.rngs[i].integers(4) for i in rows]
+        return self.show(self.shown[rows])
 
     def play(self, action: Array) -> Any:
         assert all(self.action_space.contains(a) for a in action)
-        reward = -self.error(self.state, action)
+        reward = -self.error(self.shown, action)
         truncated = (self.t == 3) & (np.array(self.columns) % 2 == 0)
         everywhere = np.arange(self.num_envs)
         return self.first(everywhere), reward, self.t == 4, truncated, self.ones

@@ -24,7 +24,6 @@ from skillweave.envs.history import History
 from skillweave.spaces import pack
 from skillweave.types import Array
 
-
 LONGEST_EPISODE = 100_000
 """Steps after which an open episode is no longer kept for a checkpoint, but ended there."""
 
@@ -230,5 +229,5 @@ def _info_rows(info: dict[str, Any], ids: Array) -> dict[str, Any]:
 
 
 def checksums(obs: Array) -> Array:
-    """One number for each row of observations (n, *obs_shape), (n,) int64: equal rows, equal sums."""
+    """A number for each row of observations (n, *obs_shape), (n,) int64; equal rows, equal ones."""
     return np.array([zlib.crc32(np.ascontiguousarray(row).tobytes()) for row in obs], np.int64)

@@ -40,7 +40,7 @@ class Walk(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
-        self.episode = 0 if seed is not None else self.episode + 1
+        self.episode += 1
         self.t, self.position = 0, 0
         self.tag = int(self.np_random.integers(1 << 20))
         self.length = int(self.np_random.integers(3, 15))

@@ -359,9 +359,8 @@ def test_alone_an_environment_is_acted_in_as_among_others(make):
 
 
 def test_memory_rows_may_be_gathered_and_scattered_in_any_order():
-    policy = nested()[0]
-    engine = make_engine(EnvSpec(Walk, engine="sync"), N)
-    expected = [a for *_, a in play(policy, engine, 0, 30)]
+    policy, spec = nested()[0], EnvSpec(Walk, engine="sync")
+    expected = [a for *_, a in play(policy, make_engine(spec, N), 0, 30)]
 
     class Shuffled:
         """The policy, asked about its environments in another order every time."""
@@ -378,7 +377,7 @@ def test_memory_rows_may_be_gathered_and_scattered_in_any_order():
         def observe(self, memory, step):
             return policy.observe(memory, step)
 
-    got = [a for *_, a in play(Shuffled(), engine, 0, 30)]
+    got = [a for *_, a in play(Shuffled(), make_engine(spec, N), 0, 30)]
     np.testing.assert_array_equal(got, expected)
 
 
