@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from skillweave.envs.infos import ActionMasks, info_rows
 from skillweave.spaces import pack
 from skillweave.types import Array, MissingExtra, SkillweaveError
 
@@ -50,6 +51,10 @@ class Engine(Protocol):
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
         """Act in some environments; the others stand still."""
+        ...
+
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
         ...
 
     def close(self) -> None:
@@ -98,6 +103,7 @@ class GymnasiumEngine:
         self.observation_space: gym.Space[Any] = self._vector.single_observation_space
         go_and_action: Any = self._vector.single_action_space
         self.action_space: gym.Space[Any] = go_and_action[1]
+        self._masks = ActionMasks(self.action_space, num_envs)
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
         self._actions: Any = gym.vector.utils.create_empty_array(
             self.action_space, num_envs, np.zeros
@@ -106,7 +112,8 @@ class GymnasiumEngine:
     def reset(self, seed: int) -> Array:
         """Start all anew from one seed; observations (N, *obs_shape)."""
         seeds = np.random.SeedSequence(seed).generate_state(self.num_envs, np.uint32) >> 1
-        obs, _ = self._vector.reset(seed=[int(s) for s in seeds])
+        obs, info = self._vector.reset(seed=[int(s) for s in seeds])
+        self._masks.see(info)
         return pack(self.observation_space, obs)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
@@ -116,7 +123,8 @@ class GymnasiumEngine:
         each: list[int | None] = [None] * self.num_envs
         for i, seed in zip(ids, seeds or (), strict=False):
             each[int(i)] = int(seed)
-        obs, _ = self._vector.reset(seed=each, options={"reset_mask": mask})
+        obs, info = self._vector.reset(seed=each, options={"reset_mask": mask})
+        self._masks.see(info_rows(info, ids, self.num_envs), ids)
         return pack(self.observation_space, obs)[ids]
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
@@ -136,9 +144,14 @@ class GymnasiumEngine:
             obs, reward, terminated, truncated = (
                 x[ids] for x in (obs, reward, terminated, truncated)
             )
-            info = _info_rows(info, ids)
+            info = info_rows(info, ids, self.num_envs)
+        self._masks.see(info, ids, terminated | truncated)
         truncated = truncated & ~terminated
         return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
+
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        return self._masks.now
 
     def close(self) -> None:
         """Release the environments."""
@@ -155,6 +168,7 @@ class EnvPoolEngine:
         # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
         self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
+        self._masks = ActionMasks(self.action_space, num_envs)
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
@@ -199,14 +213,16 @@ class EnvPoolEngine:
         """Start all anew from one seed; observations (N, *obs_shape)."""
         # A pool takes its seed only when made; making one takes milliseconds.
         self._pool = self.make_pool(seed)
-        obs, _ = self._pool.reset()
+        obs, info = self._pool.reset()
+        self._masks.see(info)
         return np.asarray(obs)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
         """Start some anew; observations (n, *obs_shape)."""
         if seeds is not None:
             raise SkillweaveError("EnvPool cannot reset single environments to a seed")
-        obs, _ = self._pool.reset(ids.astype(np.int32))
+        obs, info = self._pool.reset(ids.astype(np.int32))
+        self._masks.see(info, ids)
         return np.asarray(obs)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
@@ -215,9 +231,14 @@ class EnvPoolEngine:
             action = action.astype(np.int32)
         ids = None if ids is None else ids.astype(np.int32)
         obs, reward, terminated, truncated, info = self._pool.step(action, ids)
+        self._masks.see(info, ids, terminated | truncated)
         # An episode that terminates on the very step of its time limit arrives as truncated:
         # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
         return RawStep(obs, reward, terminated, truncated, info)
+
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        return self._masks.now
 
     def close(self) -> None:
         """Release the environments."""
@@ -230,14 +251,6 @@ def _no_precision_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*precision lowered.*")
         yield
-
-
-def _info_rows(info: dict[str, Any], ids: Array) -> dict[str, Any]:
-    """Some environments' part of Gymnasium's batched info, nested dicts included."""
-    return {
-        k: _info_rows(v, ids) if isinstance(v, dict) else v[ids] if isinstance(v, np.ndarray) else v
-        for k, v in info.items()
-    }
 
 
 def _envpool() -> Any:

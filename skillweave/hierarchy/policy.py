@@ -36,7 +36,10 @@ class HierarchyPolicy:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions (n, ...); ``deterministic`` is about the selector, ``SkillSet.greedy`` skills."""
+        """Actions (n, ...), among those that ``mask`` (n, A) allows the skills.
+
+        ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills.
+        """
         memory = {k: v.copy() for k, v in memory.items()}
         rows = np.flatnonzero(memory["over"])
         if len(rows):
@@ -51,7 +54,7 @@ class HierarchyPolicy:
                 memory[_SELECTOR + k][rows] = v
             self.skills.begin(memory, rows, skill)
             memory["over"][rows] = False
-        return self.skills.act(memory, np.arange(len(obs)), obs, rng), memory
+        return self.skills.act(memory, np.arange(len(obs)), obs, rng, mask), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Notice where calls are over."""

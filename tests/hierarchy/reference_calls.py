@@ -150,12 +150,15 @@ class Scalar:
     reflexes: tuple[Reflex, ...] = ()
     policies: tuple[Any, ...] = ()
     obs: Array = field(default_factory=lambda: np.empty(0))
+    last: int | None = None  # the skill of this episode's latest call
+    memory: Memory = field(default_factory=dict)  # its policy's
 
     def __post_init__(self) -> None:
         self.policies = self.policies or tuple(s.policy for s in self.skills)
 
     def reset(self, seed: int) -> Array:
         self.obs, _ = self.env.reset(seed=int(seed))
+        self.last = None
         return self.obs
 
     def allowed(self) -> list[bool]:
@@ -163,7 +166,7 @@ class Scalar:
 
     def call(self, choice: int) -> Outcome:
         skill, policy = self.skills[choice], self.policies[choice]
-        memory = policy.start(1)
+        memory = self.memory if choice == self.last else policy.start(1)
         rewards: list[float] = []
         while True:
             obs, tau = self.obs, len(rewards) + 1
@@ -183,8 +186,10 @@ class Scalar:
             if over:
                 break
         final = self.obs
+        self.last, self.memory = choice, memory
         if terminated or truncated:
             self.obs, _ = self.env.reset()
+            self.last = None
         return Outcome(
             obs=self.obs,
             next_obs=final,

@@ -99,6 +99,10 @@ def play(policy, engine, seed: int, steps: int, **how) -> list:
     return happened
 
 
+class Counter2(Counter):
+    """Another skill with a memory of its own."""
+
+
 class Keeper:
     """Makes environments, keeps them, and their actions."""
 
@@ -204,7 +208,7 @@ class One:
         self.start()
 
     def start(self) -> None:
-        self.running = None
+        self.running = self.last = None
 
     def act(self, obs: Array) -> int:
         if self.running is None:
@@ -212,10 +216,13 @@ class One:
             self.running = int(self.chooser.act({}, obs[None], mask)[0][0])
             self.elapsed = 0
             part = self.parts[self.running]
-            if isinstance(part, One):
+            if self.running == self.last:
+                pass  # the same skill goes on, and remembers
+            elif isinstance(part, One):
                 part.start()
             else:
                 self.memory = part.start(1)
+            self.last = self.running
         part = self.parts[self.running]
         if isinstance(part, One):
             return part.act(obs)
@@ -435,15 +442,33 @@ def test_a_call_lasts_as_many_steps_as_the_least_limit_says():
         assert decided == [k % lasts == 0 for k in range(12)]
 
 
-def test_a_skills_own_memory_is_fresh_in_every_call():
+def test_a_skill_that_is_called_again_at_once_goes_on_with_its_memory():
     policy = HierarchyPolicy(Chooser(1), skill_set(Counter, call_steps=4))
     memory, obs, actions = policy.start(1), walk_obs(0), []
     for _ in range(8):
         action, memory = policy.act(memory, obs)
         actions.append(int(action[0]))
         memory = policy.observe(memory, transition(obs, action, obs))
-    # Counting: the number of its actions, plus 1 as soon as it was paid
-    assert actions == [0, 2, 0, 1] * 2
+    # Counting: the number of its actions, plus 1 as soon as it was paid; modulo 3
+    assert actions == [0, 2, 0, 1, 2, 0, 1, 2]
+    assert memory["elapsed"].tolist() == [4], "the call's own time starts anew"
+
+
+def test_a_skill_that_is_called_after_another_one_starts_with_a_fresh_memory():
+    by_turns = ScriptedPolicy(
+        lambda obs: obs[:, POSITION].astype(int), Walk.observation_space, gym.spaces.Discrete(2)
+    )
+    policy = HierarchyPolicy(by_turns, skill_set(Counter, Counter2, call_steps=2))
+    memory, actions = policy.start(2), []
+    # two environments: the first calls 0 0 1 0, the second 0 1 1 1
+    for first, second in ((0, 0), (0, 1), (1, 1), (0, 1)):
+        obs = walk_obs(first, second)
+        for _ in range(2):
+            action, memory = policy.act(memory, obs)
+            actions.append(action.tolist())
+            memory = policy.observe(memory, transition(obs, action, obs))
+    assert [a for a, _ in actions] == [0, 2, 0, 1, 0, 2, 0, 2]
+    assert [a for _, a in actions] == [0, 2, 0, 2, 0, 1, 2, 0]
 
 
 def test_the_selector_chooses_only_among_skills_that_may_start():
