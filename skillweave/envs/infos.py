@@ -36,11 +36,11 @@ class ActionMasks:
     has no choices, so its masks are ignored.
     """
 
-    def __init__(self, space: gym.Space[Any], num_envs: int) -> None:
+    def __init__(self, space: gym.Space[Any], num_envs: int, now: Array | None = None) -> None:
         self._space, self._num_envs = space, num_envs
         discrete = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
         self._parts = action_codec(space).parts if isinstance(space, discrete) else ()
-        self.now: Array | None = None
+        self.now = now
         """(N, A) bool; None: no environment has ever told. Never changed in place."""
 
     def see(

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.engine import Engine
+from skillweave.envs.infos import allowed_rows, random_actions
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill, apply_reflexes, checked
 from skillweave.types import Array, SkillweaveError, Step, VecStep
@@ -48,8 +49,8 @@ class SkillEnv:
         return self._obs
 
     def mask(self) -> Array | None:
-        """All actions are allowed."""
-        return None
+        """(N, A) bool, the actions that the environments allow now; None: all always are."""
+        return self.engine.mask()
 
     def step(self, action: Array) -> VecStep:
         """Act in all environments. ``info`` gains the task's reward and the skill's success."""
@@ -62,7 +63,7 @@ class SkillEnv:
         if self.skill is not None:
             reward, terminated, truncated, info = self._judge(self.skill, obs, action, raw)
         ended = terminated | truncated
-        self._obs = raw.next_obs
+        self._obs, next_mask = raw.next_obs, self.engine.mask()
         if ended.any():
             ids = np.flatnonzero(ended)
             first = self.engine.reset_some(ids)
@@ -71,8 +72,9 @@ class SkillEnv:
             info = {**info, "length": self._elapsed.copy()}
             self._elapsed[ids] = 0
         return VecStep(
-            raw.next_obs, self._obs, reward, terminated, truncated, self._ones, None, info
-        )
+            raw.next_obs, self._obs, reward, terminated, truncated, self._ones,
+            self.engine.mask(), info, next_mask,
+        )  # fmt: skip
 
     def close(self) -> None:
         """Release the engine."""
@@ -110,9 +112,8 @@ class SkillEnv:
             waiting = np.flatnonzero(~holds)
             if not len(waiting):
                 return obs
-            space = self.action_space
-            space.seed(int(self._rng.integers(2**31)))
-            action = np.stack([np.asarray(space.sample()) for _ in waiting])
+            allowed = allowed_rows(self.engine.mask(), ids[waiting])
+            action = random_actions(self.action_space, len(waiting), self._rng, allowed)
             raw = self.engine.step(action, ids[waiting])
             obs[waiting] = raw.next_obs
             ended = np.flatnonzero(raw.terminated | raw.truncated)
