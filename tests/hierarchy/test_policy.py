@@ -30,8 +30,9 @@ from skillweave.hierarchy.calls import SkillSet
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds
-from skillweave.skills import Skill
+from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.training.evaluation import evaluate
 from skillweave.types import Array, SkillweaveError, Step
 
 torch.set_num_threads(1)
@@ -325,6 +326,79 @@ def test_a_hierarchy_as_a_skill_of_options_env_acts_as_the_scalar_one():
         for t in range(40):
             scalar.call((i + t) % 2)
         assert keeper.made[i].actions == logged.actions
+
+
+# A skill alone ---------------------------------------------------------------------------------
+
+
+class Remote(Skill):
+    """As Counter, where it may start hardly anywhere: alone it is asked nevertheless."""
+
+    max_steps = 6
+    policy = Counting()
+
+    def initiation(self, obs: Array) -> Array:
+        return obs[:, POSITION] == 99
+
+
+def alone(skill: Skill, others: tuple, **more) -> Run:
+    """A run of a hierarchy in which a selector never chooses ``skill``, which comes last."""
+    declared = Hierarchy(Walk, [*others, skill], **more)
+    skills = declared.skill_set([s.policy for s in declared.skills])
+    return Run(declared, None, HierarchyPolicy(Chooser(len(skills.skills)), skills))
+
+
+def always(skill: Skill, **more) -> HierarchyPolicy:
+    """A selector that has no choice."""
+    declared = Hierarchy(Walk, [skill], **more)
+    return HierarchyPolicy(Chooser(1), declared.skill_set([skill.policy]))
+
+
+@pytest.mark.parametrize("in_training", [True, False])
+@pytest.mark.parametrize("kind", [Counter, Zigzag, "nested"])
+def test_a_skill_alone_acts_as_under_a_selector_that_chooses_no_other(kind, in_training):
+    on = Reflex(lambda obs: obs[:, POSITION] == 1, action=2)
+    more = {"reflexes": [on], "reflexes_in_training": in_training, "call_steps": 3}
+    inner = hierarchy(Counter, Right, Left, call_steps=2)
+    skill = alone(Left(), ()).as_skill("inner") if kind == "nested" else kind()
+    if kind == "nested":
+        type(skill).policy = inner
+    found = alone(skill, (Left(), Right()), **more).evaluate(20, skill=skill.name)
+    wanted = evaluate(always(skill, **more), EnvSpec(Walk), episodes=20)
+    assert (found.returns, found.lengths) == (wanted.returns, wanted.lengths)
+    bare = evaluate(skill.policy, EnvSpec(Walk), episodes=20)
+    assert found.returns != bare.returns, "the reflex never acted"
+    assert bool(found.skill_steps) == (kind == "nested")
+
+
+def test_a_skill_alone_does_not_ask_where_it_may_start():
+    run = alone(Remote(), (Left(),))
+    assert run.evaluate(3, skill="remote") == evaluate(Remote.policy, EnvSpec(Walk), episodes=3)
+
+
+def test_a_film_of_a_skill_alone_shows_its_reflexes_too(tmp_path):
+    pytest.importorskip("PIL")
+
+    class Shown(Walk):
+        def __init__(self, render_mode=None):
+            super().__init__()
+            self.render_mode = render_mode
+
+        def step(self, action):
+            obs, _, *rest = super().step(action)
+            return obs, float(action), *rest
+
+        def render(self):
+            return np.zeros((8, 8, 3), np.uint8)
+
+    anywhere = Reflex(lambda obs: np.ones(len(obs), bool), action=2)
+    declared = Hierarchy(Shown, [Left(), Zigzag()], reflexes=[anywhere])
+    policy = HierarchyPolicy(Chooser(2), declared.skill_set([Left.policy, Zigzag.policy]))
+    told = Run(declared, None, policy).render(tmp_path / "a.gif", episodes=3, skill="left")
+    assert [e["return"] for e in told["episodes"]] == [2.0 * e["length"] for e in told["episodes"]]
+    assert [e["skills"] for e in told["episodes"]] == [
+        {"left": e["length"]} for e in told["episodes"]
+    ]
 
 
 # Memory ----------------------------------------------------------------------------------------
