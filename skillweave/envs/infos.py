@@ -84,7 +84,8 @@ class ActionMasks:
                 f"{mask.shape}, but numbers of shape {shape} were expected: one for each choice of "
                 f"{self._space}, 0 where it is forbidden"
             )
-        return mask != 0
+        allowed: Array = mask != 0
+        return allowed
 
 
 def allowed_rows(mask: Array | None, rows: Array) -> Array | None:

@@ -126,7 +126,10 @@ def test_where_one_environment_has_no_mask_everything_is_allowed_there():
     masks = ActionMasks(gym.spaces.Discrete(3), 3)
     masks.see({})
     assert masks.now is None
-    told = {"action_mask": np.array([[1, 0, 0], [0, 0, 0]]), "_action_mask": np.array([True, False])}
+    told = {
+        "action_mask": np.array([[1, 0, 0], [0, 0, 0]]),
+        "_action_mask": np.array([True, False]),
+    }
     masks.see(told, np.array([2, 0]))
     assert masks.now.tolist() == [[True] * 3, [True] * 3, [True, False, False]]
     masks.see({}, np.array([2]))
