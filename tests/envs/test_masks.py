@@ -231,8 +231,8 @@ def test_a_foreign_vectors_masks_are_read_as_well():
 SMALL = Network((8,))
 LEARNERS = [
     PPO(num_envs=4, n_steps=16, batch_size=32, network=SMALL),
-    DQN(num_envs=4, learning_starts=100, batch_size=8, network=SMALL),
-    SAC(num_envs=4, learning_starts=100, batch_size=8, network=SMALL),
+    DQN(num_envs=4, learning_starts=100, update_ratio=0.1, batch_size=8, network=SMALL),
+    SAC(num_envs=4, learning_starts=100, update_ratio=0.1, batch_size=8, network=SMALL),
 ]
 
 
@@ -242,7 +242,7 @@ def test_learnt_skills_selectors_and_flat_agents_never_take_what_is_forbidden(al
     pytest.importorskip("PIL")
     hierarchy = Hierarchy(
         Gate, [Late(), type("Any", (Skill,), {"max_steps": 2})()], algorithm=algorithm,
-        selector=LEARNERS[0], call_steps=3, skill_steps=400, selector_steps=400, eval_every=200,
+        selector=LEARNERS[0], call_steps=3, skill_steps=300, selector_steps=300, eval_every=200,
         eval_episodes=2, greedy_skills=False,
     )  # fmt: skip
     run = hierarchy.train(tmp_path / "run", quiet=True)
@@ -252,6 +252,28 @@ def test_learnt_skills_selectors_and_flat_agents_never_take_what_is_forbidden(al
     flat = hierarchy.train(tmp_path / "flat", quiet=True, flat=True)
     assert flat.evaluate(6, deterministic=False).mean > 0
     flat.render(tmp_path / "a.gif", episodes=2)
+
+
+class Strict(gym.Wrapper):
+    """Refuses what the mask forbids."""
+
+    def step(self, action: Any) -> Any:
+        taxi: Any = self.env.unwrapped
+        assert taxi.action_mask(taxi.s)[action], "a forbidden action"
+        return self.env.step(action)
+
+
+def test_a_hierarchy_learns_to_drive_gymnasiums_taxi_by_its_masks(tmp_path):
+    spec = EnvSpec("Taxi-v4", {"max_episode_steps": 20}, (Strict,))
+    fast = type("Fast", (Skill,), {"max_steps": 3})()
+    hierarchy = Hierarchy(
+        spec, [fast, type("Plain", (Skill,), {})()], algorithm=LEARNERS[1], selector=LEARNERS[0],
+        call_steps=5, skill_steps=300, selector_steps=300,
+    )  # fmt: skip
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    # every step costs 1; only a forbidden passenger's move costs 10
+    for skill in (None, "fast"):
+        assert run.evaluate(5, skill=skill, deterministic=False).mean >= -20
 
 
 # Skills under a selector -------------------------------------------------------------------------
