@@ -2,9 +2,9 @@
 
 Observations: x, y, vx, vy, angle, angular velocity, left leg, right leg.
 
-The tutorial also pays 10 in a skill's 300th step, for lasting. Observations do not hold the time, so
-a critic cannot foresee such a reward, and here the value goes on beyond a time limit: the 10 would
-only be noise. Without it stabilize and center hold as well as with it.
+The tutorial also pays 10 in a skill's 300th step, for lasting. Observations do not hold the time,
+so a critic cannot foresee such a reward, and here the value goes on beyond a time limit: the 10
+would only be noise. Without it stabilize and center hold as well as with it.
 """
 
 from __future__ import annotations
