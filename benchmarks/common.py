@@ -66,6 +66,9 @@ class Recorder:
         )
         return self.engine.step(action, ids)
 
+    def mask(self) -> Array | None:
+        return self.engine.mask()
+
     def close(self) -> None:
         self.engine.close()
 

@@ -29,7 +29,7 @@ class Stabilize(Skill):
     max_steps = 300
 
     def reward(self, step):
-        reward = np.where(step.timed_out, 10.0, 1.0 - movement(step, X, Y, ANGLE))
+        reward = 1.0 - movement(step, X, Y, ANGLE)
         return np.where(step.terminated | step.truncated, -100.0, reward)
 
 
@@ -38,7 +38,6 @@ class Center(Skill):
 
     def reward(self, step):
         reward = 1.0 - np.square(2.0 * step.next_obs[:, X]) - movement(step, Y, ANGLE)
-        reward = np.where(step.timed_out, 10.0, reward)
         return np.where(step.terminated | step.truncated, -1000.0, reward)
 
 

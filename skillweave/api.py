@@ -16,7 +16,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, plan, trainer
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import read_weights, write_weights
 from skillweave.reporting.progress import Progress
 from skillweave.reporting.video import color_of, render_policy
@@ -179,7 +179,17 @@ class Run:
         deterministic: bool = True,
         skill: str | None = None,
     ) -> Evaluation:
-        """Score it on Gymnasium's environment; ``skill`` scores one skill alone."""
+        """Score it on Gymnasium's environment.
+
+        Args:
+            episodes: whole episodes.
+            seed: picks them.
+            deterministic: act greedily, else sample. Of a hierarchy it is about the selector;
+                ``greedy_skills`` is about its skills.
+            skill: score this skill alone, as if the selector always chose it: the hierarchy's
+                reflexes are in force, also where the skill was trained without them
+                (``reflexes_in_training=False``).
+        """
         return evaluate(
             self._policy(skill),
             self.hierarchy.spec,
@@ -198,7 +208,7 @@ class Run:
         skill: str | None = None,
         max_steps: int | None = None,
     ) -> dict[str, Any]:
-        """Write a captioned GIF or MP4; ``skill`` shows one skill alone."""
+        """Write a captioned GIF or MP4; ``skill`` shows one skill alone, as in ``evaluate``."""
         names = [s.name for s in self.hierarchy.skills]
         colors = {s.name: color_of(i, s.color) for i, s in enumerate(self.hierarchy.skills)}
 
@@ -244,9 +254,8 @@ class Run:
             return self.policy
         if not isinstance(self.policy, HierarchyPolicy):
             raise SkillweaveError("this is a flat agent: it has no skills")
-        names = [s.name for s in self.hierarchy.skills]
         self.hierarchy.skill(skill)
-        return self.policy.skills.policies[names.index(skill)]
+        return SkillAlone(self.policy.skills, skill)
 
 
 __all__ = ["Hierarchy", "Run", "train_agent"]

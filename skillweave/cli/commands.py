@@ -73,7 +73,7 @@ class Watched(Output):
     recipe: str | None = None
     """The file that declares the hierarchy, unless it is a shipped recipe."""
     skill: str | None = None
-    """One skill alone."""
+    """One skill alone, with the hierarchy's reflexes in force."""
     seed: int = 0
     """Picks the episodes."""
     deterministic: bool = True

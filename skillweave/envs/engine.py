@@ -21,6 +21,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from skillweave.envs.history import History
+from skillweave.envs.infos import ActionMasks, info_rows
 from skillweave.spaces import pack
 from skillweave.types import Array
 
@@ -75,6 +76,10 @@ class Engine(Protocol):
         """
         ...
 
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        ...
+
     def close(self) -> None:
         """Release processes and memory."""
         ...
@@ -124,6 +129,7 @@ class GymnasiumEngine:
         self.observation_space: gym.Space[Any] = self._vector.single_observation_space
         go_and_action: Any = self._vector.single_action_space
         self.action_space: gym.Space[Any] = go_and_action[1]
+        self._masks = ActionMasks(self.action_space, num_envs)
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
         self._actions: Any = gym.vector.utils.create_empty_array(
             self.action_space, num_envs, np.zeros
@@ -180,6 +186,10 @@ class GymnasiumEngine:
             going[ids[acts]] = ~(raw.terminated | raw.truncated)
         return obs
 
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        return self._masks.now
+
     def close(self) -> None:
         """Release the environments."""
         self._vector.close()
@@ -196,7 +206,8 @@ class GymnasiumEngine:
         for i in ids:
             each[int(i)] = int(self._seed[i])
         options = None if mask.all() else {"reset_mask": mask}
-        obs, _ = self._vector.reset(seed=each, options=options)
+        obs, info = self._vector.reset(seed=each, options=options)
+        self._masks.see(info_rows(info, ids, self.num_envs), ids)
         return np.array(pack(self.observation_space, obs)[ids])
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
@@ -215,17 +226,11 @@ class GymnasiumEngine:
             obs, reward, terminated, truncated = (
                 x[ids] for x in (obs, reward, terminated, truncated)
             )
-            info = _info_rows(info, ids)
+            info = info_rows(info, ids, self.num_envs)
+        self._masks.see(info, ids, terminated | truncated)
         truncated = truncated & ~terminated
         return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
 
-
-def _info_rows(info: dict[str, Any], ids: Array) -> dict[str, Any]:
-    """Some environments' part of Gymnasium's batched info, nested dicts included."""
-    return {
-        k: _info_rows(v, ids) if isinstance(v, dict) else v[ids] if isinstance(v, np.ndarray) else v
-        for k, v in info.items()
-    }
 
 
 def checksums(obs: Array) -> Array:

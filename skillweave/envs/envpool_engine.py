@@ -12,6 +12,7 @@ import numpy as np
 
 from skillweave.envs.engine import RawStep
 from skillweave.envs.history import History
+from skillweave.envs.infos import ActionMasks
 from skillweave.types import Array, MissingExtra, SkillweaveError
 
 RENEW_AFTER = 100_000
@@ -38,6 +39,7 @@ class EnvPoolEngine:
         self._place = np.zeros(num_envs, np.int64)  # in which pool each environment is
         example: Any = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._history = History(num_envs, example)
+        self._masks = ActionMasks(self.action_space, num_envs)
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
@@ -131,17 +133,23 @@ class EnvPoolEngine:
                 obs[ids] = self._act(action, ids).next_obs
         return obs
 
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        return self._masks.now
+
     def close(self) -> None:
         """Release the environments."""
         self._pools = []
 
     def _begin(self, ids: Array) -> Array:
         def reset(pool: Any, part: Array) -> tuple[Any, ...]:
-            obs, _ = pool.reset(ids[part].astype(np.int32))
-            return (np.asarray(obs),)
+            obs, info = pool.reset(ids[part].astype(np.int32))
+            return np.asarray(obs), info
 
-        obs: Array = self._in_pools(ids, reset)[0]
-        return obs
+        obs, info = self._in_pools(ids, reset)
+        self._masks.see(info, ids)
+        found: Array = obs
+        return found
 
     def _act(self, action: Array, ids: Array) -> RawStep:
         if self._discrete:
@@ -153,7 +161,9 @@ class EnvPoolEngine:
 
         # An episode that terminates on the very step of its time limit arrives as truncated:
         # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
-        return RawStep(*self._in_pools(ids, step))
+        raw = RawStep(*self._in_pools(ids, step))
+        self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
+        return raw
 
     def _in_pools(
         self, ids: Array, ask: Callable[[Any, Array], tuple[Any, ...]]

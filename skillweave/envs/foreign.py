@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from skillweave.envs.infos import ActionMasks, info_rows
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
 from skillweave.types import Array, Restorable, SkillweaveError, VecStep
@@ -26,7 +27,7 @@ class FromVectorEnv:
 
     Reads from ``info`` what semi-MDPs need, where it is there: ``steps`` (τ), ``action_mask``,
     ``next_action_mask``, ``next_obs``; else every action is one step, all are allowed, and
-    ``final_obs`` counts.
+    ``final_obs`` and ``final_info`` count.
 
     Raises:
         SkillweaveError: the vector resets in another way; the message says how to make it.
@@ -45,7 +46,7 @@ class FromVectorEnv:
             env.single_action_space,
         )
         self._ones = np.ones(self.num_envs, np.int64)
-        self._mask: Array | None = None
+        self._masks = ActionMasks(self.action_space, self.num_envs)
         self._steps_made = 0
         self.obs: Array = np.empty(0)
 
@@ -80,7 +81,7 @@ class FromVectorEnv:
 
     def mask(self) -> Array | None:
         """(N, A) bool, the actions allowed now, or None."""
-        return self._mask
+        return self._masks.now
 
     def step(self, action: Array) -> VecStep:
         """One action in each environment."""
@@ -96,9 +97,20 @@ class FromVectorEnv:
                 next_obs[i] = pack(space, info["final_obs"][i])
         return VecStep(
             next_obs, obs, np.asarray(reward, np.float32), terminated,
-            truncated & ~terminated, steps, self._mask, info,
-            info.get("next_action_mask"),
+            truncated & ~terminated, steps, self._masks.now, info,
+            self._next_mask(info, terminated | truncated),
         )  # fmt: skip
+
+    def _next_mask(self, info: dict[str, Any], ended: Array) -> Array | None:
+        """The masks of true successors; None where they are those of what to act on next."""
+        now = self._masks.now
+        if "next_action_mask" in info or now is None or not ended.any():
+            return info.get("next_action_mask")
+        rows = np.flatnonzero(ended)
+        final = ActionMasks(self.action_space, self.num_envs, now)
+        last = info_rows(info.get("final_info", {}), rows, self.num_envs)
+        final.see(last, rows, ended[rows])
+        return final.now
 
     def close(self) -> None:
         """Close the vector."""
@@ -113,6 +125,6 @@ class FromVectorEnv:
         return ids
 
     def _see(self, obs: Any, info: dict[str, Any]) -> Array:
-        self._mask = info.get("action_mask")
+        self._masks.see(info)
         self.obs = pack(self.observation_space, obs)
         return self.obs

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.engine import LONGEST_EPISODE, Engine, checksums
+from skillweave.envs.infos import allowed_rows, random_actions
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill, apply_reflexes, checked
 from skillweave.types import (
@@ -83,8 +84,8 @@ class SkillEnv:
         """Nothing to do: every action lasts one step."""
 
     def mask(self) -> Array | None:
-        """All actions are allowed."""
-        return None
+        """(N, A) bool, the actions that the environments allow now; None: all always are."""
+        return self.engine.mask()
 
     def step(self, action: Array) -> VecStep:
         """Act in all environments. ``info`` gains the task's reward and the skill's success."""
@@ -97,13 +98,14 @@ class SkillEnv:
         if self.skill is not None:
             reward, terminated, truncated, info = self._judge(self.skill, obs, action, raw)
         ended = terminated | truncated
-        self.obs = raw.next_obs
+        self.obs, next_mask = raw.next_obs, self.engine.mask()
         if ended.any():
             info = {**info, "length": self._elapsed.copy()}
             self._begin(np.flatnonzero(ended))
         return VecStep(
-            raw.next_obs, self.obs, reward, terminated, truncated, self._ones, None, info
-        )
+            raw.next_obs, self.obs, reward, terminated, truncated, self._ones,
+            self.engine.mask(), info, next_mask,
+        )  # fmt: skip
 
     def close(self) -> None:
         """Release the engine."""
@@ -153,9 +155,8 @@ class SkillEnv:
             waiting = np.flatnonzero(~holds)
             if not len(waiting):
                 return obs
-            space = self.action_space
-            space.seed(int(self._rng.integers(2**31)))
-            action = np.stack([np.asarray(space.sample()) for _ in waiting])
+            allowed = allowed_rows(self.engine.mask(), ids[waiting])
+            action = random_actions(self.action_space, len(waiting), self._rng, allowed)
             raw = self.engine.step(action, ids[waiting])
             obs[waiting] = raw.next_obs
             ended = np.flatnonzero(raw.terminated | raw.truncated)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from skillweave.envs.infos import allowed_rows, info_rows
 from skillweave.skills import Reflex, Skill, apply_reflexes, checked
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
@@ -18,8 +19,10 @@ from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 class SkillSet:
     """Skills with their policies, and how a call runs.
 
-    Memory rows: ``skill`` (the running one), ``elapsed`` (steps of its call), and under
-    ``<index>.<key>`` what each skill's own policy remembers.
+    Memory rows: ``skill`` (the running one, −1 where no call has begun in the episode),
+    ``elapsed`` (steps of its call), and under ``<index>.<key>`` what each skill's own policy
+    remembers. Where a skill is called again at once, in the same episode, its policy goes on with
+    what it remembers; after another skill's call, or in a new episode, it starts afresh.
     """
 
     skills: tuple[Skill, ...]
@@ -75,17 +78,32 @@ class SkillSet:
 
     def begin(self, memory: Memory, rows: Array, skill: Array) -> None:
         """Start a call of ``skill`` (k,) in environments ``rows`` (k,), in place."""
+        changed = memory["skill"][rows] != skill
         memory["skill"][rows] = skill
         memory["elapsed"][rows] = 0
         for i, policy in enumerate(self.policies):
             fresh = policy.start(1)
             for k, v in fresh.items():
-                memory[f"{i}.{k}"][rows[skill == i]] = v[0]
+                memory[f"{i}.{k}"][rows[changed & (skill == i)]] = v[0]
+
+    def forget(self, memory: Memory, rows: Array) -> None:
+        """The episodes of environments ``rows`` are over: no call has begun, in place."""
+        memory["skill"][rows] = -1
 
     def act(
-        self, memory: Memory, rows: Array, obs: Array, rng: np.random.Generator | None = None
+        self,
+        memory: Memory,
+        rows: Array,
+        obs: Array,
+        rng: np.random.Generator | None = None,
+        mask: Array | None = None,
     ) -> Array:
-        """Actions of the running skills for ``obs`` (k, ...) of environments ``rows`` (k,)."""
+        """Actions of the running skills for ``obs`` (k, ...) of environments ``rows`` (k,).
+
+        ``mask`` (k, A) bool are the actions that the environments allow. Trained skills and
+        networks that return logits choose among them; other policies made elsewhere, and reflexes,
+        may take another action, and then the environment decides what comes of it.
+        """
         running = memory["skill"][rows]
         actions: Array | None = None
         for i, policy in enumerate(self.policies):
@@ -93,7 +111,8 @@ class SkillSet:
             if not len(mine):
                 continue
             own = self._own(memory, i, rows[mine])
-            some, after = policy.act(own, obs[mine], deterministic=self.greedy, rng=rng)
+            allowed = allowed_rows(mask, mine)
+            some, after = policy.act(own, obs[mine], allowed, deterministic=self.greedy, rng=rng)
             self._put(memory, i, rows[mine], after)
             if len(mine) == len(rows):
                 actions = some
@@ -145,10 +164,7 @@ def _rows(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Ste
     timed_out = np.zeros(len(rows), bool)
     if max_steps is not None:
         timed_out = (elapsed >= max_steps) & ~step.terminated[rows]
-    info = {
-        k: v[rows] if isinstance(v, np.ndarray) and len(v) == len(step.reward) else v
-        for k, v in step.info.items()
-    }
+    info = info_rows(step.info, rows, len(step.reward))
     return Step(
         step.obs[rows], step.action[rows], step.next_obs[rows], step.reward[rows],
         step.terminated[rows], step.truncated[rows], timed_out, elapsed, info,

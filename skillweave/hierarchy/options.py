@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from skillweave.envs.engine import LONGEST_EPISODE, Engine, checksums
+from skillweave.envs.infos import allowed_rows
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.seeding import Seeds
 from skillweave.spaces import unpack
@@ -34,7 +35,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         engine: the environments; stepped in part where calls differ in length.
         skills: what the actions mean.
         gamma: γ of one primitive step; a number, or one for each environment (N,).
-        seed: of the skills' own sampling, where they are not greedy.
+        seed: of the skills' own sampling, where they are not greedy. What a call draws follows
+            from it and from the number of calls before, so no generator's state must be kept.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -61,7 +63,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         if isinstance(seed, list):
             raise SkillweaveError("OptionsEnv.reset takes one seed for all environments")
         self._seed = self._seed + 1 if seed is None else seed
-        self._rng = np.random.default_rng(self._seed)
+        self._calls = 0
         self._memory = self.skills.start(self.num_envs)
         self._obs = self.engine.reset(self._seed)
         self._mask = self.skills.mask(self._obs)
@@ -81,7 +83,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     def renew(self, seeds: Seeds) -> Array:
         """Take new seeds; environments whose episodes are too long to be kept begin anew."""
         self._seed = (seeds / "skills").integer()
-        self._rng = np.random.default_rng(self._seed)
+        self._calls = 0
         self.engine.renew((seeds / "env").integer())
         return self._begin(np.flatnonzero(self._age > LONGEST_EPISODE))
 
@@ -94,7 +96,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     def restore(self, state: dict[str, Array]) -> Array:
         """Play the open episodes again; the environments that did not repeat themselves."""
         self._seed = int(state["seed"][0])
-        self._rng = np.random.default_rng(self._seed)
+        self._calls = 0
         self._age = state["age"].copy()
         self._memory = {k: v.copy() for k, v in unprefixed("memory", state).items()}
         self._obs = self.engine.restore(unprefixed("engine", state))
@@ -110,8 +112,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             self._obs = self._obs.copy()
             self._obs[ids] = self.engine.reset_some(ids)
             self._age[ids] = 0
-            for k, v in self.skills.start(len(ids)).items():
-                self._memory[k][ids] = v
+            self.skills.forget(self._memory, ids)
         self._mask = self.skills.mask(self._obs)
         return ids
 
@@ -121,6 +122,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         skill = np.asarray(actions).reshape(n)
         self._check(skill)
         self.skills.begin(self._memory, np.arange(n), skill)
+        rng = (Seeds(self._seed) / "call" / self._calls).numpy()
+        self._calls += 1
         obs = self._obs
         next_obs = np.empty_like(obs)
         reward, plain, discount = np.zeros(n), np.zeros(n), np.ones(n)
@@ -129,7 +132,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         rows = np.arange(n)
         while len(rows):
             here = obs if len(rows) == n else obs[rows]
-            action = self.skills.act(self._memory, rows, here, self._rng)
+            allowed = allowed_rows(self.engine.mask(), rows)
+            action = self.skills.act(self._memory, rows, here, rng, allowed)
             raw = self.engine.step(action, None if len(rows) == n else rows)
             reward[rows] += discount[rows] * raw.reward
             plain[rows] += raw.reward
@@ -152,6 +156,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             if ended.any():
                 terminated[rows], truncated[rows] = raw.terminated, raw.truncated
                 obs[rows[ended]] = self.engine.reset_some(rows[ended])
+                self.skills.forget(self._memory, rows[ended])
                 over = over | ended
             if over.any():
                 rows = rows[~over]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from skillweave.hierarchy.calls import SkillSet
+from skillweave.skills import apply_reflexes
 from skillweave.types import Array, Memory, Policy, Step
 
 _SELECTOR = "selector."
@@ -36,7 +37,10 @@ class HierarchyPolicy:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions (n, ...); ``deterministic`` is about the selector, ``SkillSet.greedy`` skills."""
+        """Actions (n, ...), among those that ``mask`` (n, A) allows the skills.
+
+        ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills.
+        """
         memory = {k: v.copy() for k, v in memory.items()}
         rows = np.flatnonzero(memory["over"])
         if len(rows):
@@ -51,7 +55,7 @@ class HierarchyPolicy:
                 memory[_SELECTOR + k][rows] = v
             self.skills.begin(memory, rows, skill)
             memory["over"][rows] = False
-        return self.skills.act(memory, np.arange(len(obs)), obs, rng), memory
+        return self.skills.act(memory, np.arange(len(obs)), obs, rng, mask), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Notice where calls are over."""
@@ -63,3 +67,33 @@ class HierarchyPolicy:
     def acting(self, memory: Memory) -> Array | None:
         """(n,) int64, the running skill."""
         return memory["skill"]
+
+
+class SkillAlone:
+    """One skill as it acts under a selector that chooses no other: with the reflexes in force.
+
+    It acts from an episode's start to its end, also where its own initiation set or ends say
+    otherwise. Its memory is that of the skill's policy.
+    """
+
+    def __init__(self, skills: SkillSet, name: str) -> None:
+        at = [s.name for s in skills.skills].index(name)
+        self.policy, self.reflexes = skills.policies[at], skills.reflexes
+        self.observation_space = self.policy.observation_space
+        self.action_space = self.policy.action_space
+        self.labels = self.policy.labels
+        self.start, self.observe = self.policy.start, self.policy.observe
+        self.acting = self.policy.acting
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """The skill's actions, or those of the reflexes where one holds."""
+        action, memory = self.policy.act(memory, obs, mask, deterministic=deterministic, rng=rng)
+        return apply_reflexes(self.reflexes, obs, action), memory

@@ -8,19 +8,18 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.engine import GymnasiumEngine
+from skillweave.envs.make import EnvSpec
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
-
-if TYPE_CHECKING:
-    from skillweave.envs.make import EnvSpec
 
 __all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
 
@@ -69,12 +68,13 @@ def render_policy(
         policy.act, deterministic=deterministic, rng=rng or (Seeds(seed) / "render").numpy()
     )
     env, told = env_spec.make(render_mode="rgb_array"), []
+    engine = GymnasiumEngine(lambda: env, 1)  # observations, infos and masks as everywhere else
     try:
         rate = (fps or env.metadata.get("render_fps") or 30) / every
         with VideoWriter(path, rate) as video:
             for i in range(episodes):
                 who, color, skills = "", BLACK, Counter[str]()
-                for now in _play(env, policy, act, seed + i, max_steps or UNLIMITED):
+                for now in _play(engine, policy, act, seed + i, max_steps or UNLIMITED):
                     if label is not None and not now.over:
                         who, color = label(now.memory)
                         skills[who] += 1
@@ -85,7 +85,7 @@ def render_policy(
                         video.add(frame, HOLD if now.over else None)
                 told.append({"return": now.total, "length": now.elapsed, "skills": dict(skills)})
     finally:
-        env.close()
+        engine.close()
     return {"path": str(path), "frames": video.frames, "episodes": told}
 
 
@@ -97,31 +97,23 @@ class _Moment(NamedTuple):
 
 
 def _play(
-    env: gym.Env[Any, Any], policy: Policy, act: Callable[..., Any], seed: int, limit: int
+    engine: GymnasiumEngine, policy: Policy, act: Callable[..., Any], seed: int, limit: int
 ) -> Iterator[_Moment]:
     """An episode: a moment before each step, when the action is chosen, and one at the end."""
-    obs, _ = env.reset(seed=seed)
+    obs = engine.reset_some(np.zeros(1, np.int64), [seed])
     memory, total, elapsed, over = policy.start(1), 0.0, 0, False
     while not over and elapsed < limit:
-        before = np.asarray(obs)[None]
-        action, memory = act(memory, before)
+        action, memory = act(memory, obs, engine.mask())
         yield _Moment(memory, elapsed, total, False)
-        first = int(action[0]) if isinstance(env.action_space, gym.spaces.Discrete) else action[0]
-        obs, reward, terminated, truncated, info = env.step(first)
-        elapsed, total, over = elapsed + 1, total + float(reward), terminated or truncated
+        raw = engine.step(action)
+        elapsed, total = elapsed + 1, total + float(raw.reward[0])
+        over = bool(raw.terminated[0] | raw.truncated[0])
         step = Step(
-            before, action, np.asarray(obs)[None], np.array([reward], np.float32),
-            np.array([terminated]), np.array([truncated]), np.zeros(1, bool),
-            np.array([elapsed]), {key: _batch_of_one(value) for key, value in info.items()},
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            np.zeros(1, bool), np.array([elapsed]), raw.info,
         )  # fmt: skip
-        memory = policy.observe(memory, step)
+        obs, memory = raw.next_obs, policy.observe(memory, step)
     yield _Moment(memory, elapsed, total, True)
-
-
-def _batch_of_one(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value[None]
-    return np.array([value]) if np.isscalar(value) else [value]
 
 
 def _frame(env: gym.Env[Any, Any]) -> Array:

@@ -31,7 +31,9 @@ class Skill:
             None: the hierarchy's.
         policy: what acts without being trained: a function of observations (n, *obs_shape), which
             needs no ``staticmethod``, or a method ``policy(self, obs)``; a torch module;
-            ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained.
+            ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained. Where an
+            environment tells an action mask, networks that return logits keep to it; what others
+            return goes to the environment as it is.
         color: RGB in captions and plots; None: chosen from a palette.
     """
 

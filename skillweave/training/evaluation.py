@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.spaces import same_space
 from skillweave.types import Array, Policy, SkillweaveError, Step
@@ -132,16 +133,16 @@ def _play(
     upcoming = n
     engine.reset(0)
     obs = np.array(engine.reset_some(episode, seeds[:n]))
-    memory, rows = policy.start(n), np.arange(n)
+    memory, rows, never = policy.start(n), np.arange(n), np.zeros(n, bool)
     elapsed = np.zeros(n, np.int64)
     returns, lengths = np.zeros(episodes), np.zeros(episodes, np.int64)
     used = np.zeros(len(policy.labels), np.int64)
     calls = np.zeros(len(policy.labels), np.int64)
-    never = np.zeros(n, bool)
     while len(rows):
         own = {k: v[rows] for k, v in memory.items()}
         here = obs[rows]
-        action, own = policy.act(own, here, deterministic=deterministic, rng=rng)
+        allowed = allowed_rows(engine.mask(), rows)
+        action, own = policy.act(own, here, allowed, deterministic=deterministic, rng=rng)
         raw = engine.step(action, rows)
         elapsed[rows] += 1
         acting = policy.acting(own)

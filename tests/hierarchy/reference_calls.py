@@ -152,6 +152,8 @@ class Scalar:
     reflexes: tuple[Reflex, ...] = ()
     policies: tuple[Any, ...] = ()
     obs: Array = field(default_factory=lambda: np.empty(0))
+    last: int | None = None  # the skill of this episode's latest call
+    memory: Memory = field(default_factory=dict)  # its policy's
 
     def __post_init__(self) -> None:
         self.policies = self.policies or tuple(s.policy for s in self.skills)
@@ -159,6 +161,7 @@ class Scalar:
     def reset(self, seeds: Iterator[int]) -> Array:
         self.seeds = seeds
         self.obs, _ = self.env.reset(seed=next(seeds))
+        self.last = None
         return self.obs
 
     def allowed(self) -> list[bool]:
@@ -166,7 +169,7 @@ class Scalar:
 
     def call(self, choice: int) -> Outcome:
         skill, policy = self.skills[choice], self.policies[choice]
-        memory = policy.start(1)
+        memory = self.memory if choice == self.last else policy.start(1)
         rewards: list[float] = []
         while True:
             obs, tau = self.obs, len(rewards) + 1
@@ -186,8 +189,10 @@ class Scalar:
             if over:
                 break
         final = self.obs
+        self.last, self.memory = choice, memory
         if terminated or truncated:
             self.obs, _ = self.env.reset(seed=next(self.seeds))
+            self.last = None
         return Outcome(
             obs=self.obs,
             next_obs=final,

@@ -11,6 +11,7 @@ from reference_calls import (
     POSITION,
     TAG,
     Counter,
+    Counting,
     Left,
     Right,
     Scalar,
@@ -198,6 +199,38 @@ def test_real_environments_agree_with_a_scalar_loop(options, env_id, kinds, limi
     assert (seen["steps"].min(axis=1) < seen["steps"].max(axis=1)).any()
 
 
+def test_a_skill_that_is_called_again_at_once_goes_on_with_its_memory(options, walks):
+    class Remembering(Skill):
+        policy = Counting(1000, action_space=gym.spaces.Discrete(1000))
+
+    class Walks(Walk):
+        action_space = gym.spaces.Discrete(1000)
+
+        def reset(self, **how):
+            found = super().reset(**how)
+            self.length, self.end = 11, 0
+            return found
+
+        def step(self, action):
+            obs, _, *rest = super().step(action)
+            return obs, 0.0, *rest
+
+    made = []
+
+    def make():
+        made.append(Walks())
+        return made[-1]
+
+    env = options(skill_set(Remembering, Zigzag, call_steps=3), make, num_envs=2)
+    env.reset(seed=0)
+    for choice in ([0, 0], [0, 1], [0, 0], [0, 0], [0, 0]):
+        env.step(np.array(choice))
+    # the episode ends within the fourth call, so the fifth is the first of a new episode
+    acted = [[a for _, _, a in w.log] for w in made[-2:]]
+    assert acted[0] == [*range(11), *range(3)]
+    assert acted[1][:3] + acted[1][6:] == [0, 1, 2, *range(5), *range(3)]
+
+
 def test_a_waiting_environment_is_not_stepped(options, walks):
     env = options(skill_set(Left, Zigzag, call_steps=5), walks, num_envs=4)
     env.reset(seed=0)
@@ -319,6 +352,49 @@ def test_termination_sees_the_step_of_its_own_environment_and_call(options, walk
                 assert ended or timed_out == (k == 3)
                 expected += 1
     assert expected > 100
+
+
+class Nested(gym.Env):
+    """Tells a number of its own, which is its observation too, in three depths of info."""
+
+    observation_space = gym.spaces.Box(0, 1 << 20, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.number = float(self.np_random.integers(1 << 20))
+        return np.array([self.number], np.float32), {}
+
+    def step(self, action):
+        deep = {"id": self.number, "deeper": {"id": self.number}, "word": f"env {self.number}"}
+        obs = np.array([self.number], np.float32)
+        return obs, 0.0, False, False, {"id": self.number, "deep": deep}
+
+
+@pytest.mark.parametrize("engine", ["sync", "async"])
+def test_a_skill_sees_its_own_rows_of_info_however_deep(options, engine):
+    seen = []
+
+    class Watching(Skill):
+        policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
+
+        def termination(self, step):
+            seen.append((step.obs[:, 0].tolist(), step.info))
+            return np.zeros(len(step.reward), bool)
+
+    class Short(Skill):
+        policy, max_steps = Watching.policy, 2
+
+    env = options(skill_set(Short, Watching, call_steps=4), Nested, num_envs=4, engine=engine)
+    env.reset(seed=0)
+    env.step(np.array([0, 1, 0, 1]))
+    assert len(seen) == 4
+    for rows, info in seen:
+        assert len(set(rows)) == 2
+        deep = info["deep"]
+        for found in (info["id"], deep["id"], deep["deeper"]["id"]):
+            assert found.tolist() == rows
+        assert list(deep["word"]) == [f"env {r}" for r in rows]
 
 
 def test_a_skill_sees_the_same_steps_under_a_selector_as_in_training(options):
@@ -483,6 +559,18 @@ def test_skills_go_on_sampling_anew_from_call_to_call(options, walks):
         env.step(np.zeros(1, int))
     actions = [a for _, _, a in walks.made[-1].log]
     assert len({tuple(actions[i : i + 3]) for i in range(0, 90, 3)}) > 10
+
+
+def test_what_a_call_draws_follows_from_the_seed_and_the_number_of_calls_alone(options, walks):
+    env = options(skill_set(Die, Left, call_steps=3, greedy=False), walks, num_envs=1)
+    draws = []
+    for first in (0, 1):  # the first call draws, or does not; the second draws
+        env.reset(seed=4)  # an episode of more than six steps
+        walks.made[-1].log.clear()
+        for choice in (first, 0):
+            env.step(np.array([choice]))
+        draws.append([a for _, _, a in walks.made[-1].log][-3:])
+    assert draws[0] == draws[1]
 
 
 # Gymnasium's conventions ---------------------------------------------------------------------

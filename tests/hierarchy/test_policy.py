@@ -32,8 +32,9 @@ from skillweave.hierarchy.calls import SkillSet
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds
-from skillweave.skills import Skill
+from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.training.evaluation import evaluate
 from skillweave.types import Array, SkillweaveError, Step
 
 torch.set_num_threads(1)
@@ -99,6 +100,10 @@ def play(policy, engine, seed: int, steps: int, **how) -> list:
             for k, v in policy.start(n).items():
                 memory[k][ended] = v[ended]
     return happened
+
+
+class Counter2(Counter):
+    """Another skill with a memory of its own."""
 
 
 class Keeper:
@@ -206,7 +211,7 @@ class One:
         self.start()
 
     def start(self) -> None:
-        self.running = None
+        self.running = self.last = None
 
     def act(self, obs: Array) -> int:
         if self.running is None:
@@ -214,10 +219,13 @@ class One:
             self.running = int(self.chooser.act({}, obs[None], mask)[0][0])
             self.elapsed = 0
             part = self.parts[self.running]
-            if isinstance(part, One):
+            if self.running == self.last:
+                pass  # the same skill goes on, and remembers
+            elif isinstance(part, One):
                 part.start()
             else:
                 self.memory = part.start(1)
+            self.last = self.running
         part = self.parts[self.running]
         if isinstance(part, One):
             return part.act(obs)
@@ -320,6 +328,79 @@ def test_a_hierarchy_as_a_skill_of_options_env_acts_as_the_scalar_one():
         for t in range(40):
             scalar.call((i + t) % 2)
         assert keeper.made[i].actions == logged.actions
+
+
+# A skill alone ---------------------------------------------------------------------------------
+
+
+class Remote(Skill):
+    """As Counter, where it may start hardly anywhere: alone it is asked nevertheless."""
+
+    max_steps = 6
+    policy = Counting()
+
+    def initiation(self, obs: Array) -> Array:
+        return obs[:, POSITION] == 99
+
+
+def alone(skill: Skill, others: tuple, **more) -> Run:
+    """A run of a hierarchy in which a selector never chooses ``skill``, which comes last."""
+    declared = Hierarchy(Walk, [*others, skill], **more)
+    skills = declared.skill_set([s.policy for s in declared.skills])
+    return Run(declared, None, HierarchyPolicy(Chooser(len(skills.skills)), skills))
+
+
+def always(skill: Skill, **more) -> HierarchyPolicy:
+    """A selector that has no choice."""
+    declared = Hierarchy(Walk, [skill], **more)
+    return HierarchyPolicy(Chooser(1), declared.skill_set([skill.policy]))
+
+
+@pytest.mark.parametrize("in_training", [True, False])
+@pytest.mark.parametrize("kind", [Counter, Zigzag, "nested"])
+def test_a_skill_alone_acts_as_under_a_selector_that_chooses_no_other(kind, in_training):
+    on = Reflex(lambda obs: obs[:, POSITION] == 1, action=2)
+    more = {"reflexes": [on], "reflexes_in_training": in_training, "call_steps": 3}
+    inner = hierarchy(Counter, Right, Left, call_steps=2)
+    skill = alone(Left(), ()).as_skill("inner") if kind == "nested" else kind()
+    if kind == "nested":
+        type(skill).policy = inner
+    found = alone(skill, (Left(), Right()), **more).evaluate(20, skill=skill.name)
+    wanted = evaluate(always(skill, **more), EnvSpec(Walk), episodes=20)
+    assert (found.returns, found.lengths) == (wanted.returns, wanted.lengths)
+    bare = evaluate(skill.policy, EnvSpec(Walk), episodes=20)
+    assert found.returns != bare.returns, "the reflex never acted"
+    assert bool(found.skill_steps) == (kind == "nested")
+
+
+def test_a_skill_alone_does_not_ask_where_it_may_start():
+    run = alone(Remote(), (Left(),))
+    assert run.evaluate(3, skill="remote") == evaluate(Remote.policy, EnvSpec(Walk), episodes=3)
+
+
+def test_a_film_of_a_skill_alone_shows_its_reflexes_too(tmp_path):
+    pytest.importorskip("PIL")
+
+    class Shown(Walk):
+        def __init__(self, render_mode=None):
+            super().__init__()
+            self.render_mode = render_mode
+
+        def step(self, action):
+            obs, _, *rest = super().step(action)
+            return obs, float(action), *rest
+
+        def render(self):
+            return np.zeros((8, 8, 3), np.uint8)
+
+    anywhere = Reflex(lambda obs: np.ones(len(obs), bool), action=2)
+    declared = Hierarchy(Shown, [Left(), Zigzag()], reflexes=[anywhere])
+    policy = HierarchyPolicy(Chooser(2), declared.skill_set([Left.policy, Zigzag.policy]))
+    told = Run(declared, None, policy).render(tmp_path / "a.gif", episodes=3, skill="left")
+    assert [e["return"] for e in told["episodes"]] == [2.0 * e["length"] for e in told["episodes"]]
+    assert [e["skills"] for e in told["episodes"]] == [
+        {"left": e["length"]} for e in told["episodes"]
+    ]
 
 
 # Memory ----------------------------------------------------------------------------------------
@@ -436,15 +517,33 @@ def test_a_call_lasts_as_many_steps_as_the_least_limit_says():
         assert decided == [k % lasts == 0 for k in range(12)]
 
 
-def test_a_skills_own_memory_is_fresh_in_every_call():
+def test_a_skill_that_is_called_again_at_once_goes_on_with_its_memory():
     policy = HierarchyPolicy(Chooser(1), skill_set(Counter, call_steps=4))
     memory, obs, actions = policy.start(1), walk_obs(0), []
     for _ in range(8):
         action, memory = policy.act(memory, obs)
         actions.append(int(action[0]))
         memory = policy.observe(memory, transition(obs, action, obs))
-    # Counting: the number of its actions, plus 1 as soon as it was paid
-    assert actions == [0, 2, 0, 1] * 2
+    # Counting: the number of its actions, plus 1 as soon as it was paid; modulo 3
+    assert actions == [0, 2, 0, 1, 2, 0, 1, 2]
+    assert memory["elapsed"].tolist() == [4], "the call's own time starts anew"
+
+
+def test_a_skill_that_is_called_after_another_one_starts_with_a_fresh_memory():
+    by_turns = ScriptedPolicy(
+        lambda obs: obs[:, POSITION].astype(int), Walk.observation_space, gym.spaces.Discrete(2)
+    )
+    policy = HierarchyPolicy(by_turns, skill_set(Counter, Counter2, call_steps=2))
+    memory, actions = policy.start(2), []
+    # two environments: the first calls 0 0 1 0, the second 0 1 1 1
+    for first, second in ((0, 0), (0, 1), (1, 1), (0, 1)):
+        obs = walk_obs(first, second)
+        for _ in range(2):
+            action, memory = policy.act(memory, obs)
+            actions.append(action.tolist())
+            memory = policy.observe(memory, transition(obs, action, obs))
+    assert [a for a, _ in actions] == [0, 2, 0, 1, 0, 2, 0, 2]
+    assert [a for _, a in actions] == [0, 2, 0, 2, 0, 1, 2, 0]
 
 
 def test_the_selector_chooses_only_among_skills_that_may_start():

@@ -15,6 +15,7 @@ import pytest
 
 from skillweave.envs.make import EnvSpec
 from skillweave.reporting.video import PALETTE, VideoWriter, caption, color_of, render_policy
+from skillweave.training.evaluation import evaluate
 from skillweave.types import Array, Memory, MissingExtra, SkillweaveError, Step
 
 Image = pytest.importorskip("PIL.Image")
@@ -375,3 +376,45 @@ def test_a_real_environment_without_a_display(
     assert frames[0].shape == (432, 600, 3)
     assert durations[0] == 40
     assert (frames[0][:400] != frames[-1][:400]).any()
+
+
+def test_a_film_shows_what_an_evaluation_plays(tmp_path: Path) -> None:
+    """Dict observations, nested infos and rewards reach a policy as they do elsewhere."""
+
+    class Rooms(Corridor):
+        observation_space = gym.spaces.Dict(
+            at=gym.spaces.Box(0, 10, (1,), np.float32), room=gym.spaces.Discrete(20)
+        )
+
+        def told(self) -> Any:
+            return {"room": self.at, "at": np.full(1, self.at, np.float32)}
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            super().reset(seed=seed)
+            return self.told(), {}
+
+        def step(self, action: int) -> Any:
+            _, *rest = super().step(action)
+            return self.told(), rest[0] + action / 3, *rest[1:3], {"deep": {"at": self.at}}
+
+    class Reader(Walker):
+        observation_space = Rooms.observation_space
+
+        def act(self, memory: Memory, obs: Array, mask: Any = None, **_: Any) -> Any:
+            assert obs["at"].shape == (len(obs), 1)
+            return obs["room"] % 2, memory
+
+    policies, spec = (Reader(), Reader()), EnvSpec(Rooms)
+    found = evaluate(policies[0], spec, episodes=1)
+    film = render_policy(spec, policies[1], tmp_path / "a.gif")
+    assert [e["return"] for e in film["episodes"]] == list(found.returns)
+    told = [
+        [
+            (s.obs.tolist(), s.action.tolist(), s.next_obs.tolist(), s.reward.tolist(),
+             s.elapsed.tolist(), s.info["deep"]["at"].tolist())
+            for s in policy.told
+        ]
+        for policy in policies
+    ]  # fmt: skip
+    assert told[0] == told[1]
+    assert len(told[0]) == 7

@@ -1,0 +1,108 @@
+"""What environments tell beside observations: rows of a batched info, and action masks in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.spaces import action_codec
+from skillweave.types import Array, SkillweaveError
+
+
+def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
+    """The part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
+
+    What is no array over the n environments is returned as it is.
+    """
+    return {key: _rows(value, rows, n) for key, value in info.items()}
+
+
+def _rows(value: Any, rows: Array, n: int) -> Any:
+    if isinstance(value, dict):
+        return info_rows(value, rows, n)
+    batched = isinstance(value, np.ndarray) and value.ndim > 0 and len(value) == n
+    return value[rows] if batched else value
+
+
+class ActionMasks:
+    """The actions that N environments allow now, as their infos tell.
+
+    Gymnasium's convention: ``info["action_mask"]`` of ``reset`` and ``step`` has a number for each
+    choice, 0 where it is forbidden. For several choices at once (MultiDiscrete, MultiBinary) the
+    numbers stand one choice after another. Where an info has no mask, everything is allowed. A Box
+    has no choices, so its masks are ignored.
+    """
+
+    def __init__(self, space: gym.Space[Any], num_envs: int, now: Array | None = None) -> None:
+        self._space, self._num_envs = space, num_envs
+        discrete = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
+        self._parts = action_codec(space).parts if isinstance(space, discrete) else ()
+        self.now = now
+        """(N, A) bool; None: no environment has ever told. Never changed in place."""
+
+    def see(
+        self, info: Mapping[str, Any], ids: Array | None = None, ended: Array | None = None
+    ) -> None:
+        """Take in the info of environments ``ids`` (n,), rows in their order; None: of all.
+
+        ``ended`` (n,) bool says where the episode is over: nothing needs to be allowed there.
+
+        Raises:
+            SkillweaveError: a mask has another shape, or allows nothing; the message names the
+                environment.
+        """
+        told = info.get("action_mask")
+        if not self._parts or (told is None and self.now is None):
+            return
+        ids = np.arange(self._num_envs) if ids is None else ids
+        size = sum(self._parts)
+        mask = np.ones((len(ids), size), bool)
+        if told is not None:
+            here = np.asarray(info.get("_action_mask", np.ones(len(ids), bool)))
+            mask[here] = self._checked(told, (len(ids), size))[here]
+        starts = np.cumsum((0, *self._parts[:-1]))
+        free = np.logical_or.reduceat(mask, starts, axis=1).all(axis=1)
+        over = np.zeros(len(ids), bool) if ended is None else ended
+        if not (free | over).all():
+            raise SkillweaveError(
+                f"environment {ids[np.flatnonzero(~free & ~over)[0]]} allows no action, though its "
+                "episode goes on: info['action_mask'] is 0 everywhere; allow at least one action"
+            )
+        mask[~free] = True
+        now = np.ones((self._num_envs, size), bool) if self.now is None else self.now.copy()
+        now[ids] = mask
+        self.now = now
+
+    def _checked(self, told: Any, shape: tuple[int, int]) -> Array:
+        mask = np.asarray(told)
+        if mask.shape != shape or mask.dtype.kind not in "iubf":
+            raise SkillweaveError(
+                f"info['action_mask'] of the environments is of {mask.dtype} and shape "
+                f"{mask.shape}, but numbers of shape {shape} were expected: one for each choice of "
+                f"{self._space}, 0 where it is forbidden"
+            )
+        allowed: Array = mask != 0
+        return allowed
+
+
+def allowed_rows(mask: Array | None, rows: Array) -> Array | None:
+    """Rows of an action mask, where there is one."""
+    return None if mask is None else mask[rows]
+
+
+def random_actions(
+    space: gym.Space[Any], n: int, rng: np.random.Generator, mask: Array | None = None
+) -> Array:
+    """n actions drawn at random from a space, among those that ``mask`` (n, A) allows."""
+    space.seed(int(rng.integers(2**31)))
+    drawn = np.stack([np.asarray(space.sample()) for _ in range(n)])
+    if mask is None:
+        return drawn
+    codec = action_codec(space)
+    scores = np.where(mask, rng.random(mask.shape), -1.0)
+    parts = np.split(scores, np.cumsum(codec.parts)[:-1], axis=1)
+    units = np.stack([part.argmax(axis=1) for part in parts], axis=1)
+    return codec.to_env(units if codec.multi else units[:, 0])

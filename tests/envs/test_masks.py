@@ -1,0 +1,336 @@
+"""Action masks of environments: what infos say is what everyone who acts is told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from skillweave import DQN, PPO, SAC, Hierarchy, Network, Skill, SkillweaveError, evaluate
+from skillweave.envs.foreign import FromVectorEnv
+from skillweave.envs.infos import ActionMasks, random_actions
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.hierarchy.calls import SkillSet
+from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.seeding import Seeds
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.types import Array
+
+A = 4
+
+
+def allowed_at(t: int, episode: int) -> Array:
+    """What ``Gate`` allows: one or two of four actions, by the time and the episode."""
+    mask = np.zeros(A, np.int8)
+    mask[[(t + episode) % A, (2 * t + episode + 1) % A]] = 1
+    return mask
+
+
+class Gate(gym.Env):
+    """Refuses what its mask forbids; episode e lasts 3 + e % 3 steps, odd ones are truncated.
+
+    The observation is (episode, time). Nothing is allowed where an episode has terminated.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space: gym.Space[Any] = gym.spaces.Discrete(A)
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode, self.episode = render_mode, -1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.episode, self.t = self.episode + 1, 0
+        return self._told(False)
+
+    def step(self, action: int) -> Any:
+        if not allowed_at(self.t, self.episode)[action]:
+            raise ValueError(f"{action} is forbidden at {self.t} of episode {self.episode}")
+        self.t += 1
+        ended, even = self.t == 3 + self.episode % 3, self.episode % 2 == 0
+        obs, info = self._told(ended and even)
+        return obs, float(action), ended and even, ended and not even, info
+
+    def _told(self, over: bool) -> Any:
+        mask = allowed_at(self.t, self.episode) * (not over)
+        return np.array([self.episode, self.t], np.float32), {"action_mask": mask.astype(np.int8)}
+
+    def render(self) -> Any:
+        return np.zeros((8, 8, 3), np.uint8)
+
+
+def wanted(obs: Array) -> Array:
+    """The masks of observations (n, 2) that are not the last of a terminated episode."""
+    return np.stack([allowed_at(int(t), int(e)) for e, t in obs]).astype(bool)
+
+
+def first_allowed(mask: Array) -> Array:
+    return mask.argmax(axis=1)
+
+
+# Engines -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["sync", "async"])
+def test_an_engine_knows_what_is_allowed_in_the_latest_observation_of_each_environment(name):
+    engine = make_engine(EnvSpec(Gate, engine=name), 3)
+    try:
+        obs = engine.reset(0).copy()
+        for ids in ([0, 1, 2], [2, 0], [2], None, [1, 2], [2, 1], None, None):
+            mask = engine.mask()
+            assert (mask.dtype, mask.shape) == (np.bool_, (3, A))
+            assert mask.tolist() == wanted(obs).tolist()
+            kept, rows = mask.copy(), np.arange(3) if ids is None else np.array(ids)
+            raw = engine.step(first_allowed(mask)[rows], None if ids is None else rows)
+            assert (mask == kept).all(), "what was given must not change"
+            obs[rows] = raw.next_obs
+            last = engine.mask()
+            assert last[rows[raw.terminated]].all(), "nothing matters where it terminated"
+            goes_on = rows[~raw.terminated]
+            assert last[goes_on].tolist() == wanted(obs)[goes_on].tolist()
+            if (ended := rows[raw.terminated | raw.truncated]).size:
+                obs[ended] = engine.reset_some(ended)
+    finally:
+        engine.close()
+
+
+def test_gymnasiums_taxi_is_driven_by_its_masks():
+    engine = make_engine(EnvSpec("Taxi-v4"), 5)
+    reference = gym.make("Taxi-v4").unwrapped
+    rng = np.random.default_rng(0)
+    obs = engine.reset(0)
+    for _ in range(30):
+        mask = engine.mask()
+        assert mask.tolist() == [reference.action_mask(int(s)).tolist() for s in obs]
+        action = random_actions(engine.action_space, 5, rng, mask)
+        raw = engine.step(action)
+        # every allowed move of Taxi's changes its state, so none was forbidden
+        assert (raw.next_obs != obs).all()
+        obs = raw.next_obs
+
+
+def test_without_masks_everything_is_allowed():
+    engine = make_engine(EnvSpec("CartPole-v1", engine="sync"), 2)
+    engine.reset(0)
+    assert engine.mask() is None
+    engine.step(np.zeros(2, np.int64))
+    assert engine.mask() is None
+
+
+def test_where_one_environment_has_no_mask_everything_is_allowed_there():
+    masks = ActionMasks(gym.spaces.Discrete(3), 3)
+    masks.see({})
+    assert masks.now is None
+    told = {
+        "action_mask": np.array([[1, 0, 0], [0, 0, 0]]),
+        "_action_mask": np.array([True, False]),
+    }
+    masks.see(told, np.array([2, 0]))
+    assert masks.now.tolist() == [[True] * 3, [True] * 3, [True, False, False]]
+    masks.see({}, np.array([2]))
+    assert masks.now.all()
+
+
+def test_a_mask_of_several_choices_has_their_numbers_one_after_another():
+    space = gym.spaces.MultiDiscrete([2, 3])
+    masks = ActionMasks(space, 2)
+    masks.see({"action_mask": np.array([[1, 1, 0, 0, 1], [0, 1, 1, 1, 0]])})
+    drawn = np.array(
+        [random_actions(space, 2, np.random.default_rng(i), masks.now) for i in range(40)]
+    )
+    assert {tuple(a) for a in drawn[:, 0]} == {(0, 2), (1, 2)}
+    assert {tuple(a) for a in drawn[:, 1]} == {(1, 0), (1, 1)}
+    with pytest.raises(SkillweaveError, match="environment 1 allows no action"):
+        masks.see({"action_mask": np.array([[1, 1, 0, 0, 1], [1, 1, 0, 0, 0]])})
+
+
+@pytest.mark.parametrize(
+    "mask", [np.ones((2, 4)), np.ones(2), np.array([None, None]), np.array([["a"] * 3] * 2)]
+)
+def test_a_mask_of_another_shape_is_named(mask):
+    masks = ActionMasks(gym.spaces.Discrete(3), 2)
+    with pytest.raises(SkillweaveError, match=r"action_mask.*shape \(2, 3\).*Discrete\(3\)"):
+        masks.see({"action_mask": mask})
+
+
+def test_a_mask_that_allows_nothing_names_the_environment_unless_the_episode_is_over():
+    masks = ActionMasks(gym.spaces.Discrete(3), 4)
+    told = {"action_mask": np.array([[0, 1, 0], [0, 0, 0]], np.int8)}
+    masks.see(told, np.array([1, 3]), np.array([False, True]))
+    assert masks.now[[1, 3]].tolist() == [[False, True, False], [True] * 3]
+    with pytest.raises(SkillweaveError, match=r"environment 3 allows no action.*action_mask"):
+        masks.see(told, np.array([1, 3]), np.array([False, False]))
+
+
+def test_masks_of_a_box_are_no_masks_of_choices():
+    masks = ActionMasks(gym.spaces.Box(-1, 1, (2,)), 2)
+    masks.see({"action_mask": np.zeros((2, 2))})
+    assert masks.now is None
+
+
+@pytest.mark.parametrize("start", [0, 5])
+def test_random_actions_are_spread_over_what_is_allowed(start):
+    space = gym.spaces.Discrete(4, start=start)
+    mask = np.tile([True, False, True, False], (4000, 1))
+    drawn = random_actions(space, 4000, np.random.default_rng(0), mask) - start
+    assert set(drawn.tolist()) == {0, 2}
+    assert abs((drawn == 0).mean() - 0.5) < 0.05
+
+
+# Training ----------------------------------------------------------------------------------------
+
+
+class Late(Skill):
+    """May start where the time is 2, and stops by itself at 4."""
+
+    def initiation(self, obs: Array) -> Array:
+        return obs[:, 1] >= 2
+
+    def termination(self, step: Any) -> Array:
+        return step.next_obs[:, 1] == 4
+
+
+@pytest.mark.parametrize("skill", [None, Skill(), Late()])
+def test_a_loop_is_told_the_masks_of_what_to_act_on_and_of_true_successors(skill):
+    env = SkillEnv(make_engine(EnvSpec(Gate), 4), skill)
+    obs, ended = env.reset(Seeds(0)), 0
+    for _ in range(40):
+        mask = env.mask()
+        assert mask.tolist() == wanted(obs).tolist()
+        step = env.step(first_allowed(mask))
+        assert step.mask.tolist() == wanted(step.obs).tolist()
+        after = step.mask if step.next_mask is None else step.next_mask
+        alive = ~step.terminated
+        assert after[alive].tolist() == wanted(step.next_obs)[alive].tolist()
+        obs, ended = step.obs, ended + int(step.ended.sum())
+    assert ended > 10
+
+
+def test_a_foreign_vectors_masks_are_read_as_well():
+    vector = SyncVectorEnv([Gate] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+    env = FromVectorEnv(vector)
+    obs = env.reset(Seeds(0))
+    truncated = 0
+    for _ in range(40):
+        mask = env.mask()
+        assert (mask.dtype, mask.tolist()) == (np.bool_, wanted(obs).tolist())
+        step = env.step(first_allowed(mask))
+        after = step.mask if step.next_mask is None else step.next_mask
+        alive = ~step.terminated
+        assert after[alive].tolist() == wanted(step.next_obs)[alive].tolist()
+        truncated += int(step.truncated.sum())
+        obs = step.obs
+    assert truncated > 3
+
+
+SMALL = Network((8,))
+LEARNERS = [
+    PPO(num_envs=4, n_steps=16, batch_size=32, network=SMALL),
+    DQN(num_envs=4, learning_starts=100, update_ratio=0.1, batch_size=8, network=SMALL),
+    SAC(num_envs=4, learning_starts=100, update_ratio=0.1, batch_size=8, network=SMALL),
+]
+
+
+@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda a: type(a).__name__)
+def test_learnt_skills_selectors_and_flat_agents_never_take_what_is_forbidden(algorithm, tmp_path):
+    # Gate raises an error at the first forbidden action: in training, looks, evaluation, videos.
+    pytest.importorskip("PIL")
+    hierarchy = Hierarchy(
+        Gate, [Late(), type("Any", (Skill,), {"max_steps": 2})()], algorithm=algorithm,
+        selector=LEARNERS[0], call_steps=3, skill_steps=300, selector_steps=300, eval_every=200,
+        eval_episodes=2, greedy_skills=False,
+    )  # fmt: skip
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    for how in ({"deterministic": False}, {"skill": "any"}, {}):
+        assert run.evaluate(6, **how).mean > 0
+        run.render(tmp_path / "a.gif", episodes=2, **how)
+    flat = hierarchy.train(tmp_path / "flat", quiet=True, flat=True)
+    assert flat.evaluate(6, deterministic=False).mean > 0
+    flat.render(tmp_path / "a.gif", episodes=2)
+
+
+class Strict(gym.Wrapper):
+    """Refuses what the mask forbids."""
+
+    def step(self, action: Any) -> Any:
+        taxi: Any = self.env.unwrapped
+        assert taxi.action_mask(taxi.s)[action], "a forbidden action"
+        return self.env.step(action)
+
+
+def test_a_hierarchy_learns_to_drive_gymnasiums_taxi_by_its_masks(tmp_path):
+    spec = EnvSpec("Taxi-v4", {"max_episode_steps": 20}, (Strict,))
+    fast = type("Fast", (Skill,), {"max_steps": 3})()
+    hierarchy = Hierarchy(
+        spec, [fast, type("Plain", (Skill,), {})()], algorithm=LEARNERS[1], selector=LEARNERS[0],
+        call_steps=5, skill_steps=300, selector_steps=300,
+    )  # fmt: skip
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    # every step costs 1; only a forbidden passenger's move costs 10
+    for skill in (None, "fast"):
+        assert run.evaluate(5, skill=skill, deterministic=False).mean >= -20
+
+
+# Skills under a selector -------------------------------------------------------------------------
+
+
+class Masked(ScriptedPolicy):
+    """Takes the first action that is allowed; writes down what it was told."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda obs: None, Gate.observation_space, Gate.action_space)
+        self.seen: list[tuple[Array, Array]] = []
+
+    def act(self, memory: Any, obs: Array, mask: Any = None, **_: Any) -> Any:
+        self.seen.append((obs.copy(), mask.copy()))
+        return first_allowed(mask), memory
+
+
+def constant(choice: int, count: int) -> ScriptedPolicy:
+    space = gym.spaces.Discrete(count)
+    return ScriptedPolicy(lambda obs: np.full(len(obs), choice), Gate.observation_space, space)
+
+
+def woven(policies: tuple[Any, ...]) -> SkillSet:
+    kinds = [type(f"S{i}", (Skill,), {"max_steps": 1 + i})() for i in range(len(policies))]
+    return SkillSet(tuple(kinds), policies, call_steps=4)
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_each_skill_is_told_the_masks_of_its_own_environments(nested):
+    masked = Masked(), Masked()
+    inner: Any = masked[1]
+    if nested:
+        inner = HierarchyPolicy(constant(0, 1), woven((masked[1],)))
+    skills = woven((masked[0], inner))
+    env = OptionsEnv(make_engine(EnvSpec(Gate), 4), skills, 0.9)
+    env.reset(seed=0)
+    for t in range(30):
+        _, info = env.step((np.arange(4) + t) % 2)[-2:]
+        assert "action_mask" not in info, "the selector's masks are of skills"
+    policy = HierarchyPolicy(constant(1, 2), skills)
+    evaluate(policy, EnvSpec(Gate), episodes=7, num_envs=3)
+    for part in masked:
+        assert len(part.seen) > 20
+        for obs, mask in part.seen:
+            assert mask.tolist() == wanted(obs).tolist()
+
+
+def test_what_a_policy_made_elsewhere_takes_is_for_the_environment_to_judge():
+    # Taxi stands still, and the others may raise: both are the environment's own rule.
+    stubborn = ScriptedPolicy(lambda obs: np.full(len(obs), 5), *_spaces("Taxi-v4"))
+    found = evaluate(stubborn, EnvSpec("Taxi-v4"), episodes=2)
+    assert found.lengths == (200, 200)
+    stubborn = ScriptedPolicy(lambda obs: np.full(len(obs), 3), *_spaces(Gate))
+    with pytest.raises(ValueError, match="3 is forbidden"):
+        evaluate(stubborn, EnvSpec(Gate), episodes=1)
+
+
+def _spaces(env: Any) -> tuple[Any, Any]:
+    made = EnvSpec(env).make()
+    return made.observation_space, made.action_space
