@@ -90,8 +90,7 @@ class PPOAlgorithm(Algorithm):
         # With memory the critic runs along while acting: its memory must be known, too.
         self.acting = self.layout if self.memory else Layout(acting)
 
-    def init(self, seeds: list[Seeds]) -> State:
-        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+    def _fresh_state(self, seeds: list[Seeds]) -> State:
         members, cfg = len(seeds), self.config
         params = torch.zeros(members, self.layout.size)
         views = self.layout.views(params)
