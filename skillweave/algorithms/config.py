@@ -36,7 +36,7 @@ class PPO:
     n_steps: int = 64
     """Steps of each environment between updates."""
     batch_size: int = 1024
-    """Samples of one gradient step (a minibatch)."""
+    """Samples of one gradient step (a minibatch), about; a smaller rollout is one minibatch."""
     update_epochs: int = 4
     """Passes over each rollout."""
     learning_rate: float = 1e-3
@@ -99,10 +99,6 @@ class PPO:
         one_of(self, "learning_rate_schedule", ("constant", "linear", "kl"))
         if self.network.rnn is not None:
             check(self, "critic", self.critic is None, "None where network.rnn is set")
-        rollout = self.num_envs * self.n_steps
-        check(
-            self, "batch_size", self.batch_size <= rollout, f"at most num_envs·n_steps ({rollout})"
-        )
 
 
 AlgorithmConfig: TypeAlias = PPO | DQN | TD3 | SAC
