@@ -19,7 +19,7 @@ T, B = 8, 6
 OBS = Box(-np.inf, np.inf, (3,), np.float32)
 CONFIG = PPO(
     num_envs=B, n_steps=T, batch_size=16, update_epochs=3, network=Network((16,)),
-    learning_rate_schedule="constant",
+    learning_rate_schedule="constant", normalize_obs=False,
 )  # fmt: skip
 
 
@@ -393,8 +393,8 @@ def test_a_terminal_observation_that_is_not_finite_does_no_harm():
 
 
 OUT_OF_RANGE = [
-    ("num_envs", 0), ("n_steps", 0), ("batch_size", 0), ("update_epochs", 0), ("threads", 0),
-    ("gamma", 1.01), ("gamma", -0.1), ("gamma", float("nan")),
+    ("num_envs", 0), ("n_steps", 0), ("batch_size", 0), ("batch_size", 64 * 64 + 1),
+    ("update_epochs", 0), ("threads", 0), ("gamma", 1.01), ("gamma", -0.1), ("gamma", float("nan")),
     ("gae_lambda", 2.0), ("learning_rate", 0.0), ("learning_rate", float("inf")),
     ("learning_rate", float("nan")), ("learning_rate_schedule", "cosine"), ("clip_coef", 0.0),
     ("max_grad_norm", -1.0), ("action_std_init", 0.0), ("adam_eps", 0.0), ("ent_coef", -0.01),
@@ -406,6 +406,10 @@ OUT_OF_RANGE = [
 def test_a_setting_out_of_range_is_named_with_its_value(name, value):
     with pytest.raises(SkillweaveError, match=rf"PPO\.{name} is {value!r}; it must be "):
         PPO(**{name: value})
+
+
+def test_a_small_rollout_needs_no_batch_size_of_its_own():
+    assert PPO(num_envs=4, n_steps=4).batch_size == PPO().batch_size
 
 
 def test_the_kl_schedule_asks_for_its_target():
