@@ -72,6 +72,7 @@ RECURRENT = PPO(
     batch_size=256,
     learning_rate=2e-3,
     ent_coef=0.0,
+    normalize_obs=False,
     network=Network((32,), "relu", rnn=RNN("lstm", 32)),
 )
 FIGURES = {
@@ -147,7 +148,7 @@ FIGURES = {
     ),
     "image": Figure(
         FREEWAY,
-        PPO(n_steps=128, network=small(64)),
+        PPO(n_steps=128, batch_size=1024, network=small(64)),
         2_000_000,  # after 1M: 45.6 (40.0 at worst)
         50.0,
         "Young & Tian 2019, DQN after 5M frames: about 50 (fig. 3)",

@@ -15,6 +15,7 @@ from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.stacked import Layout
 from skillweave.ops.optim import merge_moments
+from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.types import Array
@@ -166,6 +167,11 @@ class Algorithm:
 
     def init(self, seeds: list[Seeds]) -> Any:
         """Fresh members, one for each seed; a member does not depend on its neighbours."""
+        with torch_threads(1):  # of a QR decomposition, the last bits depend on their number
+            return self._fresh_state(seeds)
+
+    def _fresh_state(self, seeds: list[Seeds]) -> Any:
+        """What ``init`` returns."""
         raise NotImplementedError
 
     def see(self, state: Any, obs: Tensor) -> None:

@@ -35,8 +35,8 @@ class PPO:
     """Environments stepped side by side."""
     n_steps: int = 64
     """Steps of each environment between updates."""
-    batch_size: int = 1024
-    """Samples of one gradient step (a minibatch)."""
+    batch_size: int = 256
+    """Samples of one gradient step (a minibatch), about; a smaller rollout is one minibatch."""
     update_epochs: int = 4
     """Passes over each rollout."""
     learning_rate: float = 1e-3
@@ -65,7 +65,7 @@ class PPO:
     """KL at which an update stops early, or that the 'kl' schedule aims at."""
     normalize_advantage: bool = True
     """Zero mean, unit deviation of the advantages of each update."""
-    normalize_obs: bool = False
+    normalize_obs: bool = True
     """Running zero mean, unit deviation of observations; saved with the policy."""
     normalize_returns: bool = True
     """The critic learns returns in units of their running deviation: no reward is too large."""
@@ -100,9 +100,9 @@ class PPO:
         if self.network.rnn is not None:
             check(self, "critic", self.critic is None, "None where network.rnn is set")
         rollout = self.num_envs * self.n_steps
-        check(
-            self, "batch_size", self.batch_size <= rollout, f"at most num_envs·n_steps ({rollout})"
-        )
+        most = max(rollout, PPO.batch_size)  # a small rollout alone is no mistake
+        says = f"at most {most}; a rollout has num_envs·n_steps ({rollout}) samples"
+        check(self, "batch_size", self.batch_size <= most, says)
 
 
 AlgorithmConfig: TypeAlias = PPO | DQN | TD3 | SAC

@@ -68,8 +68,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         )  # fmt: skip
         self.layout = self.acting = Layout(self.net.shapes)
 
-    def init(self, seeds: list[Seeds]) -> State:
-        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+    def _fresh_state(self, seeds: list[Seeds]) -> State:
         params = torch.zeros(len(seeds), self.layout.size)
         self.net.init_(self.layout.views(params), self.member_generators(seeds))
         return State(

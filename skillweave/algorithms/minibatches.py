@@ -20,7 +20,8 @@ def minibatches(
         data: (P, T, B, ...), with ``advantage`` among them. Where there is a ``memory`` (P, B, M),
             whole columns are shuffled, so that a sequence is never torn.
         seeds: one a member.
-        batch_size: samples in a minibatch, about.
+        batch_size: samples in a minibatch, about: an epoch is cut into equal parts. All of a
+            smaller rollout is one minibatch.
 
     Yields:
         (P, b, ...); with a memory (P, T, b, ...), and the memory (P, b, M).
@@ -32,7 +33,7 @@ def minibatches(
         for k, v in data.items()
     }
     size = columns if recurrent else steps * columns
-    parts = min(size, max(1, steps * columns // batch_size))
+    parts = min(size, max(1, round(steps * columns / batch_size)))
     for epoch in range(epochs):
         order = [torch.randperm(size, generator=(s / epoch).torch()) for s in seeds]
         shuffled = {k: take_rows(v, torch.stack(order)) for k, v in rows.items()}

@@ -1,6 +1,7 @@
 """PPO (Schulman et al. 2017) for P members at once; a single agent is P = 1.
 
-Read down the page: State, init, act, update, loss. The settings are ``config.PPO``.
+Read down the page: State, init, act, update, loss. The settings are ``config.PPO``. What acted
+may be an update old: the objective is the decoupled one of Hilton, Cobbe & Schulman 2022.
 """
 
 from __future__ import annotations
@@ -90,8 +91,7 @@ class PPOAlgorithm(Algorithm):
         # With memory the critic runs along while acting: its memory must be known, too.
         self.acting = self.layout if self.memory else Layout(acting)
 
-    def init(self, seeds: list[Seeds]) -> State:
-        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+    def _fresh_state(self, seeds: list[Seeds]) -> State:
         members, cfg = len(seeds), self.config
         params = torch.zeros(members, self.layout.size)
         views = self.layout.views(params)
@@ -163,9 +163,7 @@ class PPOAlgorithm(Algorithm):
             rate = rate * (1.0 - progress)
         if cfg.ent_coef_final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(rate, cfg.ent_coef_final), progress)
-        limit = (
-            1.5 * cfg.target_kl if cfg.target_kl and cfg.learning_rate_schedule != "kl" else None
-        )
+        limit = None if cfg.learning_rate_schedule == "kl" else cfg.target_kl
         active = torch.ones(len(seeds), dtype=torch.bool)
         counted = torch.zeros(len(seeds))
         sums = torch.zeros(len(REPORT), len(seeds))
@@ -177,7 +175,7 @@ class PPOAlgorithm(Algorithm):
             sums.addcmul_(torch.stack([report[k] for k in REPORT]), active.float())
             if limit is not None:
                 # As in Stable-Baselines3: a member stops before the step that oversteps.
-                active = active & (report["kl"] <= limit)
+                active = active & (report["kl"] <= 1.5 * limit)
                 if not bool(active.any()):
                     break
             adam_(
@@ -211,14 +209,15 @@ class PPOAlgorithm(Algorithm):
             batch = {k: v.flatten(1, 2) for k, v in batch.items() if k != "memory"}
         log_std, mask = views.get("actor.log_std"), batch.get("mask")
         log_prob, entropy = self.head.stats(head, log_std, mask, batch["action"])
-        policy = ppo_policy_loss(log_prob, batch["log_prob"], batch["advantage"], state.clip_coef)
+        proximal, weight = batch["proximal"], batch["weight"]
+        policy = ppo_policy_loss(log_prob, proximal, batch["advantage"], state.clip_coef, weight)
         clip = self.config.clip_value
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
         value = value_loss(raw, batch["target"], batch.get("old_value"), bound)
         bonus = entropy.mean(1)
         total = policy + state.vf_coef * value - ent_coef * bonus
         with torch.no_grad():
-            kl = approximate_kl(log_prob, batch["log_prob"])
+            kl = approximate_kl(log_prob, proximal, weight)
         report = {"policy_loss": policy, "value_loss": value, "entropy": bonus, "kl": kl}
         return total, {k: v.detach() for k, v in report.items()}
 
@@ -226,16 +225,20 @@ class PPOAlgorithm(Algorithm):
     def _prepare(
         self, state: State, rollout: Rollout
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The rollout as (P, T, B, ...) tensors: inputs, action, log-prob, advantage, target."""
+        """The rollout as (P, T, B, ...) tensors: inputs, action, advantage, target, and so on."""
         cfg, tr = self.config, rollout.transition
-        lead = tr.reward.shape
-        old_log_prob, _ = self.head.stats(rollout.head, rollout.log_std, tr.mask, tr.action)
         self.see(state, tr.obs.flatten(1, 2))
         actor, views = self.actor(state), self.layout.views(state.params)
         inputs = self.inputs(actor, tr.obs.flatten(1, 2))
-        data = {k: v.unflatten(1, lead[1:]) for k, v in inputs.items()}
+        data = {k: v.unflatten(1, tr.reward.shape[1:]) for k, v in inputs.items()}
         if rollout.memory is not None and rollout.start is not None:
             data |= {"memory": rollout.memory, "start": rollout.start}
+            inputs = data
+        acted, _ = self.head.stats(rollout.head, rollout.log_std, tr.mask, tr.action)
+        # Clipping and KL count from the policy as it is now, whoever acted.
+        head = self._run(self.actor_net, views, inputs).view_as(rollout.head)
+        log_std = None if rollout.log_std is None else views["actor.log_std"][:, None]
+        proximal, _ = self.head.stats(head, log_std, tr.mask, tr.action)
         value, next_value = self._values(views, state, actor, data, tr)
         advantage = gae(tr.reward, tr.discount, value, next_value, tr.last, state.gae_lambda)
         returns = advantage + value
@@ -247,7 +250,8 @@ class PPOAlgorithm(Algorithm):
         mean, scale = state.return_mean[..., None], self._return_scale(state)[..., None]
         data |= {
             "action": tr.action,
-            "log_prob": old_log_prob,
+            "proximal": proximal,
+            "weight": (proximal - acted).exp(),
             "advantage": advantage,
             "target": (returns - mean) / scale,
         }

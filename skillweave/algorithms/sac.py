@@ -79,8 +79,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         usual = 0.5 * math.log(size) if discrete else -float(size)
         self.target_entropy = usual if config.target_entropy is None else config.target_entropy
 
-    def init(self, seeds: list[Seeds]) -> State:
-        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+    def _fresh_state(self, seeds: list[Seeds]) -> State:
         members = len(seeds)
         params = torch.zeros(members, self.layout.size)
         generators = self.member_generators(seeds)

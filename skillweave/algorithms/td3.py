@@ -73,8 +73,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
         network, count = config.critic or config.network, 2 if config.twin else 1
         self.critics = Critics(self.obs, network, 1, self.codec.size, count)
 
-    def init(self, seeds: list[Seeds]) -> State:
-        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+    def _fresh_state(self, seeds: list[Seeds]) -> State:
         params = torch.zeros(len(seeds), self.layout.size)
         generators = self.member_generators(seeds)
         self.net.init_(self.layout.views(params), 0.01, generators)

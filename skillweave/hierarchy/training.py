@@ -10,6 +10,7 @@ from skillweave.envs.skill_env import SkillEnv
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill, ready_policy
@@ -70,6 +71,7 @@ def flat_phase(declaration: Declaration) -> Phase:
     return Phase("flat", config, budget, _skill_env(declaration, None))
 
 
+@torch_threads(1)  # a loop sets its own; all else must not depend on how many there are
 def train(
     declaration: Declaration,
     run: RunDirectory,

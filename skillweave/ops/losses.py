@@ -10,13 +10,21 @@ from torch import Tensor
 
 
 def ppo_policy_loss(
-    log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, clip_coef: Tensor
+    log_prob: Tensor,
+    old_log_prob: Tensor,
+    advantage: Tensor,
+    clip_coef: Tensor,
+    weight: Tensor | None = None,
 ) -> Tensor:
-    """Clipped surrogate, ``−E[min(ρA, clip(ρ, 1−ε, 1+ε)A)]`` (Schulman et al. 2017, eq. 7).
+    """Clipped surrogate, ``−E[w·min(ρA, clip(ρ, 1−ε, 1+ε)A)]`` (Schulman et al. 2017, eq. 7).
+
+    ρ is the ratio to the policy from which clipping counts. Where another policy acted, w is the
+    ratio of the two: the decoupled objective of Hilton, Cobbe & Schulman 2022, sec. 3.
 
     Args:
         log_prob, old_log_prob, advantage: (P, B).
         clip_coef: (P,), ε.
+        weight: (P, B), w; None: 1.
 
     Returns:
         (P,).
@@ -24,7 +32,8 @@ def ppo_policy_loss(
     ratio = torch.exp(log_prob - old_log_prob)
     eps = clip_coef[:, None]
     clipped = torch.clamp(ratio, 1.0 - eps, 1.0 + eps)
-    return -torch.minimum(ratio * advantage, clipped * advantage).mean(1)
+    gain = torch.minimum(ratio * advantage, clipped * advantage)
+    return -(gain if weight is None else weight * gain).mean(1)
 
 
 def value_loss(
@@ -49,13 +58,15 @@ def value_loss(
     return 0.5 * error.mean(1)
 
 
-def approximate_kl(log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
-    """``E[(ρ − 1) − log ρ]``, the low-variance estimator k3 of KL(old‖new); (P, B) to (P,).
+def approximate_kl(log_prob: Tensor, old_log_prob: Tensor, weight: Tensor | None = None) -> Tensor:
+    """``E[w·((ρ − 1) − log ρ)]``, the low-variance estimator k3 of KL(old‖new); (P, B) to (P,).
 
-    Schulman 2020, "Approximating KL divergence".
+    Schulman 2020, "Approximating KL divergence". ``weight`` as of ``ppo_policy_loss``: samples of
+    another policy count as often as the old one would have drawn them.
     """
     log_ratio = log_prob - old_log_prob
-    return (torch.expm1(log_ratio) - log_ratio).mean(1)
+    kl = torch.expm1(log_ratio) - log_ratio
+    return (kl if weight is None else weight * kl).mean(1)
 
 
 def td_loss(value: Tensor, target: Tensor, kind: str) -> Tensor:

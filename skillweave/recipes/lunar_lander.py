@@ -71,7 +71,6 @@ HOLDING = PPO(
     gamma=0.98,
     batch_size=512,
     update_epochs=6,
-    normalize_obs=True,
     network=RELU,
 )
 # A landing is worth more than hovering for ever (+100 once against +1 a step) only where γ is
@@ -80,9 +79,9 @@ HOLDING = PPO(
 LANDING = PPO(
     learning_rate=2e-3,
     gamma=0.98,
+    batch_size=1024,
     ent_coef=0.05,
     ent_coef_final=0.002,
-    normalize_obs=True,
     network=RELU,
 )
 SELECTOR = PPO(
@@ -91,9 +90,10 @@ SELECTOR = PPO(
     batch_size=512,
     gamma=0.999,
     gae_lambda=0.98,
+    normalize_obs=False,
     network=RELU,
 )
-FLAT = PPO(update_epochs=3, gamma=0.999, gae_lambda=0.98, normalize_obs=True, network=RELU)
+FLAT = PPO(gamma=0.999, gae_lambda=0.98, network=RELU)
 
 hierarchy = Hierarchy(
     env="LunarLander-v3",

@@ -89,7 +89,7 @@ LEARNER = PPO(
     learning_rate=1.5e-3,
     gamma=0.995,
     gae_lambda=0.97,
-    normalize_obs=True,
+    batch_size=1024,
     network=Network(activation="relu"),
 )
 

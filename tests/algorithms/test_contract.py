@@ -42,7 +42,7 @@ BUFFERED: dict[str, Any] = {
 }  # fmt: skip
 ON = PPO(
     num_envs=8, n_steps=16, batch_size=32, learning_rate=1e-2, gamma=0.5, ent_coef=0.0,
-    network=Network((32,)),
+    normalize_obs=False, network=Network((32,)),
 )  # fmt: skip
 SQUASHED, STATE_STD = replace(ON, squash_actions=True), replace(ON, action_std="state")
 LSTM = replace(ON, network=Network((16,), rnn=RNN("lstm", 8)))

@@ -5,19 +5,21 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from torch import nn
+from toys import Echo, learn
 
 from skillweave.algorithms.config import PPO, config_from_json, config_to_json
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
-from skillweave.networks.config import Network
+from skillweave.networks.config import RNN, Network
 from skillweave.ops.returns import gae, normalise
 from skillweave.seeding import Seeds
+from skillweave.training.on_policy import train_on_policy
 from skillweave.types import SkillweaveError, Transition
 
 T, B = 8, 6
 OBS = Box(-np.inf, np.inf, (3,), np.float32)
 CONFIG = PPO(
     num_envs=B, n_steps=T, batch_size=16, update_epochs=3, network=Network((16,)),
-    learning_rate_schedule="constant",
+    learning_rate_schedule="constant", normalize_obs=False,
 )  # fmt: skip
 
 
@@ -65,7 +67,7 @@ def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool =
     )
 
 
-def learn(
+def updated(
     algorithm: PPOAlgorithm, state: State, updates: int = 3, members=range(1), **kwargs
 ) -> State:
     """Several updates on data that depends on the member's number alone."""
@@ -106,9 +108,9 @@ def test_a_stack_of_three_learns_what_three_single_members_learn(variant):
     algorithm, state = make(members=3, **settings)
     start = with_own_settings(state)
     singles = [members_of(start, slice(m, m + 1)) for m in range(3)]
-    stack = learn(algorithm, start, members=range(3), masked=masked)
+    stack = updated(algorithm, start, members=range(3), masked=masked)
     for m, single in enumerate(singles):
-        single = learn(algorithm, single, members=range(m, m + 1), masked=masked)
+        single = updated(algorithm, single, members=range(m, m + 1), masked=masked)
         for f in fields(State):
             whole, one = getattr(stack, f.name)[m], getattr(single, f.name)[0]
             torch.testing.assert_close(
@@ -145,15 +147,22 @@ def plain_network(algorithm: PPOAlgorithm, state: State, prefix: str) -> nn.Sequ
     return nn.Sequential(*layers[:-1])
 
 
+@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
     ("space", "masked"), [(Discrete(4), False), (Discrete(4), True), (Box(-1, 1, (2,)), False)]
 )
-def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(space, masked):
+def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
+    space, masked, late
+):
     settings = {"batch_size": T * B, "normalize_returns": False, "ent_coef": 0.1, "clip_coef": 0.01}
     algorithm, state = make(space, **settings)
     cfg = algorithm.config
     data = rollout(algorithm, state, masked=masked)
     tr = data.transition
+    acted, _ = algorithm.head.stats(data.head, data.log_std, tr.mask, tr.action)
+    if late:  # what learns is no longer what acted
+        state = algorithm.init([Seeds(7)])
+        algorithm.layout.views(state.params)["actor.1.weight"].mul_(100.0)
     actor, critic = (plain_network(algorithm, state, k) for k in ("actor", "critic"))
     log_std = nn.Parameter(torch.full((2,), cfg.action_std_init).log())
     parameters = [*actor.parameters(), *critic.parameters()]
@@ -169,6 +178,8 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
 
     with torch.no_grad():
         old, value = policy().log_prob(tr.action), critic(tr.obs)[..., 0]
+        weight = (old - acted).exp()
+        assert ((weight - 1.0).abs() > 0.1).any() == late
         raw = gae(
             tr.reward, tr.discount, value, critic(tr.next_obs)[..., 0], tr.last, state.gae_lambda
         )
@@ -179,7 +190,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
             ratio * advantage, ratio.clamp(1 - cfg.clip_coef, 1 + cfg.clip_coef) * advantage
         )
         error = 0.5 * (critic(tr.obs)[..., 0] - target).square()
-        loss = (-gain + cfg.vf_coef * error - cfg.ent_coef * policy().entropy()).mean()
+        loss = (-weight * gain + cfg.vf_coef * error - cfg.ent_coef * policy().entropy()).mean()
         adam.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
@@ -279,14 +290,79 @@ def test_metrics_of_an_update_that_stops_early_are_means_over_the_steps_it_took(
     assert metrics["entropy"].item() == pytest.approx(np.log(4), rel=0.05)  # still almost uniform
 
 
-def test_an_update_that_stops_at_once_reports_the_same_metrics():
-    algorithm, state = make(target_kl=1e-9)
-    fresh = rollout(algorithm, state)
-    _, usual = algorithm.update(state, fresh, 0.0, [Seeds(0)])
-    count = state.count.clone()
-    _, stopped = algorithm.update(state, fresh, 0.0, [Seeds(0)])  # by now the policy is another
-    assert torch.equal(state.count, count)
-    assert stopped.keys() == usual.keys()
+@pytest.mark.parametrize("settings", [{}, {"normalize_obs": True}])
+def test_an_update_from_an_old_policy_is_never_empty(settings):
+    algorithm, state = make(target_kl=1e-5, learning_rate=0.05, **settings)
+    stale = rollout(algorithm, state)
+    for done in range(1, 4):  # by the second, the policy is another than acted
+        before = state.params.clone()
+        _, metrics = algorithm.update(state, stale, 0.0, [Seeds(0)])
+        assert state.count.item() == done  # the second step would overstep
+        assert not torch.equal(state.params, before)
+        assert metrics["kl"].item() > 1e-5
+
+
+def test_kl_counts_from_the_first_policy_of_an_update():
+    algorithm, state = make(batch_size=T * B, update_epochs=2, learning_rate=0.05)
+    data = rollout(algorithm, state)
+    algorithm.layout.views(state.params)["actor.1.bias"] += torch.tensor([0.5, 0.0, -0.5, 0.0])
+    tr, heads = data.transition, []
+    for epochs in range(2):  # the policies before the first and the second gradient step
+        one, same = make(batch_size=T * B, update_epochs=1, learning_rate=0.05)
+        same.params.copy_(state.params)
+        if epochs:
+            one.update(same, data, 0.0, [Seeds(0)])
+        heads.append(one.act(one.actor(same), tr.obs.flatten(1, 2), None, None)[1])
+    taken = tr.action.flatten(1, 2)
+    first, second = (algorithm.head.stats(h, None, None, taken)[0] for h in heads)
+    acted = algorithm.head.stats(data.head, None, None, tr.action)[0].flatten(1, 2)
+    ratio = (second - first).exp()
+    expected = ((first - acted).exp() * (ratio - 1.0 - ratio.log())).mean() / 2  # the first is 0
+    _, metrics = algorithm.update(state, data, 0.0, [Seeds(0)])
+    assert expected > 1e-4
+    assert metrics["kl"].item() == pytest.approx(expected.item(), rel=1e-2)
+
+
+class Weighed(PPOAlgorithm):
+    """Keeps the weights of all samples."""
+
+    def loss(self, views, state, batch, ent_coef):
+        self.found = [*getattr(self, "found", []), batch["weight"]]
+        return super().loss(views, state, batch, ent_coef)
+
+
+SPACES = pytest.mark.parametrize("asks", ["Discrete", "MultiDiscrete", "Box"])
+MEMORIES = pytest.mark.parametrize("rnn", [None, RNN("lstm", 8)])
+
+
+@SPACES
+@MEMORIES
+@pytest.mark.parametrize("overlap", [False, True])
+def test_weights_are_one_unless_what_acted_is_old(asks, rnn, overlap):
+    env, config = Echo(B, "vector", asks), replace(CONFIG, network=Network((16,), rnn=rnn))
+    config = replace(config, overlap=overlap, learning_rate=1e-2, batch_size=T * B)
+    algorithm = Weighed(config, env.observation_space, env.action_space)
+    train_on_policy(algorithm, env, algorithm.init([Seeds(0)]), Seeds(0), 4 * T * B)
+    off = [(w - 1.0).abs().max().item() for w in algorithm.found[:: config.update_epochs]]
+    assert len(off) == 4
+    assert [x > 1e-3 for x in off] == [False, overlap, overlap, overlap]
+
+
+@SPACES
+@MEMORIES
+@pytest.mark.parametrize(("columns", "steps"), [(1, 1), (1, 5), (4, 1), (4, 4)])
+def test_a_rollout_of_any_size_is_learnt_from(columns, steps, asks, rnn):
+    # A selector's rollout holds as many decisions as fit into its steps: few, or one.
+    config = PPO(
+        num_envs=columns, n_steps=steps, normalize_obs=True, network=Network((16,), rnn=rnn)
+    )
+    ticks = []
+    _, state = learn(
+        config, Echo(columns, "vector", asks), 3 * columns * steps, on_tick=ticks.append
+    )
+    assert state.count.item() == 3 * config.update_epochs  # all of it is one minibatch
+    assert torch.isfinite(state.params).all()
+    assert [t.metrics["samples"] for t in ticks] == [columns * steps] * 3
 
 
 def test_the_linear_schedule_falls_to_nothing():
@@ -330,6 +406,10 @@ OUT_OF_RANGE = [
 def test_a_setting_out_of_range_is_named_with_its_value(name, value):
     with pytest.raises(SkillweaveError, match=rf"PPO\.{name} is {value!r}; it must be "):
         PPO(**{name: value})
+
+
+def test_a_small_rollout_needs_no_batch_size_of_its_own():
+    assert PPO(num_envs=4, n_steps=4).batch_size == PPO().batch_size
 
 
 def test_the_kl_schedule_asks_for_its_target():

@@ -250,9 +250,9 @@ def test_scale_and_set_change_budgets_and_settings(
 def test_settings_that_only_fit_together_may_be_given_in_any_order(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    # The recipe's batch_size, 32, does not fit into a rollout of 2·8 steps.
+    # A minibatch of 400 does not fit into the recipe's rollout of 4·16 steps.
     common = ("--evaluate", 0, "--quiet", "--json", "--scale", 0.1)
-    settings = ["selector.num_envs=2", "selector.n_steps=8", "selector.batch_size=16"]
+    settings = ["selector.num_envs=20", "selector.n_steps=20", "selector.batch_size=400"]
     for number, order in enumerate((settings, settings[::-1])):
         flags = [part for setting in order for part in ("--set", setting)]
         answer = call("train", trained.plain, "-o", tmp_path / f"run{number}", *flags, *common)
