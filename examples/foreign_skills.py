@@ -86,7 +86,7 @@ def main() -> None:
             ENV,
             skills(folder),
             call_steps=5,
-            selector=PPO(num_envs=8, n_steps=64, batch_size=128),
+            selector=PPO(num_envs=8, n_steps=320, batch_size=128),
             selector_steps=args.steps,
         )
         run = hierarchy.train(folder / "run", seed=args.seed, quiet=True)

@@ -34,7 +34,7 @@ class PPO:
     num_envs: int = 64
     """Environments stepped side by side."""
     n_steps: int = 64
-    """Steps of each environment between updates."""
+    """Environment steps of each environment between updates, for selectors too."""
     batch_size: int = 256
     """Samples of one gradient step (a minibatch), about; a smaller rollout is one minibatch."""
     update_epochs: int = 4

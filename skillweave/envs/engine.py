@@ -131,9 +131,8 @@ class GymnasiumEngine:
         self.action_space: gym.Space[Any] = go_and_action[1]
         self._masks = ActionMasks(self.action_space, num_envs)
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
-        self._actions: Any = gym.vector.utils.create_empty_array(
-            self.action_space, num_envs, np.zeros
-        )
+        empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
+        self._actions: Array = np.asarray(empty)
         self._all = np.arange(num_envs)
         self._root = 0
         self._episode = np.zeros(num_envs, np.int64)  # episodes begun since the root seed
@@ -230,7 +229,6 @@ class GymnasiumEngine:
         self._masks.see(info, ids, terminated | truncated)
         truncated = truncated & ~terminated
         return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
-
 
 
 def checksums(obs: Array) -> Array:

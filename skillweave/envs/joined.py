@@ -94,11 +94,13 @@ class JoinedEnvs:
 
     def _infos(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
         """What all parts tell, array by array."""
-        each = self._each
+        def batched(value: Any) -> bool:
+            return isinstance(value, np.ndarray) and value.shape[:1] == (self._each,)
+
         return {
             k: np.concatenate([info[k] for info in infos])
-            for k, v in infos[0].items()
-            if isinstance(v, np.ndarray) and all(np.shape(i.get(k))[:1] == (each,) for i in infos)
+            for k in infos[0]
+            if all(batched(info.get(k)) for info in infos)
         }
 
 

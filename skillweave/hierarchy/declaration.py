@@ -39,7 +39,7 @@ class Declaration:
     algorithm: AlgorithmConfig = field(default_factory=PPO)
     """Trains every skill that names none of its own."""
     selector: AlgorithmConfig = field(default_factory=PPO)
-    """Trains the selector; its γ is that of one environment step, its n_steps count decisions."""
+    """Trains the selector; its γ is that of one environment step, and so its n_steps."""
     skill_steps: int = 500_000
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000

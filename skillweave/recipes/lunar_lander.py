@@ -86,7 +86,7 @@ LANDING = PPO(
 )
 SELECTOR = PPO(
     num_envs=128,  # fewer, longer steps of the engine: acting costs nearly the same for all
-    n_steps=8,
+    n_steps=80,  # 8 calls
     batch_size=512,
     gamma=0.999,
     gae_lambda=0.98,

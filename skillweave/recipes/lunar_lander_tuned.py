@@ -98,7 +98,7 @@ hierarchy = Hierarchy(
     skills=[Approach(), Brake(), Touchdown()],
     call_steps=8,
     algorithm=LEARNER,
-    selector=replace(LEARNER, gamma=0.999, gae_lambda=0.98, n_steps=32, normalize_obs=False),
+    selector=replace(LEARNER, gamma=0.999, gae_lambda=0.98, n_steps=256, normalize_obs=False),
     skill_steps=400_000,
     selector_steps=800_000,
 )

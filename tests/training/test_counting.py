@@ -1,0 +1,134 @@
+"""Every step that an environment makes in training is reported, and none twice."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import skillweave as sw
+from skillweave.envs import engine as engines
+from skillweave.runs.directory import RunDirectory
+
+NET = sw.Network((8,))
+SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=NET)
+REPLAY = {"num_envs": 4, "learning_starts": 40, "batch_size": 8, "update_ratio": 0.1}
+
+
+class Walk(gym.Env):
+    """Episodes of 20 steps; the observation is the time."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.array([self.t / 20], np.float32), float(action), self.t == 20, False, {}
+
+
+class Late(sw.Skill):
+    """May start late in an episode, which random acting has to find."""
+
+    def initiation(self, obs):
+        return obs[:, 0] >= 0.7
+
+
+class Always(sw.Skill):
+    """May start anywhere."""
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Counts the steps that Gymnasium's engines make."""
+    count, plain = [0], engines.GymnasiumEngine.step
+
+    def step(self, action, ids=None):
+        count[0] += len(action)
+        return plain(self, action, ids)
+
+    monkeypatch.setattr(engines.GymnasiumEngine, "step", step)
+    return count
+
+
+def reported(run: sw.Run) -> int:
+    phases = run.info()["phases"]
+    return sum(p["steps"] + p["evaluation_steps"] for p in phases)
+
+
+def hierarchy(**settings) -> sw.Hierarchy:
+    given = {"algorithm": SMALL, "selector": SMALL, "skill_steps": 600, "selector_steps": 600}
+    spec = sw.EnvSpec(Walk, engine="sync")
+    return sw.Hierarchy(spec, [Late(), Always()], call_steps=3, **{**given, **settings})
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"eval_every": 200, "eval_episodes": 3},
+        {"algorithm": sw.DQN(**REPLAY, network=NET), "selector": sw.DQN(**REPLAY, network=NET)},
+    ],
+)
+def test_the_search_for_a_start_is_reported_and_counts_against_the_budget(
+    settings, made, tmp_path
+):
+    run = hierarchy(**settings).train(tmp_path / "run", quiet=True)
+    assert reported(run) == made[0]
+    late, always, selector = run.info()["phases"]
+    assert late["steps"] <= 600 + 4 * 16 * 14, "a rollout, each step of it perhaps a search"
+    assert always["steps"] <= 600 + 4 * 16
+    assert selector["steps"] <= 600 + 4 * 16 + 4 * 3
+    assert (always["evaluation_steps"] > 0) == ("eval_every" in settings)
+
+
+@pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
+def test_the_fitness_of_a_population_is_reported_and_counts_against_the_budget(
+    algorithm, made, tmp_path
+):
+    search = sw.Evolution(population=3, generations=4, episodes=5)
+    spec = sw.EnvSpec(Walk, engine="sync")
+    run = sw.train_agent(spec, algorithm, 800, tmp_path / "run", quiet=True, evolve=search)
+    assert reported(run) == made[0]
+    (entry,) = run.info()["phases"]
+    assert entry["budget"] == 2400
+    # The first generation could not know what fitness takes: 3 members and the best, 5 episodes.
+    assert 2000 <= entry["steps"] <= 2400 + 3 * 64 + 4 * 100
+
+
+def test_what_a_killed_and_resumed_run_made_again_is_not_reported_twice(made, tmp_path):
+    class Stop(Exception):
+        pass
+
+    class Stopping(sw.api.Progress):
+        def tick(self, name, steps, seconds, metrics):
+            if name == "always" and steps >= 400:
+                raise Stop
+
+    whole = hierarchy(cut_every=150).train(tmp_path / "whole", quiet=True)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("skillweave.api.Progress", Stopping)
+        with pytest.raises(Stop):
+            hierarchy(cut_every=150).train(tmp_path / "broken", quiet=True)
+    again = hierarchy(cut_every=150).resume(tmp_path / "broken", quiet=True)
+    ours, theirs = ([p["steps"] for p in r.info()["phases"]] for r in (again, whole))
+    assert ours == theirs
+
+
+def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
+    class Zero(sw.Skill):
+        def policy(self, obs):
+            return np.zeros(len(obs), np.int64)
+
+    class One(sw.Skill):
+        def policy(self, obs):
+            return np.ones(len(obs), np.int64)
+
+    declared = sw.Hierarchy(sw.EnvSpec(Walk, engine="sync"), [Zero(), One()])
+    declared.selector_steps //= 20  # a twentieth of the default budget
+    run = declared.train(tmp_path / "run", quiet=True)
+    updates = sum(1 for _ in RunDirectory.open(run.path).metrics())
+    assert updates >= 150 / 20
+    assert run.info()["phases"][0]["steps"] <= declared.selector_steps + 64 * 64 + 64 * 40
