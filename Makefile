@@ -1,13 +1,14 @@
 # make demo   train, score and film the lunar-lander recipe
 # make test   the tests            make check   ruff, mypy, import order, tests
 # make bench  the benchmarks       make weights the shipped weights, made anew
+# make torture  mutated files, kills, bad disks, hostile code: an hour
 PYTHON ?= python3
 # One torch for everything, installed first: a plain `torch` may pull gigabytes of CUDA.
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SEED ?= 0
 
-.PHONY: demo test check bench figures weights smoke clean
+.PHONY: demo test check torture bench figures weights smoke clean
 
 .venv/demo: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("Skillweave needs Python 3.11 or newer, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
@@ -34,6 +35,9 @@ check: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+torture: .venv/dev
+	$(BIN)/python -m scripts.torture --seed $(SEED)
 
 bench: .venv/dev
 	$(BIN)/python -m benchmarks

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
+
+from benchmarks.common import run_command
 
 QUICK = (
     ["startup"],
@@ -34,7 +35,7 @@ ALL = (
 def main() -> None:
     for name, *arguments in ALL if "--all" in sys.argv else QUICK:
         print(f"== {name}", flush=True)
-        subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *arguments], check=True)
+        run_command([sys.executable, "-m", f"benchmarks.{name}", *arguments])
 
 
 if __name__ == "__main__":

@@ -1,14 +1,19 @@
-"""What the benchmarks share: the machine, tables, recording and replaying."""
+"""What the benchmarks share: the machine, processes, tables, recording and replaying."""
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import platform
+import signal
 import statistics
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +26,40 @@ from skillweave.types import Array
 def machine() -> str:
     cores = len(os.sched_getaffinity(0))
     return f"{platform.machine()}, {cores} cores, Python {platform.python_version()}"
+
+
+def workers(count: int) -> ProcessPoolExecutor:
+    """A pool of fresh processes that end when this one does, however it ends."""
+    start = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(count, start, initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def run_command(
+    command: Sequence[str], *, capture: bool = False, check: bool = True, **how: Any
+) -> subprocess.CompletedProcess[str]:
+    """``subprocess.run``, but a SIGTERM to this process also ends the command's with SIGTERM."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    pipe = subprocess.PIPE if capture else None
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, **how) as child:
+        try:
+            out, error = child.communicate()
+        except BaseException:
+            child.terminate()
+            raise
+    if check and child.returncode:
+        raise subprocess.CalledProcessError(child.returncode, command, out, error)
+    return subprocess.CompletedProcess(command, child.returncode, out, error)
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

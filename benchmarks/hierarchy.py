@@ -12,12 +12,11 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.common import median, report, table
+from benchmarks.common import median, report, run_command, table
 
 
 def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, object]:
@@ -48,7 +47,7 @@ def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, ob
 def child(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, float]:
     command = [sys.executable, "-m", "benchmarks.hierarchy", "--recipe", recipe, "--one", str(seed)]
     command += ["--flat-one"] * flat + [w for s in settings for w in ("--set", s)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = run_command(command, capture=True)
     result: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return result
 

@@ -11,15 +11,13 @@ from __future__ import annotations
 import argparse
 import functools
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
-from benchmarks.common import median, report, table
+from benchmarks.common import median, report, table, workers
 from skillweave import DQN, PPO, RNN, SAC, TD3, EnvSpec, Network, train_agent
 
 
@@ -184,7 +182,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args()
     summary = {}
-    with ProcessPoolExecutor(given.processes, get_context("spawn")) as pool:
+    with workers(given.processes) as pool:
         jobs = {
             name: [pool.submit(learn, name, seed) for seed in given.seeds]
             for name in given.figures or FIGURES

@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import median, report, table
+from benchmarks.common import median, report, table, workers
 from skillweave import DQN, Hierarchy, Network, recipes
 
 SELECTOR = DQN(
@@ -91,7 +89,7 @@ def main() -> None:
     parser.add_argument("--dqn-skills", action="store_true")
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args()
-    with ProcessPoolExecutor(given.processes, get_context("spawn")) as pool:
+    with workers(given.processes) as pool:
         jobs = [pool.submit(learn, seed, given.dqn_skills) for seed in given.seeds]
         rows = []
         for job in jobs:

@@ -17,7 +17,6 @@ The numbers are those of the figures in the issue; 4 is ``benchmarks.search``.
 from __future__ import annotations
 
 import argparse
-import subprocess
 import time
 from dataclasses import fields, replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.common import median, report, table, warm_up
+from benchmarks.common import median, report, run_command, table, warm_up
 from benchmarks.updates import rollout, seconds
 from skillweave import PPO, EnvSpec, Evolution, Network
 from skillweave.envs.make import make_engine
@@ -83,9 +82,7 @@ def against_agilerl(seeds: list[int], steps: int, python: str) -> dict[str, Any]
 
 
 def _agilerl(python: str, steps: int) -> float:
-    done = subprocess.run(
-        [python, str(AGILERL), str(steps)], capture_output=True, text=True, check=False
-    )
+    done = run_command([python, str(AGILERL), str(steps)], capture=True, check=False)
     if done.returncode:
         raise SystemExit(f"AgileRL failed:\n{done.stderr[-2000:]}")
     return float(done.stdout.split()[-1])

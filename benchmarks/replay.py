@@ -9,7 +9,6 @@ process of its own, so that the growth of the resident memory is its own.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from benchmarks.common import median, report, table
+from benchmarks.common import median, report, table, workers
 
 NUM_ENVS, BATCH, PRIORITIZED_BATCH, REPEATS = 16, 256, 128, 2000
 SPACE = gym.spaces.Box(-np.inf, np.inf, (8,), np.float32)
@@ -129,8 +128,8 @@ def main() -> None:
     given = parser.parse_args()
     rows = {}
     for kind in KINDS:
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            rows[kind] = pool.apply(measured, (kind, given.transitions))
+        with workers(1) as pool:
+            rows[kind] = pool.submit(measured, kind, given.transitions).result()
     header = ["", *rows["uniform"]]
     print(table(header, [[k, *(f"{v:,.0f}" for v in row.values())] for k, row in rows.items()]))
     ratio = rows["uniform"]["sample_us"] / rows["Stable-Baselines3"]["sample_us"]

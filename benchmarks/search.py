@@ -13,13 +13,11 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import median, report, table
+from benchmarks.common import median, report, table, workers
 from skillweave import PPO, Evolution, Mutations, Network, Range, train_agent
 
 BUDGET, GENERATIONS = 4_000_000, 20
@@ -72,7 +70,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args()
     rows = []
-    with ProcessPoolExecutor(given.processes, get_context("spawn")) as pool:
+    with workers(given.processes) as pool:
         jobs = [pool.submit(search, way, seed) for seed in given.seeds for way in given.ways]
         for job in jobs:
             rows.append(job.result())

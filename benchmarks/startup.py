@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import time
 
-from benchmarks.common import median, report
+from benchmarks.common import median, report, run_command
 
 
 def seconds(*arguments: str) -> float:
     times = []
     for _ in range(10):
         started = time.perf_counter()
-        subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+        run_command([sys.executable, *arguments], capture=True)
         times.append(time.perf_counter() - started)
     return median(times)
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import median, report
+from benchmarks.common import median, report, run_command
 
 ROOT = Path(__file__).parents[1]
 TEXT = ROOT / "tests/compat/tutorial.txt"
@@ -49,9 +48,7 @@ def seconds(python: str, code: str) -> tuple[float, float]:
             "WANDB_MODE": "offline",
         }
         start, before = time.perf_counter(), os.times()
-        done = subprocess.run(
-            [python, path.name], cwd=folder, env=env, capture_output=True, text=True
-        )
+        done = run_command([python, path.name], cwd=folder, env=env, capture=True, check=False)
         if done.returncode:
             sys.exit(f"{python} failed: {done.stderr[-2000:]}")
         after = os.times()

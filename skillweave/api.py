@@ -24,6 +24,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
+from skillweave.training.phase import check_replay
 from skillweave.types import Memory, Policy, SkillweaveError
 
 
@@ -59,9 +60,13 @@ class Hierarchy(Declaration):
         """
         if seed < 0:
             raise SkillweaveError(f"seed is {seed}; it must be at least 0")
-        self.check_spaces()
+        observation_space, action_space = self.check_spaces()
         content = training.manifest(self, seed=seed, flat=flat)
         plan(content["phases"], evolve)
+        for phase in content["phases"]:
+            chooses = phase["name"] == "selector"
+            acts = gym.spaces.Discrete(len(self.skills)) if chooses else action_space
+            check_replay(phase, observation_space, acts)
         track = tuple(track)
         make_trackers(track, None)  # a missing extra is said before anything is written
         run = RunDirectory.create(run_dir, content | {"recipe": self.recipe, "track": track})

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,6 @@ from skillweave.seeding import Seeds
 from skillweave.training.phase import Phase, train_phase
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
-
-SCRIPT = Path(__file__).parents[1] / "scripts" / "kill_and_resume.py"
 
 RECIPE = '''
 """A small hierarchy on CartPole with a piece of everything that could keep state."""
@@ -542,64 +539,3 @@ def test_a_run_stopped_by_a_full_disk_goes_on_when_there_is_room_again(
     assert "No space left on device" in done.stderr
     assert not RunDirectory.open(tmp_path / "stopped").finished
     assert_same(tmp_path / "finished", whole)
-
-
-def test_three_kills_at_random_moments_change_no_weight(tmp_path: Path) -> None:
-    recipe = write_recipe(tmp_path)
-    command = [sys.executable, str(SCRIPT), str(recipe), "--kills", "3", "--seed", "11"]
-    command += ["--out", str(tmp_path / "kills"), "--set", "skill_steps=3000"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert_same(tmp_path / "kills" / "killed", tmp_path / "kills" / "whole")
-    table = [line.split() for line in done.stdout.splitlines() if " update " in line]
-    assert [row[0] for row in table] == ["1", "2", "3"], done.stdout
-    assert any("killed" in row for row in table), done.stdout
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
-# The script can tell a difference
-
-
-@pytest.fixture(scope="module")
-def script() -> Iterator[Any]:
-    spec = importlib.util.spec_from_file_location("kill_and_resume", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # its dataclass looks itself up there
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
-
-
-def test_the_script_finds_equal_runs_equal(
-    tmp_path: Path, reference: Reference, script: Any
-) -> None:
-    _, whole = reference("sync")
-    shutil.copytree(whole, tmp_path / "run")
-    assert script.differences(tmp_path / "run", whole) == []
-
-
-@pytest.mark.parametrize("how", ["one bit", "missing", "one more", "a line twice"])
-def test_the_script_finds_any_difference(
-    tmp_path: Path, reference: Reference, script: Any, how: str
-) -> None:
-    _, whole = reference("sync")
-    run = tmp_path / "run"
-    shutil.copytree(whole, run)
-    policy = run / "policies" / "left.safetensors"
-    match how:
-        case "one bit":
-            data = bytearray(policy.read_bytes())
-            data[-1] ^= 1
-            policy.write_bytes(data)
-        case "missing":
-            policy.unlink()
-        case "one more":
-            (run / "policies" / "right.safetensors").write_bytes(b"")
-        case "a line twice":
-            metrics = run / "metrics.jsonl"
-            text = metrics.read_text()
-            metrics.write_text(text + text.splitlines(keepends=True)[-1])
-    found = script.differences(run, whole)
-    named = {"one more": "right.safetensors", "a line twice": "metrics.jsonl"}
-    assert [line.split(":")[0] for line in found] == [named.get(how, "left.safetensors")]

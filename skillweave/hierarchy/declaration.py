@@ -173,14 +173,19 @@ class Declaration:
             self.greedy_skills,
         )
 
-    def check_spaces(self) -> None:
-        """Make the environment once; raise a SkillweaveError where something does not fit it."""
+    def check_spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
+        """Make the environment once; its observation space and action space.
+
+        Raises:
+            SkillweaveError: something does not fit it.
+        """
         env = self.spec.make()
         try:
             obs_codec(env.observation_space)
             action_codec(env.action_space)
             self._check_algorithms(env.action_space)
             self._fitted(env)
+            return env.observation_space, env.action_space
         finally:
             env.close()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 from torch import Tensor
@@ -15,10 +16,10 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
-from skillweave.training.off_policy import train_off_policy
+from skillweave.training.off_policy import make_buffer, train_off_policy
 from skillweave.training.on_policy import train_on_policy
 from skillweave.training.probe import MakeEnv, Probe
-from skillweave.types import unprefixed
+from skillweave.types import SkillweaveError, unprefixed
 
 START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
 """Where a phase stands before its first update."""
@@ -71,6 +72,26 @@ class Phase:
             "algorithm": config_to_json(self.config),
             "status": "waiting",
         }
+
+
+def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
+    """Raise a SkillweaveError where a phase's replay buffer cannot be made.
+
+    Args:
+        entry: the manifest's; "evolution" says of how many members.
+    """
+    config = config_from_json(entry["algorithm"])
+    algorithm = make_algorithm(config, observation_space, action_space)
+    if not isinstance(algorithm, OffPolicyAlgorithm):
+        return
+    members = int((entry.get("evolution") or {"population": 1})["population"])
+    env: Any = SimpleNamespace(
+        num_envs=config.num_envs * members, observation_space=observation_space
+    )
+    try:
+        make_buffer(algorithm, env, members, shared=True)  # what is not written takes no memory
+    except SkillweaveError as error:
+        raise SkillweaveError(f"phase {entry['name']!r}: {error}") from error
 
 
 class Record:

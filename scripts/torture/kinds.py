@@ -1,0 +1,148 @@
+"""Tiny trainings of every kind: what is killed, what meets a bad disk, whose files are mutated."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete
+
+from skillweave import DQN, PPO, RNN, SAC, EnvSpec, Evolution, Hierarchy, Mutations, Network, Skill
+from skillweave.api import Run, Task
+
+SEED = 3
+"""Of every training."""
+CART, TINY = "CartPole-v1", "TortureTiny-v0"
+
+
+class Tiny(gym.Env[Any, Any]):
+    """Eight steps of a walk; Dict observations, continuous actions."""
+
+    observation_space = Dict(place=Box(-9.0, 9.0, (2,), np.float32), lamp=Discrete(3))
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        pass
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Start somewhere."""
+        super().reset(seed=seed)
+        self.place, self.t = self.np_random.uniform(-1, 1, 2).astype(np.float32), 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> Any:
+        """Go where the action says, and a little elsewhere."""
+        self.t += 1
+        self.place[0] += action[0] + 0.1 * self.np_random.normal()
+        self.place = self.place.clip(-9, 9)
+        return self._seen(), -float(abs(self.place[0])), self.t == 8, False, {}
+
+    def _seen(self) -> Any:
+        return {"place": self.place.copy(), "lamp": self.t % 3}
+
+
+if TINY not in gym.registry:
+    gym.register(TINY, Tiny)
+
+
+class Left(Skill):
+    """Keeps the cart on the left."""
+
+    max_steps = 15
+
+    def reward(self, step: Any) -> Any:
+        """More on the left."""
+        return -step.next_obs[:, 0] + 0.1 * step.timed_out
+
+
+class Balance(Skill):
+    """CartPole's own task."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One training: how it is declared, and how it evolves."""
+
+    declare: Callable[[], Hierarchy]
+    flat: bool = True
+    evolve: Evolution | None = None
+
+    def train(self, run: Path) -> Run:
+        """Train from the start."""
+        how: dict[str, Any] = {"flat": self.flat, "evolve": self.evolve}
+        return self.declare().train(run, seed=SEED, quiet=True, **how)
+
+    def go_on(self, run: Path) -> Run:
+        """Do what a user does after a kill: resume the run, or begin where there is none."""
+        if (run / "run.json").exists():
+            return self.declare().resume(run, quiet=True)
+        if run.exists():
+            shutil.rmtree(run)
+        return self.train(run)
+
+
+NET = Network((6,))
+LEARNS: dict[str, Any] = {"num_envs": 4, "n_steps": 16, "batch_size": 32, "update_epochs": 2}
+REPLAYS: dict[str, Any] = {
+    "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 200, "update_ratio": 0.25,
+    "network": Network((6,), "relu"),
+}  # fmt: skip
+EVOLVES: dict[str, Any] = {
+    "population": 3, "generations": 3, "episodes": 2,
+    "mutations": Mutations(units=(4, 16), layers=(1, 2)),
+}  # fmt: skip
+
+
+def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
+    """Two skills and a selector."""
+    return Hierarchy(
+        EnvSpec(CART, engine="sync"), [Left(), Balance()], call_steps=6, algorithm=skill,
+        selector=selector, skill_steps=steps, selector_steps=steps, cut_every=steps // 4,
+    )  # fmt: skip
+
+
+def alone(env: Any, algorithm: Any, steps: int) -> Hierarchy:
+    """One agent."""
+    return Hierarchy(
+        env, [Task()], algorithm=algorithm, flat_steps=steps, cut_every=max(1, steps // 5)
+    )
+
+
+KINDS: dict[str, Kind] = {
+    "skills and selector": Kind(
+        lambda: woven(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)), flat=False
+    ),
+    "skills and selector, replay": Kind(
+        lambda: woven(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS)), flat=False
+    ),
+    "replay of continuous actions": Kind(
+        lambda: alone(TINY, SAC(**REPLAYS, normalize_obs=True, n_step=3), 800)
+    ),
+    "recurrent": Kind(
+        lambda: alone(
+            EnvSpec(CART, engine="sync"),
+            PPO(**LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))),
+            2000,
+        )
+    ),
+    "envpool": Kind(
+        lambda: alone(CART, PPO(**LEARNS, network=NET, normalize_obs=True, target_kl=0.02), 4000)
+    ),
+    "workers": Kind(
+        lambda: alone(EnvSpec(CART, engine="async"), PPO(**LEARNS, network=NET), 2000)
+    ),
+    "population": Kind(
+        lambda: alone(EnvSpec(CART, engine="sync"), PPO(**LEARNS, network=NET), 800),
+        evolve=Evolution(**EVOLVES),
+    ),
+    "population, replay": Kind(
+        lambda: alone(EnvSpec(CART, engine="sync"), DQN(**REPLAYS), 300),
+        evolve=Evolution(**EVOLVES),
+    ),
+}  # fmt: skip
+"""Every kind of phase and engine that could lose something."""

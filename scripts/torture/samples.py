@@ -1,0 +1,289 @@
+"""What is mutated: small runs and files of every kind, each with what a user does with it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from scripts.torture.compare import tensors_and_header
+from scripts.torture.kinds import CART, KINDS, LEARNS, NET, Balance, Kind, woven
+from skillweave import PPO, EnvSpec, Hierarchy, Skill, from_onnx
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.api import Run, train_agent
+from skillweave.cli import actions, commands
+from skillweave.reporting.lineage import read_lineage
+from skillweave.reporting.plots import plot_run
+from skillweave.runs.agents import load_agent
+from skillweave.runs.agilerl import convert
+from skillweave.runs.directory import RunDirectory
+from skillweave.seeding import Seeds
+from skillweave.spaces import pack
+from skillweave.types import Policy
+
+Play = dict[str, Any]
+"""What a policy does, so that two can be compared by ==."""
+ROWS = 32
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Files, and what is done with them."""
+
+    make: Callable[[Path], None]
+    """Writes them into an empty folder."""
+    use: Callable[[Path, str], Play]
+    """Does what a user does, with the folder, and the name of the file that was changed."""
+    share: float = 1.0
+    """How often it is drawn; less where its use takes long."""
+
+
+# What users do ---------------------------------------------------------------------------------
+
+
+def play(run: Run) -> Play:
+    """A trained policy's actions, and an episode of its."""
+    score = run.evaluate(1)
+    return plays(run.policy) | {"returns": score.returns, "lengths": score.lengths}
+
+
+def plays(policy: Policy) -> Play:
+    """A policy's actions on fixed observations, greedy and sampled."""
+    space = policy.observation_space
+    space.seed(0)
+    obs = pack(space, gym.vector.utils.concatenate(
+        space, [space.sample() for _ in range(ROWS)],
+        gym.vector.utils.create_empty_array(space, ROWS),
+    ))  # fmt: skip
+    return {
+        f"deterministic {greedy}": policy.act(
+            policy.start(ROWS), obs, deterministic=greedy, rng=np.random.default_rng(0)
+        )[0].tolist()
+        for greedy in (True, False)
+    }
+
+
+def looked_at(run: Path, changed: str) -> None:
+    """The commands that only read."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        actions.run(commands.Info(target=str(run)))
+    found = RunDirectory.open(run)
+    if changed.endswith(".jsonl"):
+        list(found.metrics())
+        for phase in found.manifest["phases"]:
+            read_lineage(run, phase["name"])
+        plot_run(found, run / "plots")
+
+
+def declared(kind: Kind) -> Callable[[Path, str], Play]:
+    """Load a run by its own declaration."""
+
+    def use(folder: Path, changed: str) -> Play:
+        looked_at(folder / "run", changed)
+        return play(kind.declare().load(folder / "run"))
+
+    return use
+
+
+def from_data(folder: Path, changed: str) -> Play:
+    """Load a run that says itself what it is."""
+    run = folder / "run"
+    looked_at(run, changed)
+    manifest = RunDirectory.open(run).manifest
+    return play(Hierarchy.from_manifest(manifest).load(run))
+
+
+def resumed(kind: Kind) -> Callable[[Path, str], Play]:
+    """Resume a run to its end."""
+
+    def use(folder: Path, changed: str) -> Play:
+        run = folder / "run"
+        looked_at(run, changed)
+        played = play(kind.declare().resume(run, quiet=True))
+        policies = sorted((run / "policies").glob("*.safetensors"))
+        return played | {
+            p.name: hashlib.sha256(tensors_and_header(p)[0]).hexdigest() for p in policies
+        }
+
+    return use
+
+
+def weights_file(kind: Kind) -> Callable[[Path, str], Play]:
+    """Load a file of weights into its declaration."""
+    return lambda folder, changed: play(kind.declare().load_weights(folder / "w.safetensors"))
+
+
+def flat_weights(folder: Path, changed: str) -> Play:
+    """Score a flat agent's weights on the command line."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        actions.run(commands.Evaluate(target=str(folder / "w.safetensors"), episodes=1, json=True))
+    return {"printed": out.getvalue().replace(str(folder), "")}
+
+
+def converted(folder: Path, changed: str) -> Play:
+    """Convert a checkpoint of AgileRL's, and load the result."""
+    convert(folder / "old.pt", folder / "new.safetensors")
+    algorithm, state, about = load_agent(folder / "new.safetensors", Seeds(0))
+    return plays(AgentPolicy.of(algorithm, state)) | {"about": repr(about)}
+
+
+def onnx_skill(folder: Path, changed: str) -> Play:
+    """Load a run whose skill is an ONNX file, and the file itself."""
+    looked_at(folder / "run", changed)
+    return play(_with_onnx(folder).load(folder / "run"))
+
+
+# How they are made -----------------------------------------------------------------------------
+
+
+class _Stop(Exception):
+    """Ends a training early."""
+
+
+def unfinished(kind: Kind, cuts: int) -> Callable[[Path], None]:
+    """Make a run that was stopped after so many checkpoints."""
+
+    def make(folder: Path) -> None:
+        saved, count = RunDirectory.save_checkpoint, 0
+
+        def stop(run: RunDirectory, *arguments: Any) -> None:
+            nonlocal count
+            saved(run, *arguments)
+            count += 1
+            if count == cuts:
+                raise _Stop
+
+        RunDirectory.save_checkpoint = stop  # type: ignore[method-assign]
+        try:
+            kind.train(folder / "run")
+        except _Stop:
+            pass
+        finally:
+            RunDirectory.save_checkpoint = saved  # type: ignore[method-assign]
+
+    return make
+
+
+def whole(name: str) -> Callable[[Path], None]:
+    """Make a finished run."""
+
+    def make(folder: Path) -> None:
+        KINDS[name].train(folder / "run")
+
+    return make
+
+
+def weights(name: str) -> Callable[[Path], None]:
+    """Make a file of a whole run's weights."""
+
+    def make(folder: Path) -> None:
+        import tempfile
+
+        with tempfile.TemporaryDirectory() as run:
+            KINDS[name].train(Path(run) / "run").save_weights(folder / "w.safetensors")
+
+    return make
+
+
+def agilerl(folder: Path) -> None:
+    """Make a checkpoint as AgileRL's PPO writes it."""
+    torch.manual_seed(0)
+
+    def network(outputs: int) -> dict[str, torch.Tensor]:
+        layers = OrderedDict(linear_layer_0=torch.nn.Linear(4, 6))
+        layers["linear_layer_output"] = torch.nn.Linear(6, outputs)
+        return {f"feature_net.{k}": v for k, v in torch.nn.Sequential(layers).state_dict().items()}
+
+    def described(outputs: int, end: str | None) -> dict[str, Any]:
+        return {
+            "num_inputs": 4, "num_outputs": outputs, "hidden_size": [6], "mlp_activation": "Tanh",
+            "mlp_output_activation": end, "layer_norm": False, "device": torch.device("cpu"),
+        }  # fmt: skip
+
+    checkpoint = {
+        "algo": "PPO", "gamma": 0.97, "lr": 3e-4, "batch_size": 32, "one_hot": False, "index": 2,
+        "scores": [np.float64(1.5)], "fitness": [np.float32(2.0)], "steps": [0, np.int64(9)],
+        "actor_init_dict": described(2, "Softmax"), "critic_init_dict": described(1, None),
+        "actor_state_dict": network(2), "critic_state_dict": network(1), "array": np.arange(3.0),
+    }  # fmt: skip
+    torch.save(checkpoint, folder / "old.pt")
+
+
+def onnx_file(path: Path) -> None:
+    """Write CartPole's linear controller as an ONNX model."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    weight = np.array([[-0.1, 0.1], [-0.2, 0.2], [-2.0, 2.0], [-1.0, 1.0]], np.float32)
+    node = helper.make_node("MatMul", ["obs", "w"], ["logits"])
+    shapes = {"obs": ["n", 4], "logits": ["n", 2]}
+    ends = [helper.make_tensor_value_info(k, TensorProto.FLOAT, v) for k, v in shapes.items()]
+    graph = helper.make_graph(
+        [node], "linear", ends[:1], ends[1:], [onnx.numpy_helper.from_array(weight, "w")]
+    )
+    opset = [helper.make_opsetid("", 17)]
+    onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=9), str(path))
+
+
+def _with_onnx(folder: Path) -> Hierarchy:
+    class Model(Skill):
+        policy = from_onnx(folder / "model.onnx")
+
+    spec = EnvSpec(CART, engine="sync")
+    ppo = PPO(**LEARNS, network=NET)
+    return Hierarchy(
+        spec, [Model(), Balance()], algorithm=ppo, selector=ppo, skill_steps=64, selector_steps=64
+    )
+
+
+def onnx_run(folder: Path) -> None:
+    """Make a run with a skill that is an ONNX file."""
+    onnx_file(folder / "model.onnx")
+    _with_onnx(folder).train(folder / "run", seed=0, quiet=True)
+
+
+def agent(folder: Path) -> None:
+    """Make one plain agent's run."""
+    ppo = PPO(**LEARNS, network=NET, normalize_obs=True)
+    train_agent(EnvSpec(CART, engine="sync"), ppo, 128, folder / "run", quiet=True)
+
+
+SHORT = Kind(
+    lambda: woven(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)), flat=False
+)  # fmt: skip
+"""Few steps to resume."""
+SAMPLES: dict[str, Sample] = {
+    "hierarchy": Sample(
+        whole("skills and selector, replay"), declared(KINDS["skills and selector, replay"])
+    ),
+    "hierarchy of data": Sample(whole("skills and selector"), from_data),
+    "continuous": Sample(
+        whole("replay of continuous actions"), declared(KINDS["replay of continuous actions"])
+    ),
+    "recurrent": Sample(whole("recurrent"), from_data, share=0.3),
+    "agent": Sample(agent, from_data),
+    "population": Sample(whole("population"), from_data),
+    "unfinished": Sample(unfinished(SHORT, 5), resumed(SHORT), share=0.4),
+    "unfinished population": Sample(
+        unfinished(KINDS["population, replay"], 2), resumed(KINDS["population, replay"]),
+        share=0.1,
+    ),
+    "weights": Sample(
+        weights("skills and selector"), weights_file(KINDS["skills and selector"])
+    ),
+    "flat weights": Sample(
+        weights("replay of continuous actions"), flat_weights
+    ),
+    "AgileRL": Sample(agilerl, converted),
+    "ONNX": Sample(onnx_run, onnx_skill, share=0.3),
+}  # fmt: skip
