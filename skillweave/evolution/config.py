@@ -144,6 +144,8 @@ class Mutations:
             SkillweaveError: a setting that it does not have, or a range without the start value.
         """
         own = {f.name for f in fields(config)}
+        if getattr(config, "learn_ent_coef", False):
+            own.discard("ent_coef")  # learning begins with it: a change would do nothing
         if self.ranges is None:
             usual = {k: USUAL[k] for k in _MUTATED if k in own}
             return {k: r for k, r in usual.items() if r.low <= getattr(config, k) <= r.high}

@@ -45,6 +45,7 @@ RANGES: list[tuple[type, str, object, str]] = [
     (DQN, "n_atoms", 1, "at least 2"),
     (DQN, "v_max", -10.0, r"more than v_min \(-10\.0\)"),
     (DQN, "v_max", NAN, "a finite number"),
+    (DQN, "v_max", None, "set, as v_min is"),
     (DQN, "loss", "mae", "one of huber, mse"),
     *((TD3, name, bad, "at least 0 and finite") for name in (
         "exploration_noise", "target_noise", "target_noise_clip") for bad in (-0.1, INF, NAN)),
@@ -61,7 +62,7 @@ RANGES: list[tuple[type, str, object, str]] = [
 
 def fails(kind: type, name: str, value: object, asked: str) -> None:
     with pytest.raises(SkillweaveError, match=rf"{kind.__name__}\.{name} is .*must be {asked}$"):
-        kind(**{name: value})
+        kind(**{**({"v_min": -10.0} if name == "v_max" else {}), name: value})
 
 
 @pytest.mark.parametrize(("kind", "name", "value", "asked"), RANGES)
@@ -82,8 +83,9 @@ def test_every_setting_that_has_a_range_is_tried(kind):
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
-        (DQN, {"v_max": INF}),
-        (DQN, {"v_min": -INF}),
+        (DQN, {"v_max": INF, "v_min": 0.0}),
+        (DQN, {"v_min": -INF, "v_max": 0.0}),
+        (DQN, {"v_min": None, "v_max": 0.0}),
         (SAC, {"target_entropy": NAN}),
         (SAC, {"target_entropy": INF}),
         (SAC, {"critic": Network(rnn=RNN())}),
