@@ -174,11 +174,10 @@ class DQN(OffPolicy):
         number(self, *exploration, high=1.0)
         whole(self, "target_update_interval", "n_atoms")
         check(self, "n_atoms", self.n_atoms >= 2, "at least 2")
-        if self.v_min is None:
-            check(self, "v_min", self.v_max is None, "set, as v_max is")
-        else:
-            check(self, "v_max", self.v_max is not None, "set, as v_min is")
-            number(self, "v_min", "v_max", low=-INFINITY)
+        for name, other in (("v_min", self.v_max), ("v_max", self.v_min)):
+            if other is not None:
+                number(self, name, low=-INFINITY)
+        if self.v_min is not None and self.v_max is not None:
             check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
         one_of(self, "loss", ("huber", "mse"))
 

@@ -63,7 +63,8 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         self.interval = config.target_update_interval
         self.atoms = None
         if config.distributional:
-            low, high = (config.v_min, config.v_max) if self._given else (-WIDEST, WIDEST)
+            low = -WIDEST if config.v_min is None else config.v_min
+            high = WIDEST if config.v_max is None else config.v_max
             self.atoms = torch.linspace(low, high, config.n_atoms)
         self.net = QNet(
             self.obs, config.network, self.codec.size,

@@ -38,4 +38,5 @@ class Ring:
 
     def take(self, numbers: Array) -> Array:
         """The rows of ``numbers``, of any shape."""
-        return self.rows[numbers & len(self.rows) - 1]
+        found: Array = self.rows[numbers & len(self.rows) - 1]
+        return found

@@ -69,7 +69,7 @@ def clamp_inward(x: Tensor, low: float, high: float) -> Tensor:
     A clamp has no gradient outside its bounds, so what got there would stay for ever. Here only
     the part that leads further out is zero ("zeroing gradients", Hausknecht & Stone 2016, sec. 5).
     """
-    found: Tensor = _ClampInward.apply(x, low, high)
+    found: Tensor = _ClampInward.apply(x, low, high)  # type: ignore[no-untyped-call]
     return found
 
 

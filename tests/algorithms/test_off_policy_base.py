@@ -46,7 +46,7 @@ RANGES: list[tuple[type, str, object, str]] = [
     (DQN, "n_atoms", 1, "at least 2"),
     (DQN, "v_max", -10.0, r"more than v_min \(-10\.0\)"),
     (DQN, "v_max", NAN, "a finite number"),
-    (DQN, "v_max", None, "set, as v_min is"),
+    (DQN, "v_max", None, "a finite number"),  # as v_min is
     (DQN, "loss", "mae", "one of huber, mse"),
     *((TD3, name, bad, "at least 0 and finite") for name in (
         "exploration_noise", "target_noise", "target_noise_clip") for bad in (-0.1, INF, NAN)),
