@@ -128,6 +128,11 @@ class Sample:
     mask: Tensor | None  # (P, B, A) bool, allowed actions in ``next_obs``; None: all
     weight: Tensor | None  # (P, B) float32, importance weights; None where drawn uniformly
     index: Array  # (P, B) int64, which transitions these are, to give them new priorities
+    # Where an algorithm asks for them, the n − 1 observations between ``obs`` and ``next_obs``:
+    between_obs: Tensor | None = None  # (P, B, n − 1, *obs_shape)
+    between_mask: Tensor | None = None  # (P, B, n − 1, A) bool, allowed actions; None: all
+    between_discount: Tensor | None = None
+    """(P, B, n − 1), what a reward there counts: γ^Στ, or 0 where the steps ended before."""
 
     def split(self, batch: int) -> Iterator[Sample]:
         """Samples of ``batch`` transitions of each member, one after another."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -42,6 +43,13 @@ class Family:
     """What learns, then its slow copy if there is one."""
     moments: tuple[str, ...] = ("mu", "nu")
     """The optimiser's."""
+    count: str = "count"
+    """The field with the optimiser's steps: (P,), or (..., D) where parameters differ in age."""
+
+
+def setting_number(value: float | None) -> float:
+    """A setting as it stands in a state, where "no limit" (None) is infinity."""
+    return math.inf if value is None else float(value)
 
 
 class Algorithm:
@@ -83,7 +91,10 @@ class Algorithm:
             "return_mean": torch.zeros(members, 1),
             "return_var": torch.ones(members, 1),
             "return_count": torch.full((members,), 1e-4),
-            **{k: torch.full((members,), float(getattr(self.config, k))) for k in self.settings},
+            **{
+                k: torch.full((members,), setting_number(getattr(self.config, k)))
+                for k in self.settings
+            },
         }
 
     def actor(self, state: Any, progress: float = 1.0) -> Actor:

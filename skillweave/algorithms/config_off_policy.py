@@ -99,8 +99,8 @@ class OffPolicy:
     """Discount γ of one step."""
     tau: float = 0.005
     """Share of the new weights in the target's at each target update."""
-    max_grad_norm: float = 10.0
-    """Gradients are scaled down to this norm."""
+    max_grad_norm: float | None = None
+    """Gradients are scaled down to this norm; None: they are not."""
     normalize_obs: bool = False
     """Running zero mean, unit deviation of observations; saved with the policy."""
     normalize_rewards: bool = False
@@ -119,7 +119,9 @@ class OffPolicy:
         check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
         whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
         number(self, "gamma", "tau", "priority_alpha", "priority_beta", high=1.0)
-        positive(self, "learning_rate", "max_grad_norm", "adam_eps", "update_ratio")
+        positive(self, "learning_rate", "adam_eps", "update_ratio")
+        if self.max_grad_norm is not None:
+            positive(self, "max_grad_norm")
         number(self, "learning_starts")
         one_of(self, "learning_rate_schedule", ("constant", "linear"))
         least = self.num_envs * (self.n_step + 1)
@@ -145,10 +147,15 @@ class DQN(OffPolicy):
     """C51: the distribution of returns on fixed atoms (Bellemare et al. 2017)."""
     n_atoms: int = 51
     """C51's atoms."""
-    v_min: float = -10.0
-    """C51's smallest return."""
-    v_max: float = 10.0
-    """C51's largest return."""
+    v_min: float | None = None
+    """C51's smallest return; None: −10 times the root mean square of the returns seen so far, in
+    units of which it then learns. What lies beyond the atoms is learnt as the last one."""
+    v_max: float | None = None
+    """C51's largest return; None, as v_min is: 10 times."""
+    max_grad_norm: float | None = 10.0
+    """Gradients are scaled down to this norm; None: they are not."""
+    learning_starts: int = 1_000
+    """Transitions collected by acting at random before the first gradient step."""
     exploration_fraction: float = 0.1
     """Share of the budget over which ε falls."""
     exploration_initial_eps: float = 1.0
@@ -167,8 +174,11 @@ class DQN(OffPolicy):
         number(self, *exploration, high=1.0)
         whole(self, "target_update_interval", "n_atoms")
         check(self, "n_atoms", self.n_atoms >= 2, "at least 2")
-        number(self, "v_min", "v_max", low=-INFINITY)
-        check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
+        for name, other in (("v_min", self.v_max), ("v_max", self.v_min)):
+            if other is not None:
+                number(self, name, low=-INFINITY)
+        if self.v_min is not None and self.v_max is not None:
+            check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
         one_of(self, "loss", ("huber", "mse"))
 
     @classmethod
@@ -185,6 +195,8 @@ class DQN(OffPolicy):
 class TD3(OffPolicy):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
 
+    normalize_obs: bool = True
+    """Running zero mean, unit deviation of observations; saved with the policy."""
     critic: Network | None = None
     """The critics' network; None: as the actor's."""
     exploration_noise: float = 0.1
@@ -216,14 +228,17 @@ class TD3(OffPolicy):
 class SAC(OffPolicy):
     """Soft actor-critic (Haarnoja et al. 2018b); of choices too (Christodoulou 2019)."""
 
+    normalize_obs: bool = True
+    """Running zero mean, unit deviation of observations; saved with the policy."""
     critic: Network | None = None
     """The critics' network; None: as the actor's."""
     ent_coef: float = 1.0
-    """The temperature α, at the start."""
+    """The temperature α; where it is learnt, at the start."""
     learn_ent_coef: bool = True
     """α is learnt, so that the policy's entropy is ``target_entropy``."""
     target_entropy: float | None = None
-    """Entropy aimed at, in nats; None: −A for A continuous actions, half of log A for choices."""
+    """Entropy aimed at, in nats; None: −A for A continuous actions, half of log A for choices.
+    Where a mask allows m of A choices, it is this times log m / log A."""
     policy_delay: int = 1
     """Critic updates for each update of the actor."""
 

@@ -24,6 +24,9 @@ from skillweave.ops.losses import categorical_projection, td_loss
 from skillweave.seeding import Seeds
 from skillweave.types import Sample
 
+WIDEST = 10.0
+"""Largest return on atoms without v_min and v_max, in units of the returns seen so far."""
+
 
 @dataclass
 class State:
@@ -33,7 +36,8 @@ class State:
     target: Tensor  # (P, D), the slow copy
     mu: Tensor  # (P, D), Adam's first moment
     nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,), Adam's steps
+    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
+    updates: Tensor  # (P,) int64, gradient steps
     obs_mean: Tensor  # (P, O)
     obs_var: Tensor  # (P, O)
     obs_count: Tensor  # (P,)
@@ -51,7 +55,6 @@ class DQNAlgorithm(OffPolicyAlgorithm):
 
     state_type = State
     settings = ("learning_rate", "gamma", "tau", "max_grad_norm")
-    counter = "count"
 
     def __init__(
         self, config: DQN, observation_space: gym.Space[Any], action_space: gym.Space[Any]
@@ -60,13 +63,33 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         self.interval = config.target_update_interval
         self.atoms = None
         if config.distributional:
-            self.atoms = torch.linspace(config.v_min, config.v_max, config.n_atoms)
+            low = -WIDEST if config.v_min is None else config.v_min
+            high = WIDEST if config.v_max is None else config.v_max
+            self.atoms = torch.linspace(low, high, config.n_atoms)
         self.net = QNet(
             self.obs, config.network, self.codec.size,
             atoms=config.n_atoms if config.distributional else 1,
             dueling=config.dueling, noisy=config.noisy,
         )  # fmt: skip
         self.layout = self.acting = Layout(self.net.shapes)
+
+    @property
+    def _given(self) -> bool:
+        """Whether the atoms are returns of the settings' own, not of those seen."""
+        return self.config.v_min is not None
+
+    @property
+    def scales_rewards(self) -> bool:
+        """Whether it needs the running moments of returns."""
+        return super().scales_rewards or (self.atoms is not None and not self._given)
+
+    def rewards(self, state: State, sample: Sample) -> Tensor:
+        """Rewards (P, B) in the units of the atoms."""
+        if self.atoms is None or self._given:
+            return super().rewards(state, sample)
+        # The root of the mean square: of returns that are all alike the deviation would be 0.
+        square = state.return_var + state.return_mean.square()
+        return sample.reward * (square + 1e-8).rsqrt()
 
     def _fresh_state(self, seeds: list[Seeds]) -> State:
         params = torch.zeros(len(seeds), self.layout.size)
@@ -76,7 +99,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             target=params.clone(),
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
-            count=torch.zeros(len(seeds)),
+            count=torch.zeros(len(seeds), dtype=torch.int64),
             **self.fresh(len(seeds)),
         )
 

@@ -25,10 +25,19 @@ from skillweave.types import Sample
 class OffPolicyAlgorithm(Algorithm):
     """Learns from samples of a replay buffer, one gradient step at a time."""
 
-    counter: ClassVar[str] = "critic_count"
-    """The field of the state that counts gradient steps."""
     interval: int
     """Gradient steps between those that the slower networks take part in."""
+    between: ClassVar[bool] = False
+    """Whether it learns from the observations between those that n steps begin and end with."""
+
+    @property
+    def scales_rewards(self) -> bool:
+        """Whether it needs the running moments of returns."""
+        return bool(self.config.normalize_rewards)
+
+    def fresh(self, members: int) -> dict[str, Tensor]:
+        """The fields that every state has, and the count of gradient steps."""
+        return super().fresh(members) | {"updates": torch.zeros(members, dtype=torch.int64)}
 
     def update(
         self, state: Any, sample: Sample, progress: float, generators: list[torch.Generator]
@@ -42,7 +51,8 @@ class OffPolicyAlgorithm(Algorithm):
         Returns:
             Metrics (P,), and the samples' errors (P, B), for their priorities.
         """
-        due = (int(getattr(state, self.counter)[0]) + 1) % self.interval == 0
+        state.updates += 1
+        due = int(state.updates[0]) % self.interval == 0
         noise = self.learning_noise(generators, sample.reward.shape[1], due)
         learn = self._compiled if self.config.compile else self.learn
         done: tuple[dict[str, Tensor], Tensor] = learn(
@@ -145,7 +155,7 @@ class Critics:
     def family(self) -> Family:
         """The fields of a state that hold critics."""
         weights, moments = ("critic", "critic_target"), ("critic_mu", "critic_nu")
-        return Family(self.layout, (("critic", self.net),), weights, moments)
+        return Family(self.layout, (("critic", self.net),), weights, moments, "critic_count")
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """Windows into (P, K, D), each (P·K, *shape)."""

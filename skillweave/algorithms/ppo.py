@@ -40,7 +40,7 @@ class State:
     params: Tensor  # (P, D), actor first, then critic
     mu: Tensor  # (P, D), Adam's first moment
     nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,), Adam's steps
+    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
     obs_mean: Tensor  # (P, O)
     obs_var: Tensor  # (P, O)
     obs_count: Tensor  # (P,)
@@ -107,7 +107,7 @@ class PPOAlgorithm(Algorithm):
             params=params,
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
-            count=torch.zeros(members),
+            count=torch.zeros(members, dtype=torch.int64),
             **self.fresh(members),
         )
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from skillweave.algorithms.base import Actor, Family
 from skillweave.algorithms.config import SAC
+from skillweave.algorithms.config_off_policy import check
 from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -35,16 +36,17 @@ class State:
     params: Tensor  # (P, D), the actor
     mu: Tensor  # (P, D), Adam's first moment
     nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,), Adam's steps
+    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
     critic: Tensor  # (P, K, D)
     critic_target: Tensor  # (P, K, D)
     critic_mu: Tensor  # (P, K, D)
     critic_nu: Tensor  # (P, K, D)
-    critic_count: Tensor  # (P,)
+    critic_count: Tensor  # (P,) int64, or (P, K, D)
     log_alpha: Tensor  # (P, 1), log of the temperature
     alpha_mu: Tensor  # (P, 1)
     alpha_nu: Tensor  # (P, 1)
-    alpha_count: Tensor  # (P,)
+    alpha_count: Tensor  # (P,) int64
+    updates: Tensor  # (P,) int64, gradient steps
     obs_mean: Tensor  # (P, O)
     obs_var: Tensor  # (P, O)
     obs_count: Tensor  # (P,)
@@ -56,14 +58,16 @@ class State:
     learning_rate: Tensor  # (P,); this and all below are settings, one a member
     gamma: Tensor  # (P,)
     tau: Tensor  # (P,)
-    max_grad_norm: Tensor  # (P,)
+    max_grad_norm: Tensor  # (P,), infinity: gradients are not clipped
+    ent_coef: Tensor  # (P,), the temperature where it is not learnt
 
 
 class SACAlgorithm(OffPolicyAlgorithm):
     """SAC on one pair of spaces. Holds no learnt state: that is in ``State``."""
 
     state_type = State
-    settings = ("learning_rate", "gamma", "tau", "max_grad_norm")
+    settings = ("learning_rate", "gamma", "tau", "max_grad_norm", "ent_coef")
+    between = True
 
     def __init__(
         self, config: SAC, observation_space: gym.Space[Any], action_space: gym.Space[Any]
@@ -78,6 +82,13 @@ class SACAlgorithm(OffPolicyAlgorithm):
         self.critics = Critics(self.obs, critic, size if discrete else 1, 0 if discrete else size)
         usual = 0.5 * math.log(size) if discrete else -float(size)
         self.target_entropy = usual if config.target_entropy is None else config.target_entropy
+        highest = math.log(size) if discrete else size * math.log(2.0)  # of even chances
+        check(
+            config,
+            "target_entropy",
+            self.target_entropy <= highest,
+            f"at most {highest:.4g}, the entropy of {action_space} at random",
+        )
 
     def _fresh_state(self, seeds: list[Seeds]) -> State:
         members = len(seeds)
@@ -89,16 +100,16 @@ class SACAlgorithm(OffPolicyAlgorithm):
             params=params,
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
-            count=torch.zeros(members),
+            count=torch.zeros(members, dtype=torch.int64),
             critic=critic,
             critic_target=critic.clone(),
             critic_mu=torch.zeros_like(critic),
             critic_nu=torch.zeros_like(critic),
-            critic_count=torch.zeros(members),
+            critic_count=torch.zeros(members, dtype=torch.int64),
             log_alpha=torch.full((members, 1), math.log(self.config.ent_coef)),
             alpha_mu=torch.zeros(members, 1),
             alpha_nu=torch.zeros(members, 1),
-            alpha_count=torch.zeros(members),
+            alpha_count=torch.zeros(members, dtype=torch.int64),
             policy_loss=torch.zeros(members),
             entropy=torch.zeros(members),
             **self.fresh(members),
@@ -126,32 +137,34 @@ class SACAlgorithm(OffPolicyAlgorithm):
     def learning_noise(
         self, generators: list[torch.Generator], batch: int, due: bool
     ) -> list[Tensor]:
-        """Of the next actions, and of those that the actor learns from; (P, B, A) each."""
+        """Of the next actions, of those between, and of the actor's; (P, B or B·(n − 1), A)."""
         if self.codec.discrete:
             return []
-        return [normal(generators, batch, self.codec.size) for _ in range(1 + due)]
+        between = [batch * (self.config.n_step - 1)] * (self.config.n_step > 1)
+        sizes = [batch, *between, *[batch] * due]
+        return [normal(generators, size, self.codec.size) for size in sizes]
 
     def learn(
         self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step of critics, actor and temperature, in place."""
         actor = Actor({}, *self.scaling(state))
-        eps, alpha = self.config.adam_eps, state.log_alpha.exp()
+        eps, learnt = self.config.adam_eps, self.config.learn_ent_coef
+        alpha = state.log_alpha.exp() if learnt else state.ent_coef[:, None]
         inputs = self.inputs(actor, sample.obs)
         leaves = self.critics.leaves(state.critic)
-        following = self.inputs(actor, sample.next_obs)
-        loss, error, q = self.critic_loss(leaves, state, sample, inputs, following, alpha, noise)
+        loss, error, q = self.critic_loss(leaves, state, sample, actor, inputs, alpha, noise)
         norm = self.critics.step_(state, loss, leaves, rate, eps)
         if due:
             policy = self.layout.leaves(state.params)
             policy_loss, entropy = self.policy_loss(
-                policy, state, sample.obs_mask, inputs, alpha, noise[1:]
+                policy, state, sample.obs_mask, inputs, alpha, noise[-1:]
             )
             self.step_(state, policy_loss, policy, rate)
             state.policy_loss, state.entropy = policy_loss.detach(), entropy
-            if self.config.learn_ent_coef:
+            if learnt:
                 # d/d log α of −log α·(log π + H̄), as in the authors' code, not of −α·(…).
-                slope = (entropy - self.target_entropy)[:, None]
+                slope = (entropy - self.entropy_aim(sample.obs_mask))[:, None]
                 moments = state.alpha_mu, state.alpha_nu, state.alpha_count
                 adam_(state.log_alpha, slope, *moments, rate, eps=eps)
         state.critic_target.lerp_(state.critic, state.tau[:, None, None])
@@ -171,14 +184,17 @@ class SACAlgorithm(OffPolicyAlgorithm):
         views: Views,
         state: State,
         sample: Sample,
+        actor: Actor,
         inputs: Inputs,
-        following: Inputs,
         alpha: Tensor,
         noise: list[Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Loss (P,), error of each sample (P, B) and mean value (P,)."""
         with torch.no_grad():
-            slow = self.critics.views(state.critic_target)
+            slow, following = (
+                self.critics.views(state.critic_target),
+                self.inputs(actor, sample.next_obs),
+            )
             head = self.net(self.layout.views(state.params), following)
             if self.codec.discrete:
                 log_p = _log_p(head, sample.mask)
@@ -188,7 +204,10 @@ class SACAlgorithm(OffPolicyAlgorithm):
                 action, log_prob = self._sampled(head, noise[0])
                 q = self.critics(slow, following, action).squeeze(-1).amin(1)
                 value = q - alpha * log_prob
-            target = self.target(self.rewards(state, sample), sample.discount, value)
+            reward = self.rewards(state, sample)
+            if sample.between_obs is not None:
+                reward = reward + alpha * self.entropy_between(state, sample, actor, noise[1:])
+            target = self.target(reward, sample.discount, value)
         if self.codec.discrete:
             out = self.critics(views, inputs)  # (P, K, B, A)
             chosen = sample.action[:, None, :, None].expand(*out.shape[:3], 1)
@@ -218,6 +237,37 @@ class SACAlgorithm(OffPolicyAlgorithm):
         action, log_prob = self._sampled(head, noise[0])
         q = self.critics(critics, inputs, action).squeeze(-1).amin(1)
         return (alpha * log_prob - q).mean(1), -log_prob.detach().mean(1)
+
+    def entropy_between(
+        self, state: State, sample: Sample, actor: Actor, noise: list[Tensor]
+    ) -> Tensor:
+        """What the policy's entropy at the steps between adds to n steps' reward, (P, B).
+
+        The soft value of the first step holds ``γᵏ·α·H(π(·|sₖ))`` for each k from 1 to n − 1
+        (Haarnoja et al. 2018a, eq. 3). Of forces it is estimated by an action drawn now: of the
+        one that was taken, by an older policy, −log π may be as large as it likes.
+        """
+        assert sample.between_obs is not None
+        assert sample.between_discount is not None
+        lead = sample.between_discount.shape
+        inputs = self.inputs(actor, sample.between_obs.flatten(1, 2))
+        head = self.net(self.layout.views(state.params), inputs)
+        if self.codec.discrete:
+            mask = sample.between_mask
+            log_p = _log_p(head, None if mask is None else mask.flatten(1, 2))
+            entropy = -(log_p.exp() * log_p).sum(-1)
+        else:
+            entropy = -self._sampled(head, noise[0])[1]
+        # As in `target`: 0·NaN is NaN.
+        discount = sample.between_discount
+        return torch.where(discount == 0.0, 0.0, discount * entropy.view(lead)).sum(-1)
+
+    def entropy_aim(self, mask: Tensor | None) -> Tensor | float:
+        """The entropy aimed at: of m choices allowed instead of A, log m / log A of it; (P,)."""
+        if mask is None or self.codec.size == 1:
+            return self.target_entropy
+        share = mask.sum(-1).clamp_min(1).log() / math.log(self.codec.size)
+        return self.target_entropy * share.mean(1)
 
     def _sampled(self, head: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Squashed actions (P, B, A) and their log-probability (P, B); app. C."""

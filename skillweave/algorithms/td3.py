@@ -31,12 +31,13 @@ class State:
     target: Tensor  # (P, D), its slow copy
     mu: Tensor  # (P, D), Adam's first moment
     nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,), Adam's steps
+    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
     critic: Tensor  # (P, K, D)
     critic_target: Tensor  # (P, K, D)
     critic_mu: Tensor  # (P, K, D)
     critic_nu: Tensor  # (P, K, D)
-    critic_count: Tensor  # (P,)
+    critic_count: Tensor  # (P,) int64, or (P, K, D)
+    updates: Tensor  # (P,) int64, gradient steps
     obs_mean: Tensor  # (P, O)
     obs_var: Tensor  # (P, O)
     obs_count: Tensor  # (P,)
@@ -83,12 +84,12 @@ class TD3Algorithm(OffPolicyAlgorithm):
             target=params.clone(),
             mu=torch.zeros_like(params),
             nu=torch.zeros_like(params),
-            count=torch.zeros(len(seeds)),
+            count=torch.zeros(len(seeds), dtype=torch.int64),
             critic=critic,
             critic_target=critic.clone(),
             critic_mu=torch.zeros_like(critic),
             critic_nu=torch.zeros_like(critic),
-            critic_count=torch.zeros(len(seeds)),
+            critic_count=torch.zeros(len(seeds), dtype=torch.int64),
             policy_loss=torch.zeros(len(seeds)),
             **self.fresh(len(seeds)),
         )

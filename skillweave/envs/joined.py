@@ -98,10 +98,18 @@ class JoinedEnvs:
             return isinstance(value, np.ndarray) and value.shape[:1] == (self._each,)
 
         return {
-            k: np.concatenate([info[k] for info in infos])
+            k: _concatenated([info[k] for info in infos])
             for k in infos[0]
             if all(batched(info.get(k)) for info in infos)
         }
+
+
+def _concatenated(parts: list[Array]) -> Array:
+    """Rows of all parts; rows of numbers as long as the longest, zeros behind the others."""
+    if parts[0].ndim == 2:
+        widest = max(part.shape[1] for part in parts)
+        parts = [np.pad(part, ((0, 0), (0, widest - part.shape[1]))) for part in parts]
+    return np.concatenate(parts)
 
 
 def _joined(masks: list[Array | None]) -> Array | None:

@@ -19,7 +19,7 @@ from skillweave.algorithms.base import Family
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution.config import Mutations
-from skillweave.evolution.stacks import Member, copy, networks_of
+from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
 from skillweave.networks import growth
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
@@ -176,14 +176,18 @@ def _carried(
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
     """A family's fields in the new layout."""
-    names = (*before.weights, *before.moments)
+    names = (*before.weights, *before.moments, before.count)
     lead = state[names[0]].shape[:-1]
-    named = {k: before.layout.views(state[k].reshape(-1, before.layout.size)) for k in names}
+    # What is new begins with moments of 0 after 0 steps; the others' go on.
+    count = spread_count(state[before.count], state[names[0]]).double()  # as moments are: no int
+    flat = {**state, before.count: count}
+    named = {k: before.layout.views(flat[k].reshape(-1, before.layout.size)) for k in names}
     for _, net in before.nets:
         for plan in _plans(net, change, generator):
             alter = plan(named[before.weights[0]])
-            named = {k: alter(v, k in before.moments) for k, v in named.items()}
-    return {k: after.layout.flatten(v).reshape(*lead, -1) for k, v in named.items()}
+            named = {k: alter(v, k not in before.weights) for k, v in named.items()}
+    found = {k: after.layout.flatten(v).reshape(*lead, -1) for k, v in named.items()}
+    return found | {before.count: even_count(found[before.count].long())}
 
 
 def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:

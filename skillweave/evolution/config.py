@@ -144,16 +144,22 @@ class Mutations:
             SkillweaveError: a setting that it does not have, or a range without the start value.
         """
         own = {f.name for f in fields(config)}
+        learnt = {"ent_coef"} if getattr(config, "learn_ent_coef", False) else set()
         if self.ranges is None:
-            usual = {k: USUAL[k] for k in _MUTATED if k in own}
+            usual = {k: USUAL[k] for k in _MUTATED if k in own - learnt}
             return {k: r for k, r in usual.items() if r.low <= getattr(config, k) <= r.high}
         for name, found in self.ranges.items():
             kind = type(config).__name__
             if name not in own or name not in USUAL:
-                can = ", ".join(k for k in USUAL if k in own)
+                can = ", ".join(k for k in USUAL if k in own - learnt)
                 raise SkillweaveError(
                     f"Mutations.ranges: {kind} has no setting {name!r} that can mutate; "
                     f"those that can: {can}"
+                )
+            if name in learnt:
+                raise SkillweaveError(
+                    f"Mutations.ranges: {kind} learns {name} (learn_{name}=True), so a mutation "
+                    f"would change nothing: leave it out, or set learn_{name}=False"
                 )
             value = getattr(config, name)
             if start and (value is None or not found.low <= value <= found.high):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from skillweave.algorithms.base import setting_number
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
@@ -61,7 +62,7 @@ def with_settings(member: Member, **settings: Any) -> Member:
     found.config = replace(member.config, **settings)
     for name, value in settings.items():
         if hasattr(found.state, name):
-            getattr(found.state, name).fill_(value)
+            getattr(found.state, name).fill_(setting_number(value))
     return found
 
 

@@ -15,11 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.base import Algorithm, Family
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import Network
 from skillweave.networks.stacked import Layout
+
+SETTLED = 1 << 15
+"""Steps after which Adam's corrections are exactly 1: 0.999 to this power is below float32's ε."""
 
 
 @dataclass(frozen=True)
@@ -100,12 +103,16 @@ def join(
         made[config] = make_algorithm(config, *spaces)
     algorithm = made[config]
     wide, padded = algorithm.layouts(), []
+    uneven = [f for f in algorithm.families() if any(_count(m, f).ndim > 1 for m in members)]
     for member in members:
         own = member.algorithm(spaces).layouts()
         tensors = {f.name: getattr(member.state, f.name) for f in fields(member.state)}
-        padded.append({
-            k: pad(v, own[k], wide[k]) if k in wide else v for k, v in tensors.items()
-        })  # fmt: skip
+        tensors |= {k: pad(v, own[k], wide[k]) for k, v in tensors.items() if k in wide}
+        for f in uneven:
+            like = f.weights[0]
+            each = spread_count(_count(member, f), getattr(member.state, like))
+            tensors[f.count] = pad(each, own[like], wide[like])
+        padded.append(tensors)
     joined = {k: torch.cat([p[k] for p in padded]) for k in padded[0]}
     return algorithm, algorithm.state_type(**joined)
 
@@ -117,10 +124,34 @@ def split(
     wide = algorithm.layouts()
     for i, member in enumerate(members):
         own = member.algorithm(spaces).layouts()
-        tensors = {f.name: getattr(state, f.name)[i : i + 1] for f in fields(state)}
-        member.state = algorithm.state_type(**{
-            k: crop(v, wide[k], own[k]) if k in wide else v.clone() for k, v in tensors.items()
-        })  # fmt: skip
+        tensors = {f.name: getattr(state, f.name)[i : i + 1].clone() for f in fields(state)}
+        tensors |= {k: crop(v, wide[k], own[k]) for k, v in tensors.items() if k in wide}
+        for f in algorithm.families():
+            if (count := tensors[f.count]).ndim > 1:
+                like = f.weights[0]
+                tensors[f.count] = even_count(crop(count, wide[like], own[like]))
+        member.state = algorithm.state_type(**tensors)
+
+
+def spread_count(count: Tensor, like: Tensor) -> Tensor:
+    """Adam's steps of each parameter (P, …, D), as those of a member (P,) or as they are."""
+    return count.view(*count.shape, *[1] * (like.ndim - count.ndim)).expand_as(like)
+
+
+def even_count(count: Tensor) -> Tensor:
+    """Adam's steps (P,) where all parameters of each member have one age, else as they are.
+
+    Ages count as one, too, where all have taken so many steps that nothing is left to correct.
+    """
+    rows = count.flatten(1)
+    oldest = rows.amax(1)
+    same = (rows == oldest[:, None]) | (rows >= SETTLED)
+    return oldest if bool(same.all()) else count
+
+
+def _count(member: Member, family: Family) -> Tensor:
+    found: Tensor = getattr(member.state, family.count)
+    return found
 
 
 def pad(flat: Tensor, own: Layout, wide: Layout) -> Tensor:

@@ -27,7 +27,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
 
     ``info`` of a step, arrays over N environments: ``steps`` (τ), ``discount`` (γ^τ, or 0 where
     terminated), ``call_return`` (Σ rₖ), ``next_obs`` (the true successors, one array whatever the
-    space: see ``spaces.pack``), and Gymnasium's ``final_obs``. Where initiation sets exist:
+    space: see ``spaces.pack``), and Gymnasium's ``final_obs``. Where each environment has its own
+    γ: ``rewards`` (N, longest), of each step of a call, then zeros. Where initiation sets exist:
     ``action_mask`` (N, S), and ``next_action_mask``, that of ``next_obs`` (all True where the
     episode terminated, or no skill may start).
 
@@ -104,6 +105,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
 
     def set_gamma(self, gamma: Array) -> None:
         """γ of one primitive step in each environment, (N,), from now on."""
+        self._keeps_rewards = np.ndim(gamma) > 0  # others may learn from it, with a γ of their own
         self._gamma = np.broadcast_to(np.asarray(gamma, np.float64), (self.num_envs,))
 
     def _begin(self, ids: Array) -> Array:
@@ -129,12 +131,16 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         reward, plain, discount = np.zeros(n), np.zeros(n), np.ones(n)
         steps = np.zeros(n, np.int64)
         terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
+        each: list[Array] = []
         rows = np.arange(n)
         while len(rows):
             here = obs if len(rows) == n else obs[rows]
             allowed = allowed_rows(self.engine.mask(), rows)
             action = self.skills.act(self._memory, rows, here, rng, allowed)
             raw = self.engine.step(action, None if len(rows) == n else rows)
+            if self._keeps_rewards:
+                each.append(np.zeros(n, np.float32))
+                each[-1][rows] = raw.reward
             reward[rows] += discount[rows] * raw.reward
             plain[rows] += raw.reward
             discount[rows] *= self._gamma[rows]
@@ -168,6 +174,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             "call_return": plain,
             "next_obs": next_obs,
             "skill": skill,
+            **({"rewards": np.stack(each, 1)} if each else {}),
             **self._masks(next_obs, terminated, truncated),
             **self._final(next_obs, terminated | truncated),
         }

@@ -11,6 +11,7 @@ from torch import Tensor
 from skillweave.ops.distributions import (
     categorical_sample,
     categorical_stats,
+    clamp_inward,
     gumbel,
     mask_logits,
     normal_stats,
@@ -112,7 +113,7 @@ class ActionHead:
             assert log_std is not None
             return head, log_std
         mean, raw = head.chunk(2, dim=-1)
-        return mean, raw.clamp(*LOG_STD)
+        return mean, clamp_inward(raw, *LOG_STD)
 
     def to_env(self, action: Array) -> Array:
         """Policy units to the environment's."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,6 +46,31 @@ def normal_stats(mean: Tensor, log_std: Tensor, action: Tensor) -> tuple[Tensor,
     log_prob = (-0.5 * z.square() - log_std - _HALF_LOG_TWO_PI).sum(-1)
     entropy = (log_std + 0.5 + _HALF_LOG_TWO_PI).expand_as(mean).sum(-1)
     return log_prob, entropy
+
+
+class _ClampInward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, low: float, high: float) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.bounds = low, high
+        return x.clamp(low, high)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        (x,), (low, high) = ctx.saved_tensors, ctx.bounds
+        # A step goes against the gradient.
+        outward = ((x < low) & (grad > 0.0)) | ((x > high) & (grad < 0.0))
+        return grad.masked_fill(outward, 0.0), None, None
+
+
+def clamp_inward(x: Tensor, low: float, high: float) -> Tensor:
+    """``x.clamp(low, high)``, but what lies outside still learns to come back; any shape.
+
+    A clamp has no gradient outside its bounds, so what got there would stay for ever. Here only
+    the part that leads further out is zero ("zeroing gradients", Hausknecht & Stone 2016, sec. 5).
+    """
+    found: Tensor = _ClampInward.apply(x, low, high)  # type: ignore[no-untyped-call]
+    return found
 
 
 def tanh_log_det(x: Tensor) -> Tensor:

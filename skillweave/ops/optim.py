@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 
 def clip_grad_norm_(grad: Tensor, max_norm: Tensor) -> Tensor:
-    """Scale each member's gradient (P, D) in place to at most ``max_norm`` (P,).
+    """Scale each member's gradient (P, D) in place to at most ``max_norm`` (P,), infinity: freely.
 
     Returns:
         The norms before clipping, (P,).
@@ -34,7 +36,8 @@ def adam_(
 
     Args:
         params, grad, mu, nu: (P, D); the moments start at zero.
-        count: (P,) float, steps taken so far.
+        count: (P,) or (P, …) int64, steps taken so far: a member's, or each parameter's own, where
+            some are younger than others.
         learning_rate: (P,).
         active: (P,) bool; members at False are left exactly as they are.
     """
@@ -45,14 +48,16 @@ def adam_(
         for whole, new in zip((params, mu, nu, count), (part[0], *part[2:5]), strict=True):
             whole[rows] = new
         return
-    count.add_(1.0)
+    count.add_(1)
+    age = (count[:, None] if count.ndim == 1 else count.flatten(1)).to(params.dtype)
     mu.lerp_(grad, 1.0 - beta1)
     nu.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
-    correction2 = (1.0 - beta2**count).sqrt()
-    step = learning_rate * correction2 / (1.0 - beta1**count)
+    correction1 = -torch.expm1(age * math.log(beta1))  # 1 − β₁ᵏ; (P, 1) or (P, D)
+    correction2 = (-torch.expm1(age * math.log(beta2))).sqrt()
+    step = learning_rate[:, None] * correction2 / correction1
     # eps is scaled too, so that this equals the algorithm as published.
-    denominator = nu.sqrt().add_((eps * correction2)[:, None])
-    params.sub_(step[:, None] * mu / denominator)
+    denominator = nu.sqrt().add_(eps * correction2)
+    params.sub_(step * mu / denominator)
 
 
 def kl_adapted_rate(

@@ -53,6 +53,7 @@ def make_buffer(
         n_step=cfg.n_step,
         prioritized=cfg.prioritized,
         alpha=cfg.priority_alpha,
+        between=algorithm.between,
     )
 
 
@@ -216,7 +217,7 @@ class _Loop:
         for i, stack in enumerate(self.stacks):
             algorithm, state, part = stack.algorithm, stack.state, self.rows(i)
             algorithm.see(state, by_member(obs[part], stack.members))
-            if algorithm.config.normalize_rewards:
+            if algorithm.scales_rewards:
                 gamma = np.repeat(state.gamma.numpy(), self._each)
                 now = self._returns[part] * gamma ** step.steps[part] + step.reward[part]
                 self._returns[part] = now

@@ -247,7 +247,7 @@ def test_training_keeps_the_shape_and_type_of_all_that_is_learnt(config):
 def test_what_is_learnt_can_be_changed_in_place():
     _, state = learn(SAC(**BUFFERED, **SCALED), Echo(8), 128)
     for f in fields(state):
-        getattr(state, f.name).mul_(1.0)
+        getattr(state, f.name).mul_(1)
 
 
 # Ends, calls and masks: values by hand, γ = 0.8

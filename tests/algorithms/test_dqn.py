@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from toys import Toy, learn
 
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.dqn import DQNAlgorithm, State
@@ -211,3 +212,38 @@ def test_a_masked_action_is_not_taken_however_good_it_looks():
             assert (action != 0).all()
             if noise is None:
                 assert (action == 2).all()
+
+
+# The atoms
+
+
+class Pays(Toy):
+    """Each action pays thousands, the second the most."""
+
+    def play(self, action: Any) -> Any:
+        still = np.zeros((self.num_envs, 1), np.float32)
+        return still, 4000.0 + 2000.0 * action, self.never, self.never, self.ones
+
+
+def test_atoms_without_bounds_of_their_own_fit_the_returns_seen():
+    config = DQN(
+        distributional=True, num_envs=8, learning_starts=64, buffer_size=1000, batch_size=32,
+        learning_rate=0.1, tau=0.3, gamma=0.5, network=Network(()), update_ratio=0.25,
+    )  # fmt: skip
+    algorithm, state = learn(config, Pays(8), 1200)
+    scale = (state.return_var + state.return_mean.square()).sqrt()
+    _, q, _ = algorithm.act(algorithm.actor(state), torch.zeros(1, 1, 1), None, None)
+    # Of the best policy 6000 / (1 − γ); the other action loses 2000 of it.
+    assert (q * scale).flatten().tolist() == pytest.approx([10_000, 12_000], rel=0.05)
+
+
+def test_the_units_of_atoms_by_hand():
+    algorithm, state = make(distributional=True, n_atoms=5)
+    assert algorithm.atoms.tolist() == [-10, -5, 0, 5, 10]
+    assert algorithm.scales_rewards
+    state.return_mean[:], state.return_var[:] = 3.0, 16.0
+    s = sample()
+    torch.testing.assert_close(algorithm.rewards(state, s), s.reward / 5.0)
+    given, state = make(distributional=True, n_atoms=5, v_min=-2.0, v_max=2.0)
+    assert not given.scales_rewards
+    assert torch.equal(given.rewards(state, s), s.reward)

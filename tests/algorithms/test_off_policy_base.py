@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
@@ -22,7 +23,7 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
-from skillweave.types import SkillweaveError
+from skillweave.types import Sample, SkillweaveError
 
 NAN, INF = float("nan"), float("inf")
 RANGES: list[tuple[type, str, object, str]] = [
@@ -45,6 +46,7 @@ RANGES: list[tuple[type, str, object, str]] = [
     (DQN, "n_atoms", 1, "at least 2"),
     (DQN, "v_max", -10.0, r"more than v_min \(-10\.0\)"),
     (DQN, "v_max", NAN, "a finite number"),
+    (DQN, "v_max", None, "a finite number"),  # as v_min is
     (DQN, "loss", "mae", "one of huber, mse"),
     *((TD3, name, bad, "at least 0 and finite") for name in (
         "exploration_noise", "target_noise", "target_noise_clip") for bad in (-0.1, INF, NAN)),
@@ -61,7 +63,7 @@ RANGES: list[tuple[type, str, object, str]] = [
 
 def fails(kind: type, name: str, value: object, asked: str) -> None:
     with pytest.raises(SkillweaveError, match=rf"{kind.__name__}\.{name} is .*must be {asked}$"):
-        kind(**{name: value})
+        kind(**{**({"v_min": -10.0} if name == "v_max" else {}), name: value})
 
 
 @pytest.mark.parametrize(("kind", "name", "value", "asked"), RANGES)
@@ -82,8 +84,9 @@ def test_every_setting_that_has_a_range_is_tried(kind):
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
-        (DQN, {"v_max": INF}),
-        (DQN, {"v_min": -INF}),
+        (DQN, {"v_max": INF, "v_min": 0.0}),
+        (DQN, {"v_min": -INF, "v_max": 0.0}),
+        (DQN, {"v_min": None, "v_max": 0.0}),
         (SAC, {"target_entropy": NAN}),
         (SAC, {"target_entropy": INF}),
         (SAC, {"critic": Network(rnn=RNN())}),
@@ -203,3 +206,37 @@ def test_a_step_of_the_critics_clips_both_together():
     assert state.critic_mu.norm().item() == pytest.approx(0.1 * 1e-3, rel=1e-3)
     assert not torch.equal(state.critic[:, 0], before[:, 0])
     assert not torch.equal(state.critic[:, 1], before[:, 1])
+
+
+@pytest.mark.parametrize("kind", [SAC, TD3])
+def test_gradients_are_not_clipped_unless_asked_for(kind):
+    config = kind(network=Network((4,)))
+    assert (config.max_grad_norm, config.normalize_obs) == (None, True)
+    assert config_from_json(config_to_json(config)) == config
+    old = config_to_json(config) | {"max_grad_norm": 10.0, "normalize_obs": False}
+    assert config_from_json(old) == replace(config, max_grad_norm=10.0, normalize_obs=False)
+    algorithm = make_algorithm(config, Box(-1, 1, (3,)), Box(-1, 1, (1,)))
+    state = algorithm.init([Seeds(0)])
+    assert state.max_grad_norm.tolist() == [INF]
+    leaves = algorithm.critics.leaves(state.critic)
+    x, action = {"vector": torch.ones(1, 5, 3)}, torch.ones(1, 5, 1)
+    loss = 1e6 * algorithm.critics(leaves, x, action).square().mean((1, 2, 3))
+    norm = algorithm.critics.step_(state, loss, leaves, torch.tensor([0.1]), 1e-8)
+    assert norm.item() > 1e3
+    assert state.critic_mu.norm().item() == pytest.approx(0.1 * norm.item(), rel=1e-4)
+
+
+def test_the_slow_networks_turn_comes_beyond_what_a_float_can_count():
+    config = TD3(network=Network((4,)), policy_delay=2, target_noise=0.0)
+    algorithm = make_algorithm(config, Box(-1, 1, (3,)), Box(-1, 1, (1,)))
+    state = algorithm.init([Seeds(0)])
+    state.updates += 1 << 24
+    obs, one = torch.zeros(1, 4, 3), torch.ones(1, 4)
+    sample = Sample(obs, one[..., None], one, one, obs, None, None, None, np.zeros((1, 4), int))
+    moved = []
+    for _ in range(4):
+        before = state.params.clone()
+        algorithm.update(state, sample, 0.0, [])
+        moved.append(not torch.equal(state.params, before))
+    assert moved == [False, True, False, True]
+    assert state.updates.tolist() == [(1 << 24) + 4]

@@ -11,16 +11,16 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from torch.distributions import Categorical, Normal, TanhTransform, TransformedDistribution
-from toys import Masked, learn
+from toys import Masked, Toy, learn
 
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.sac import SACAlgorithm, State
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
+from skillweave.types import Sample, SkillweaveError
 
 P, B = 2, 6
-LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2)
+LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2, normalize_obs=False)
 FORCES, CHOICES = Box(-1, 1, (2,)), Discrete(3)
 
 
@@ -80,10 +80,10 @@ def squashed(head: torch.Tensor, g: torch.Generator) -> tuple[torch.Tensor, torc
 
 def losses(algorithm: SACAlgorithm, state: State, s: Sample) -> tuple[Any, Any]:
     alpha = state.log_alpha.exp()
-    inputs, following = {"vector": s.obs}, {"vector": s.next_obs}
+    inputs, actor = {"vector": s.obs}, algorithm.actor(state)
     views = algorithm.critics.views(state.critic)
     noise = algorithm.learning_noise(generators(), s.reward.shape[1], False)
-    critic = algorithm.critic_loss(views, state, s, inputs, following, alpha, noise)
+    critic = algorithm.critic_loss(views, state, s, actor, inputs, alpha, noise)
     views = algorithm.layout.views(state.params)
     return critic, algorithm.policy_loss(views, state, s.obs_mask, inputs, alpha, noise)
 
@@ -162,10 +162,9 @@ def test_the_temperature_falls_where_the_entropy_is_above_its_aim_and_rises_belo
 
 
 def test_a_fixed_temperature_stays():
-    algorithm, state = make(FORCES, learn_ent_coef=False)
-    before = state.log_alpha.clone()
+    algorithm, state = make(FORCES, learn_ent_coef=False, ent_coef=0.2)
+    state.ent_coef[1] = 0.7  # members' own
     metrics, _ = algorithm.update(state, sample(FORCES), 0.0, generators())
-    assert torch.equal(state.log_alpha, before)
     assert metrics["ent_coef"].tolist() == pytest.approx([0.2, 0.7])
 
 
@@ -206,3 +205,130 @@ def test_masks_and_a_high_temperature_leave_everything_finite(alpha):
     _, state = learn(replace(config, network=Network((8,))), Masked(4), 40)
     assert state.critic.isfinite().all()
     assert state.params.isfinite().all()
+
+
+# n steps
+
+
+@pytest.mark.parametrize("space", [FORCES, CHOICES], ids=["forces", "choices"])
+def test_the_entropy_between_n_steps_is_part_of_the_target_by_hand(space):
+    algorithm, state = make(space, n_step=3)
+    s, alphas, g = sample(space), [0.2, 0.7], torch.Generator().manual_seed(5)
+    between = torch.randn(P, B, 2, 3, generator=g)
+    counts = torch.tensor([0.9, 0.5]).expand(P, B, 2).clone()
+    counts[:, 1:3, 1] = 0.0  # the steps ended before
+    between[:, 1:3, 1] = math.nan
+    mask = None
+    if space is CHOICES:
+        mask = torch.rand(P, B, 2, 3, generator=g) < 0.5
+        mask[..., 1] = True
+    with_between = replace(
+        s, between_obs=between, between_mask=mask, between_discount=counts, weight=None
+    )
+    alpha = torch.tensor(alphas)[:, None]
+    noise = algorithm.learning_noise(generators(), B, False)
+    views, actor = algorithm.critics.views(state.critic), algorithm.actor(state)
+    inputs = {"vector": s.obs}
+    _, error, _ = algorithm.critic_loss(views, state, with_between, actor, inputs, alpha, noise)
+    extra = torch.zeros(P, B)
+    own = algorithm.layout.views(state.params)
+    for m in range(P):
+        head = line(own, "actor", m, between[m].flatten(0, 1))
+        if space is CHOICES:
+            head = head.masked_fill(~mask[m].flatten(0, 1), -1e9)
+            entropy = Categorical(logits=head.nan_to_num()).entropy()
+        else:
+            chance = generators()[m]
+            torch.randn(B, 2, generator=chance)  # of the next actions
+            _, log_prob = squashed(head.nan_to_num(), chance)
+            entropy = -log_prob.float()
+        extra[m] = alphas[m] * (counts[m] * entropy.view(B, 2)).sum(-1)
+    without = replace(s, reward=s.reward + extra, weight=None)
+    _, expected, _ = algorithm.critic_loss(views, state, without, actor, inputs, alpha, noise)
+    torch.testing.assert_close(error, expected, rtol=1e-4, atol=1e-5)
+
+
+class Nothing(Toy):
+    """No reward, no end: the soft value of acting is α·log 2·γ/(1 − γ)."""
+
+    def play(self, action: Any) -> Any:
+        still = np.zeros((self.num_envs, 1), np.float32)
+        return still, 0.0 * self.ones, self.never, self.never, self.ones
+
+
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_the_soft_value_is_the_same_whatever_the_number_of_steps(n_step):
+    config = SAC(
+        num_envs=8, learning_starts=64, buffer_size=400, batch_size=16, learning_rate=0.1, tau=0.5,
+        gamma=0.5, learn_ent_coef=False, n_step=n_step, network=Network(()), update_ratio=0.25,
+    )  # fmt: skip
+    algorithm, state = learn(config, Nothing(8), 600)
+    views = algorithm.critics.views(state.critic)
+    q = algorithm.critics(views, {"vector": torch.zeros(1, 1, 1)}).mean().item()
+    assert q == pytest.approx(math.log(2), rel=0.01)  # without the steps between 0.099
+
+
+def test_observations_between_are_drawn_only_where_there_are_some():
+    for n_step, sizes in (1, [B, B]), (3, [B, B * 2, B]):
+        algorithm, _ = make(FORCES, n_step=n_step)
+        noise = algorithm.learning_noise(generators(), B, True)
+        assert [x.shape[1] for x in noise] == sizes
+
+
+# Masks
+
+
+def test_fewer_choices_are_to_have_less_entropy():
+    algorithm = SACAlgorithm(LINEAR, Box(-1, 1, (3,)), Discrete(8))
+    mask = torch.zeros(2, 2, 8, dtype=torch.bool)
+    mask[0, 0, :2] = mask[0, 1, :4] = mask[1, :, :1] = True
+    aim, aims = algorithm.entropy_aim(mask).tolist(), 0.5 * math.log(8)
+    assert aim == pytest.approx([0.5 * (math.log(2) + math.log(4)) / 2, 0.0])
+    assert algorithm.entropy_aim(None) == pytest.approx(aims)
+    assert algorithm.entropy_aim(torch.ones_like(mask)).tolist() == pytest.approx([aims] * 2)
+    alone = SACAlgorithm(LINEAR, Box(-1, 1, (3,)), Discrete(1))
+    assert alone.entropy_aim(torch.ones(1, 2, 1, dtype=torch.bool)) == 0.0
+
+
+class TwoOfEight(Toy):
+    """Two of eight actions are allowed; the second of them pays."""
+
+    action_space = Discrete(8)
+
+    def mask(self) -> Any:
+        return np.tile(np.arange(8) < 2, (self.num_envs, 1))
+
+    def play(self, action: Any) -> Any:
+        still = np.zeros((self.num_envs, 1), np.float32)
+        return still, (action == 1) * 1.0, self.t == 1, self.never, self.ones
+
+
+def test_under_a_mask_the_temperature_does_not_grow_without_bound():
+    config = SAC(
+        num_envs=8, learning_starts=64, buffer_size=1000, batch_size=16, learning_rate=5e-2,
+        network=Network(()), update_ratio=0.25,
+    )  # fmt: skip
+    _, state = learn(config, TwoOfEight(8), 1200)
+    # Aimed at is half of log 2; half of log 8, which is more than log 2, was never reached.
+    assert state.log_alpha.exp().item() < 2.0
+
+
+@pytest.mark.parametrize(("space", "aim"), [(CHOICES, 1.2), (FORCES, 1.5)])
+def test_an_entropy_that_no_policy_has_is_refused(space, aim):
+    with pytest.raises(
+        SkillweaveError, match=r"SAC\.target_entropy is .*at most 1\.\d+, the entropy"
+    ):
+        make(space, target_entropy=aim)
+
+
+# Deviations
+
+
+def test_a_collapsed_deviation_comes_back():
+    algorithm, state = make(FORCES)
+    bias = algorithm.layout.views(state.params)["actor.0.bias"]
+    bias[..., 2:] = -9.0
+    for _ in range(10):
+        algorithm.update(state, sample(FORCES), 0.0, generators())
+    # There a deviation costs nothing and entropy pays: every step of Adam is the whole rate.
+    assert bias[..., 2:].flatten().tolist() == pytest.approx([-8.9] * 4, abs=0.01)

@@ -126,6 +126,7 @@ class Kept:
     terminated: bool
     ended: bool
     steps: int
+    rewards: np.ndarray | None = None  # of each step, where members with other γ learn from them
 
 
 @dataclass
@@ -138,6 +139,7 @@ class World:
     ending: float
     longest: int
     masked: float
+    told: bool = False  # the rewards of each step of a call
 
     def __post_init__(self) -> None:
         self.history: list[list[Kept]] = []
@@ -167,9 +169,15 @@ class World:
         true, mask, allowed = self.draw(), self.draw_mask(), self.draw_mask()
         if allowed is not None:
             allowed[~ended] = True if mask is None else mask[~ended]
+        steps, info = rng.integers(1, self.longest + 1, n), {}
+        reward = rng.random(n, dtype=np.float32)
+        if self.told:
+            rewards = rng.random((n, int(steps.max())), dtype=np.float32)
+            info["rewards"] = rewards * (np.arange(rewards.shape[1]) < steps[:, None])
+            reward = info["rewards"] @ np.float32(0.7) ** np.arange(rewards.shape[1])
         step = VecStep(
-            true, np.where(ended[:, None], self.draw(), true), rng.random(n, dtype=np.float32),
-            terminated, truncated, rng.integers(1, self.longest + 1, n), mask, {}, allowed,
+            true, np.where(ended[:, None], self.draw(), true), reward,
+            terminated, truncated, steps, mask, info, allowed,
         )  # fmt: skip
         action = rng.integers(A, size=n)
         self.buffer.add(self.obs, self.mask, action, step)
@@ -182,6 +190,7 @@ class World:
                     step.reward[i], true[i],
                     everything if after is None else after[i],
                     terminated[i], ended[i], step.steps[i],
+                    info["rewards"][i] if self.told else None,
                 )
             )  # fmt: skip
         self.history.append(row)
@@ -198,8 +207,16 @@ class World:
     def expected(self, index: int, n_step: int, gamma: float) -> dict:
         t, column = divmod(index, self.num_envs)
         reward, discount = 0.0, 1.0
-        for kept in [row[column] for row in self.history[t : t + n_step]]:
-            reward += discount * kept.reward
+        between = {"obs": np.zeros((n_step - 1, 2)), "mask": np.ones((n_step - 1, A), bool)}
+        counts = np.zeros(n_step - 1)
+        for k, kept in enumerate(row[column] for row in self.history[t : t + n_step]):
+            if k:
+                between["obs"][k - 1], between["mask"][k - 1] = kept.obs, kept.obs_mask
+                counts[k - 1] = discount
+            own = kept.reward
+            if kept.rewards is not None:
+                own = sum(gamma**i * r for i, r in enumerate(kept.rewards))
+            reward += discount * own
             discount *= gamma**kept.steps
             if kept.ended:
                 break
@@ -208,7 +225,8 @@ class World:
         return {
             "obs": first.obs, "obs_mask": first.obs_mask, "action": first.action,
             "reward": reward, "discount": discount, "next_obs": kept.next_obs,
-            "mask": kept.allowed,
+            "mask": kept.allowed, "between_discount": counts,
+            "between_obs": between["obs"], "between_mask": between["mask"],
         }  # fmt: skip
 
 
@@ -223,21 +241,24 @@ class World:
     masked=st.sampled_from([0.0, 0.5, 1.0]),
     shared=st.booleans(),
     prioritized=st.booleans(),
+    between=st.booleans(),
+    told=st.booleans(),
     plan=st.lists(st.sampled_from("aaaaaaacsu"), min_size=1, max_size=40),
 )
 @settings(max_examples=150, deadline=None)
 def test_samples_equal_a_naive_buffers(
-    seed, members, width, rows, n_step, ending, longest, masked, shared, prioritized, plan
-):
+    seed, members, width, rows, n_step, ending, longest, masked, shared, prioritized, between,
+    told, plan,
+):  # fmt: skip
     n, gamma, rng = members * width, GAMMA[:members], np.random.default_rng(seed)
 
     def make() -> ReplayBuffer:
         return ReplayBuffer(
             rows * n + n - 1, n, members, SPACE, (), np.int64,
-            mask_size=A, shared=shared, n_step=n_step, prioritized=prioritized,
+            mask_size=A, shared=shared, n_step=n_step, prioritized=prioritized, between=between,
         )  # fmt: skip
 
-    world = World(make(), n, rng, ending, longest, masked)
+    world = World(make(), n, rng, ending, longest, masked, told and shared)
     for what in ["a", *plan, "s"]:
         if what == "a":
             world.step()
@@ -270,8 +291,12 @@ def check(world: World, gamma: torch.Tensor, n_step: int, shared: bool, seed: in
             for name, value in expected.items():
                 found = getattr(sample, name)
                 if found is None:
-                    assert "mask" in name
-                    assert value.all()
+                    alone = n_step == 1 or not world.buffer._between
+                    assert "mask" in name or (alone and "between" in name)
+                    assert alone or value.all()
+                elif name in ("between_obs", "between_mask"):  # what counts for nothing is any
+                    counts = expected["between_discount"] > 0.0
+                    np.testing.assert_array_equal(found[p, b][counts], value[counts])
                 else:
                     np.testing.assert_allclose(found[p, b], value, rtol=1e-5)
 
@@ -479,3 +504,59 @@ def test_updating_priorities_of_a_uniform_buffer_does_nothing():
     before = buffer.sample(9, GAMMA[:1], generators(1))
     buffer.update_priorities(before.index, before.reward)
     assert same(before, buffer.sample(9, GAMMA[:1], generators(1)))
+
+
+# Between, and calls that several learn from
+
+
+def test_the_observations_between_n_steps_and_what_rewards_there_count():
+    buffer = line([1, 2, 4, 8, 16], "..t..", n_step=3, steps=[1, 2, 1, 1, 1], between=True)
+    s = buffer.sample(1000, torch.tensor([0.5]), generators(1))
+    found = {
+        int(t): (x[:, 0].tolist(), d.tolist())
+        for t, x, d in zip(s.obs[0, :, 0], s.between_obs[0], s.between_discount[0], strict=True)
+    }
+    assert found[0] == ([1, 2], [0.5, 0.125])  # γ after one step, γ³ after three
+    assert found[1][0][0] == 2
+    assert found[1][1] == [0.25, 0.0]  # the end
+    assert found[2][1] == [0.0, 0.0]
+    assert found[3][1] == [0.5, 0.0]  # nothing newer
+    parts = list(s.split(10))
+    assert parts[1].between_obs.shape == (1, 10, 2, 2)
+    assert torch.equal(parts[1].between_discount, s.between_discount[:, 10:20])
+    assert line([1, 2], n_step=3).sample(2, GAMMA[:1], generators(1)).between_obs is None
+    assert line([1, 2], between=True).sample(2, GAMMA[:1], generators(1)).between_obs is None
+
+
+def shared_calls(capacity: int) -> ReplayBuffer:
+    """Two members; first a step of reward 1 each, then calls of 3 steps that pay 1, 2, 4."""
+    buffer = ReplayBuffer(capacity, 2, 2, SPACE, (), np.int64, mask_size=A, shared=True)
+    obs, never = np.zeros((2, 2), np.float32), np.zeros(2, bool)
+    for rewards in ([[1.0]] * 2, *[[[1.0, 2.0, 4.0]] * 2] * 3):
+        steps, told = np.full(2, len(rewards[0])), {"rewards": np.array(rewards, np.float32)}
+        # Who acted discounted by γ = 0: to them a call paid its first reward alone.
+        step = VecStep(obs, obs, np.ones(2, np.float32), never, never, steps, None, told)
+        buffer.add(obs, None, np.zeros(2), step)
+    return buffer
+
+
+@pytest.mark.parametrize(("capacity", "firsts"), [(8, [1.0]), (4, [])])
+def test_every_learner_discounts_within_a_call_by_its_own_gamma(capacity, firsts):
+    buffer = shared_calls(capacity)
+    for gammas in ([0.5, 0.1], [0.25, 1.0]):  # a mutation may change them at any time
+        s = buffer.sample(200, torch.tensor(gammas), generators(2))
+        for p, g in enumerate(gammas):
+            calls = 1 + 2 * g + 4 * g**2
+            found = sorted({round(r, 5) for r in s.reward[p].tolist()})
+            assert found == pytest.approx(sorted([*firsts, calls]))
+
+
+def test_rewards_of_calls_that_are_gone_take_no_room():
+    buffer = shared_calls(4)
+    never, obs = np.zeros(2, bool), np.zeros((2, 2), np.float32)
+    for i in range(200):
+        told = {"rewards": np.full((2, 1 + i % 7), 0.5, np.float32)}
+        steps = np.full(2, 1 + i % 7)
+        step = VecStep(obs, obs, np.ones(2, np.float32), never, never, steps, None, told)
+        buffer.add(obs, None, np.zeros(2), step)
+    assert len(buffer.state()["rewards"]) == 64

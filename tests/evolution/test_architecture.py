@@ -12,7 +12,8 @@ import torch
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Mutations, Network, SkillweaveError
 from skillweave.evolution.architecture import Change, check_architecture, draw_change, rebuilt
-from skillweave.evolution.stacks import Member
+from skillweave.evolution.stacks import Member, copy, join, split
+from skillweave.ops.optim import adam_
 from skillweave.seeding import Seeds
 
 VECTOR = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
@@ -205,3 +206,65 @@ def test_layer_norm_and_no_layers_are_refused():
             check_architecture(PPO(network=network), Mutations(), "")
     off = Mutations(none=0.4, architecture=0.0)
     check_architecture(PPO(network=Network((8,), layer_norm=True)), off, "")
+
+
+# Adam
+
+
+def pushed(algorithm: Any, state: Any, updates: int) -> None:
+    """Every parameter's gradient is 1."""
+    for f in algorithm.families():
+        mu, nu = (getattr(state, k) for k in f.moments)
+        parts = [x.flatten(1) for x in (getattr(state, f.weights[0]), mu, nu)]
+        for _ in range(updates):
+            count = getattr(state, f.count)
+            adam_(parts[0], torch.ones_like(parts[0]), *parts[1:], count, state.learning_rate)
+
+
+def steady(name: str) -> tuple[Member, Any]:
+    """A member that has felt gradients of 1 for 100,000 steps."""
+    made, spaces = member(name, "relu")
+    for f in made.algorithm(spaces).families():
+        for k, value in zip((*f.moments, f.count), (1, 1, 100_000), strict=True):
+            getattr(made.state, k).fill_(value)
+    return made, spaces
+
+
+@pytest.mark.parametrize("growth", GROWTH)
+@pytest.mark.parametrize("name", KINDS)
+def test_what_is_new_moves_as_far_as_a_fresh_network_would(name, growth):
+    before, spaces = steady(name)
+    grown = rebuilt(before, GROWTH[growth], spaces, np.random.default_rng(0))
+    algorithm, then = grown.algorithm(spaces), copy(grown).state
+    pushed(algorithm, grown.state, 50)
+    for f in algorithm.families():
+        moved = getattr(then, f.weights[0]) - getattr(grown.state, f.weights[0])
+        each = moved / grown.state.learning_rate
+        # A gradient that stays the same moves a parameter by the rate at every step.
+        torch.testing.assert_close(each, torch.full_like(each, 50.0), rtol=0.01, atol=0.0)
+        count = getattr(grown.state, f.count)
+        assert set(count.flatten().tolist()) == {50, 100_050}
+        assert count.dtype == torch.int64
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_in_a_stack_every_parameter_keeps_its_age(name):
+    before, spaces = steady(name)
+    grown = rebuilt(before, GROWTH["units of the last layer"], spaces, np.random.default_rng(0))
+    together = [replace(m, state=copy(m).state) for m in (before, grown)]
+    algorithm, state = join(together, spaces)
+    pushed(algorithm, state, 5)
+    split(algorithm, state, together, spaces)
+    for mine, alone in zip(together, (before, grown), strict=True):
+        pushed(alone.algorithm(spaces), alone.state, 5)
+        for f in fields(alone.state):
+            torch.testing.assert_close(getattr(mine.state, f.name), getattr(alone.state, f.name))
+
+
+def test_ages_that_make_no_difference_any_more_are_one():
+    before, spaces = steady("dqn")
+    grown = rebuilt(before, GROWTH["a layer"], spaces, np.random.default_rng(0))
+    assert grown.state.count.shape == grown.state.params.shape
+    grown.state.count += 40_000
+    split(*join([grown], spaces), [grown], spaces)
+    assert grown.state.count.tolist() == [140_000]

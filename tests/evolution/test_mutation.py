@@ -12,9 +12,10 @@ import torch
 
 from skillweave import DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range, SkillweaveError
 from skillweave.evolution.config import KINDS
-from skillweave.evolution.mutation import check_mutations, mutate, random_config
-from skillweave.evolution.stacks import Member
+from skillweave.evolution.mutation import check_mutations, mutate, random_config, with_settings
+from skillweave.evolution.stacks import Member, join
 from skillweave.seeding import Seeds
+from skillweave.types import Sample
 
 OBS = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
 CHOICE, FORCE = gym.spaces.Discrete(3), gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -179,3 +180,43 @@ def test_random_settings_cover_their_ranges_and_fit_together():
 def test_mutations_that_an_agent_does_not_have_are_refused(config, evolution, said):
     with pytest.raises(SkillweaveError, match=said):
         check_mutations(config, evolution, "phase x: ")
+
+
+# SAC's temperature
+
+
+FIXED = replace(CASES["sac"][0], learn_ent_coef=False, ent_coef=0.05)
+
+
+def test_a_mutated_temperature_is_the_one_that_is_learnt_by():
+    made, spaces = Member(0, FIXED, None), (OBS, FORCE)
+    made.state = made.algorithm(spaces).init([Seeds(3)])
+    by = only("hyperparameters", ranges={"ent_coef": Range(1e-3, 0.5)})
+    child = mutate(made, by, spaces, np.random.default_rng(0))
+    assert child.config.ent_coef != 0.05
+    algorithm, state = join([made, child], spaces)  # they share a stack
+    rows = torch.zeros(2, 4, 5)
+    sample = Sample(
+        rows, torch.zeros(2, 4, 2), torch.zeros(2, 4), torch.zeros(2, 4), rows, None, None, None,
+        np.zeros((2, 4), int),
+    )  # fmt: skip
+    metrics, _ = algorithm.update(state, sample, 0.0, [Seeds(m).torch() for m in range(2)])
+    assert metrics["ent_coef"].tolist() == pytest.approx([0.05, child.config.ent_coef])
+
+
+def test_a_temperature_that_is_learnt_does_not_mutate():
+    learnt = replace(FIXED, learn_ent_coef=True)
+    assert "ent_coef" in Mutations().ranges_of(FIXED)
+    assert "ent_coef" not in Mutations().ranges_of(learnt)
+    by = Evolution(mutations=Mutations(ranges={"ent_coef": Range(1e-3, 0.5)}))
+    check_mutations(FIXED, by, "")
+    with pytest.raises(SkillweaveError, match=r"ent_coef.*learn_ent_coef"):
+        check_mutations(learnt, by, "phase x: ")
+
+
+def test_a_limit_of_gradients_may_be_none_and_may_be_set():
+    made, _ = member("sac")
+    assert made.state.max_grad_norm.tolist() == [float("inf")]
+    assert with_settings(made, max_grad_norm=2.0).state.max_grad_norm.tolist() == [2.0]
+    back = with_settings(with_settings(made, max_grad_norm=2.0), max_grad_norm=None)
+    assert back.state.max_grad_norm.tolist() == [float("inf")]

@@ -11,6 +11,7 @@ from torch.distributions import (
 )
 
 from skillweave.networks.heads import LOG_STD, ActionHead
+from skillweave.ops.distributions import clamp_inward
 from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec
 
@@ -93,6 +94,13 @@ def test_a_deviation_that_depends_on_the_state_stays_in_its_range():
     head = ActionHead(action_codec(Box(-1, 1, (1,))), "state")
     raw = torch.tensor([[[0.0, -9.0], [0.0, 9.0], [0.0, 1.0]]])
     assert head.moments(raw, None)[1].flatten().tolist() == [*LOG_STD, 1.0]
+
+
+def test_a_deviation_out_of_its_range_learns_to_come_back_and_not_to_go_further():
+    x = torch.tensor([-9.0, -9.0, 0.0, 0.0, 9.0, 9.0], requires_grad=True)
+    slope = torch.tensor([-2.0, 2.0, -2.0, 2.0, -2.0, 2.0])  # a step goes against it
+    (clamp_inward(x, -5.0, 2.0) * slope).sum().backward()
+    assert x.grad.tolist() == [-2.0, 0.0, -2.0, 2.0, 0.0, 2.0]
 
 
 @pytest.mark.parametrize("std", ["parameter", "state"])

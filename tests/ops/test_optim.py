@@ -85,3 +85,45 @@ def test_merged_moments_are_those_of_all_data_together(sizes, seed):
     np.testing.assert_allclose(mean, together.mean(1), rtol=1e-9)
     np.testing.assert_allclose(var, together.var(1), rtol=1e-9, atol=1e-12)
     assert count.tolist() == [sum(sizes)] * 2
+
+
+def test_parameters_of_several_ages_move_as_each_would_by_itself():
+    """New units in an old network: fresh moments, so their steps count from their birth."""
+    generator = torch.Generator().manual_seed(0)
+    params, rate = torch.zeros(1, 4), torch.tensor([0.1])
+    mu, nu, count = adam_state(1, 4)
+    count = torch.tensor([[100_000, 0, 100_000, 0]])
+    alone = [p.clone() for p in (params[:, ::2], mu[:, ::2], nu[:, ::2])]
+    fresh = [p.clone() for p in (params[:, 1::2], mu[:, 1::2], nu[:, 1::2])]
+    old, young = torch.tensor([100_000]), torch.tensor([0])
+    for _ in range(30):
+        grad = torch.randn(1, 4, generator=generator)
+        adam_(params, grad, mu, nu, count, rate)
+        adam_(alone[0], grad[:, ::2], *alone[1:], old, rate)
+        adam_(fresh[0], grad[:, 1::2], *fresh[1:], young, rate)
+    torch.testing.assert_close(params[:, ::2], alone[0])
+    torch.testing.assert_close(params[:, 1::2], fresh[0])
+    assert count.tolist() == [[100_030, 30, 100_030, 30]]
+
+
+def test_a_constant_gradient_moves_a_new_parameter_by_the_rate_and_no_further():
+    params, (mu, nu, _) = torch.zeros(1, 1), adam_state(1, 1)
+    count = torch.zeros(1, 1, dtype=torch.int64)
+    for _ in range(50):
+        adam_(params, torch.ones(1, 1), mu, nu, count, torch.ones(1))
+    assert params.item() == pytest.approx(-50.0, rel=0.01)
+
+
+def test_steps_are_counted_beyond_what_a_float_can_count():
+    params, (mu, nu, _) = torch.zeros(1, 2), adam_state(1, 2)
+    count = torch.tensor([1 << 24])
+    for _ in range(3):
+        adam_(params, torch.ones(1, 2), mu, nu, count, torch.ones(1))
+    assert count.tolist() == [(1 << 24) + 3]
+
+
+def test_no_limit_leaves_a_gradient_as_it_is():
+    grad = torch.tensor([[3e5, 4e5], [0.0, 0.0]])
+    norm = clip_grad_norm_(grad, torch.full((2,), float("inf")))
+    assert norm.tolist() == [5e5, 0.0]
+    assert grad.tolist() == [[3e5, 4e5], [0.0, 0.0]]
