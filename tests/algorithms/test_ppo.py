@@ -12,6 +12,7 @@ from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.networks.config import RNN, Network
 from skillweave.ops.returns import gae, normalise
 from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
 from skillweave.training.on_policy import train_on_policy
 from skillweave.types import SkillweaveError, Transition
 
@@ -342,7 +343,7 @@ def test_weights_are_one_unless_what_acted_is_old(asks, rnn, overlap):
     env, config = Echo(B, "vector", asks), replace(CONFIG, network=Network((16,), rnn=rnn))
     config = replace(config, overlap=overlap, learning_rate=1e-2, batch_size=T * B)
     algorithm = Weighed(config, env.observation_space, env.action_space)
-    train_on_policy(algorithm, env, algorithm.init([Seeds(0)]), Seeds(0), 4 * T * B)
+    train_on_policy(algorithm, Collector(env), algorithm.init([Seeds(0)]), Seeds(0), 4 * T * B)
     off = [(w - 1.0).abs().max().item() for w in algorithm.found[:: config.update_epochs]]
     assert len(off) == 4
     assert [x > 1e-3 for x in off] == [False, overlap, overlap, overlap]
