@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -47,9 +46,15 @@ class Family:
     """The field with the optimiser's steps: (P,), or (..., D) where parameters differ in age."""
 
 
+LARGEST = torch.finfo(torch.float32).max
+
+
 def setting_number(value: float | None) -> float:
-    """A setting as it stands in a state, where "no limit" (None) is infinity."""
-    return math.inf if value is None else float(value)
+    """A setting as it stands in a state, where "no limit" (None) is the largest number there is.
+
+    Not infinity: in a state that is not finite something has diverged.
+    """
+    return LARGEST if value is None else float(value)
 
 
 class Algorithm:

@@ -58,7 +58,7 @@ class State:
     learning_rate: Tensor  # (P,); this and all below are settings, one a member
     gamma: Tensor  # (P,)
     tau: Tensor  # (P,)
-    max_grad_norm: Tensor  # (P,), infinity: gradients are not clipped
+    max_grad_norm: Tensor  # (P,)
     ent_coef: Tensor  # (P,), the temperature where it is not learnt
 
 

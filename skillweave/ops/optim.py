@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def clip_grad_norm_(grad: Tensor, max_norm: Tensor) -> Tensor:
-    """Scale each member's gradient (P, D) in place to at most ``max_norm`` (P,), infinity: freely.
+    """Scale each member's gradient (P, D) in place to at most ``max_norm`` (P,).
 
     Returns:
         The norms before clipping, (P,).

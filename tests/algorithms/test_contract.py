@@ -39,6 +39,7 @@ SMALL = Network((32,), "relu")
 BUFFERED: dict[str, Any] = {
     "num_envs": 8, "batch_size": 32, "learning_starts": 64, "buffer_size": 4000,
     "learning_rate": 5e-3, "gamma": 0.5, "tau": 0.05, "network": SMALL,
+    "learning_rate_schedule": "constant", "update_ratio": 1.0,
 }  # fmt: skip
 ON = PPO(
     num_envs=8, n_steps=16, batch_size=32, learning_rate=1e-2, gamma=0.5, ent_coef=0.0,

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from skillweave import DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range, SkillweaveError
+from skillweave.algorithms.base import LARGEST
 from skillweave.evolution.config import KINDS
 from skillweave.evolution.mutation import check_mutations, mutate, random_config, with_settings
 from skillweave.evolution.stacks import Member, join
@@ -216,7 +217,7 @@ def test_a_temperature_that_is_learnt_does_not_mutate():
 
 def test_a_limit_of_gradients_may_be_none_and_may_be_set():
     made, _ = member("sac")
-    assert made.state.max_grad_norm.tolist() == [float("inf")]
+    assert made.state.max_grad_norm.tolist() == [LARGEST]
     assert with_settings(made, max_grad_norm=2.0).state.max_grad_norm.tolist() == [2.0]
     back = with_settings(with_settings(made, max_grad_norm=2.0), max_grad_norm=None)
-    assert back.state.max_grad_norm.tolist() == [float("inf")]
+    assert back.state.max_grad_norm.tolist() == [LARGEST]

@@ -749,3 +749,20 @@ def test_envpool_steps_only_those_whose_calls_go_on(options):
         ends += int(terminated.sum())
     assert different > 10
     assert ends > 3
+
+
+def test_where_gammas_differ_the_reward_of_every_step_of_a_call_is_told(options):
+    gamma = np.linspace(0.5, 1.0, N)
+    env = options(skill_set(*ALL, call_steps=6), gamma=gamma)
+    env.reset(seed=0)
+    for i in range(20):
+        _, reward, _, _, info = env.step(np.full(N, i % len(ALL)))
+        each, steps = info["rewards"], info["steps"]
+        assert each.shape == (N, steps.max())
+        assert not each[np.arange(each.shape[1]) >= steps[:, None]].any()
+        np.testing.assert_allclose(each.sum(1), info["call_return"], rtol=1e-5, atol=1e-6)
+        own = (each * gamma[:, None] ** np.arange(each.shape[1])).sum(1)
+        np.testing.assert_allclose(own, reward, rtol=1e-5, atol=1e-6)
+    alone = options(skill_set(*ALL, call_steps=6), gamma=0.9)
+    alone.reset(seed=0)
+    assert "rewards" not in alone.step(np.zeros(N, int))[-1]

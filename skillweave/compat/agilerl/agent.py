@@ -65,6 +65,7 @@ class Agent:
             if isinstance(setting := getattr(type(self), name, None), Setting):
                 own = setting.native(value) | own
         network = given["net_config"]
+        own["normalize_obs"] = False  # AgileRL does not
         own["network"] = network_of(network, "Tanh" if self.algo == "PPO" else "ReLU")
         seen = observations_of(given["state_dim"], given["one_hot"], network)
         self._wrap(

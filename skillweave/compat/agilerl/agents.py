@@ -145,7 +145,7 @@ class TD3(Agent):
         state.target_noise.fill_(policy_noise)
         state.target_noise_clip.fill_(noise_clip)
         metrics, _ = self.native.learn_sample(self.gamma, *experiences[:5])
-        due = int(state.critic_count[0]) % self.policy_freq == 0
+        due = int(state.updates[0]) % self.policy_freq == 0
         return metrics["policy_loss"] if due else None, metrics["critic_loss"]
 
 
