@@ -241,8 +241,8 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
     if not (path / "run.json").exists():
         return KeyboardInterrupt("nothing was trained yet")
     manifest = RunDirectory.open(path).manifest
-    recipe, hint = manifest["recipe"], ""
-    if manifest["resume_needs_recipe"] and recipe not in recipes.names():
+    recipe, hint = manifest.get("recipe"), ""
+    if manifest.get("resume_needs_recipe", True) and recipe not in recipes.names():
         hint = f" --recipe {recipe or 'FILE.py'}"
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]

@@ -106,6 +106,7 @@ class Record:
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
         entry["final"] = at["metrics"]
         self.run.save()
+        self.run.drop_checkpoints()
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 
@@ -126,8 +127,9 @@ def train_phase(
     probe = Probe(phase.make_env, config.gamma, seeds, every, episodes)
     try:
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
-        found = run.load_checkpoint(algorithm.state_type, phase.name)
-        state, at, extra = found or (algorithm.init([seeds / "member" / 0]), dict(START), {})
+        fresh = algorithm.init([seeds / "member" / 0])
+        found = run.load_checkpoint(algorithm.state_type, phase.name, like=fresh)
+        state, at, extra = found or (fresh, dict(START), {})
         record = Record(phase.name, run, listeners, at)
         probe.start(at["steps"])
 

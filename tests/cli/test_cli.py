@@ -558,9 +558,9 @@ def trap(run: Path, source: Path, recipe: str, **fields: Any) -> Path:
     marker = run.parent / "executed"
     for place in (run / "trap.py", run / "policies" / "trap.py", run / "__init__.py"):
         place.write_text(TRAP.format(marker=str(marker)) + PLAIN)
-    data = json.loads((run / "run.json").read_text())
+    data = read_json(run / "run.json")
     data |= {"recipe": recipe, **fields}
-    (run / "run.json").write_text(json.dumps(data))
+    write_json(run / "run.json", data)  # with the checksum of what it says now
     return marker
 
 

@@ -13,17 +13,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.config import PPO
+from skillweave.algorithms.config import PPO, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.networks.config import Network
-from skillweave.runs.directory import RunDirectory, versions
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import versions
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 
+ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
 PHASES = [
-    {"name": "landing", "status": "training", "budget": 10},
-    {"name": "selector", "status": "waiting", "budget": 10},
+    {"name": "landing", "status": "training", "budget": 10, "algorithm": ALGORITHM},
+    {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM},
 ]
+AT = {"seconds": 1.0, "metrics": {}}
 
 
 def manifest() -> dict[str, Any]:
@@ -70,7 +73,7 @@ def damage(path: Path) -> None:
 
 def save(run: RunDirectory, seed: int, phase: str = "landing") -> Learnt:
     state = learnt(seed)
-    run.save_checkpoint(state, {"phase": phase, "update": seed, "steps": 10 * seed})
+    run.save_checkpoint(state, {"phase": phase, "update": seed, "steps": 10 * seed} | AT)
     return state
 
 
@@ -142,9 +145,9 @@ def test_an_unknown_phase_is_answered_with_those_there_are(run: RunDirectory) ->
 
 
 def test_a_run_is_finished_when_every_phase_is_done(run: RunDirectory) -> None:
-    run.phase("landing")["status"] = "done"
+    run.phase("landing").update(status="done", steps=1, seconds=1.0)
     assert not run.finished
-    run.phase("selector")["status"] = "done"
+    run.phase("selector").update(status="done", steps=1, seconds=1.0)
     assert run.finished
     run.save()
     assert RunDirectory.open(run.path).finished
@@ -228,7 +231,8 @@ def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None
     class Other:
         bias: Tensor
 
-    run.save_checkpoint(Other(torch.zeros(1)), {"phase": "landing"})
+    at = {"phase": "landing", "update": 1, "steps": 1} | AT
+    run.save_checkpoint(Other(torch.zeros(1)), at)
     with pytest.raises(SkillweaveError, match="does not hold a Learnt"):
         run.load_checkpoint(Learnt, "landing")
 
