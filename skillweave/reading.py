@@ -55,13 +55,13 @@ Seconds = Annotated[float, Asked("at least 0", lambda x: x >= 0)]
 """A time."""
 
 
-def shown(value: object) -> str:
+def shown(value: object, most: int = _SHOWN) -> str:
     """A value for a message: its ``repr``, shortened."""
     try:
         text = repr(value)
     except Exception:  # a number of too many digits, or nested too deep
         text = f"a {type(value).__name__}"
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 1]}…"
+    return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 # Files
