@@ -96,7 +96,7 @@ class AgentPolicy(Memoryless):
             digest.update(json.dumps(space_to_json(space), sort_keys=True).encode())
         for name, value in sorted(self.weights.items()):
             digest.update(f"{name}{tuple(value.shape)}".encode())
-            digest.update(value.contiguous().numpy())
+            digest.update(value.reshape(-1).numpy().data)
         return {"sha256": digest.hexdigest()}
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:

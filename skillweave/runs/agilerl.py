@@ -40,7 +40,7 @@ def convert(path: Path, out: Path) -> str:
             AgileRL's, or holds what no native policy computes; the message says what.
     """
     data = read_torch_pickle(path)
-    algo = data.get("algo") if isinstance(data, dict) else None
+    algo: Any = data.get("algo") if isinstance(data, dict) else None
     known = isinstance(algo, str) and algo in _KINDS
     if not known or "actor_state_dict" not in data or "actor_init_dict" not in data:
         raise SkillweaveError(
@@ -128,8 +128,8 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     if kind is not DQN:
         config["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])
     algorithm: Any = make_algorithm(kind(**config), *_spaces(kind, data))
-    own, shapes = "q" if kind is DQN else "actor", algorithm.layout.shapes
-    weights = _named(shapes, own, data["actor_state_dict"])
+    acting, shapes = "q" if kind is DQN else "actor", algorithm.layout.shapes
+    weights = _named(shapes, acting, data["actor_state_dict"])
     if kind is PPO:
         weights |= _named(shapes, "critic", critics[0])
     apart = critics if kind is TD3 else []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from skillweave.reading import fit
-from skillweave.runs.files import move, read_tensors, remove, write_tensors
+from skillweave.runs.files import move, read_header, read_tensors, remove, write_tensors
 from skillweave.runs.manifest import Checkpoint
 from skillweave.types import SkillweaveError
 
@@ -74,7 +74,7 @@ class Checkpoints:
         for path in self._files:
             remove(path)
 
-    def clear(self, done: Collection[str]) -> None:
+    def clear(self, done: Sequence[str]) -> None:
         """Put in order what a killed process left; ``done`` are the phases that need none."""
         fresh, latest, _ = self._files
         if fresh.exists() and not latest.exists():  # killed between two renames: it is whole
@@ -82,5 +82,6 @@ class Checkpoints:
         remove(fresh)
         for path in self._files:
             with suppress(SkillweaveError):  # a damaged one is told when it is needed
-                if path.exists() and read_tensors(path)[1].get("phase") in done:
+                if path.exists() and read_header(path).get("phase") in done:
+                    read_tensors(path)  # not on the word of a damaged header
                     remove(path)

@@ -110,9 +110,8 @@ class RunDirectory:
         for directory in (self.path, self.path / "policies"):
             for path in directory.glob(TEMPORARY):
                 remove(path)
-        self._checkpoints.clear(
-            {p["name"] for p in self.manifest["phases"] if p["status"] == "done"}
-        )
+        done = [p["name"] for p in self.manifest["phases"] if p["status"] == "done"]
+        self._checkpoints.clear(done)
 
     def save(self) -> None:
         """Write ``run.json``."""

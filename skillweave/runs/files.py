@@ -177,11 +177,32 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     """Like ``read_tensors``, and the checksum."""
+    header, tensors = _opened(path, with_tensors=True)
+    told = header.pop("sha256", None)
+    sha256 = _digest(json.dumps(header, sort_keys=True), tensors)
+    if told != sha256:
+        raise SkillweaveError(f"{path} is damaged: its contents do not match its checksum")
+    # Copies: in the file tensors are aligned to 4 bytes only, and matrix products of such differ in
+    # the last bit, so that a resumed run would drift.
+    return {k: v.clone() for k, v in tensors.items()}, header, sha256
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """The header alone, quickly: its checksum is not compared.
+
+    Raises:
+        SkillweaveError: as ``read_tensors``.
+    """
+    return _opened(path, with_tensors=False)[0]
+
+
+def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
     check_file(path)
     try:
         with safetensors.safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+            names = file.keys() if with_tensors else ()
+            tensors = {k: file.get_tensor(k) for k in names}
     except (OSError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise SkillweaveError(f"{path} is damaged (truncated?): {error}") from error
     except safetensors.SafetensorError as error:
@@ -192,13 +213,7 @@ def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     if not isinstance(header, dict):
         raise SkillweaveError(f"{path} was not written by Skillweave: its header is no object")
     check_schema(header, path)
-    told = header.pop("sha256", None)
-    sha256 = _digest(json.dumps(header, sort_keys=True), tensors)
-    if told != sha256:
-        raise SkillweaveError(f"{path} is damaged: its contents do not match its checksum")
-    # Copies: in the file tensors are aligned to 4 bytes only, and matrix products of such differ in
-    # the last bit, so that a resumed run would drift.
-    return {k: v.clone() for k, v in tensors.items()}, header, sha256
+    return header, tensors
 
 
 def _json(path: Path, data: Mapping[str, Any], **how: Any) -> str:
@@ -213,5 +228,5 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
     for name in sorted(tensors):
         digest.update(f"{name}{tensors[name].dtype}{tuple(tensors[name].shape)}".encode())
         # As bytes, so that it may be of a type that NumPy does not know.
-        digest.update(tensors[name].reshape(-1).view(torch.uint8).numpy())
+        digest.update(tensors[name].reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()

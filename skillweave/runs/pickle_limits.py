@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickletools
 import zipfile
+from typing import Any
 
 from skillweave.types import SkillweaveError
 
@@ -43,7 +44,7 @@ def check_program(program: bytes) -> None:
     It is run with the depth of every object in place of the object.
     """
     stack: list[int] = []
-    memo: dict[int, int] = {}
+    memo: dict[Any, int] = {}
     for step, (operation, argument, _) in enumerate(pickletools.genops(program)):
         name, taken = operation.name, operation.stack_before
         if step >= MOST_STEPS:
