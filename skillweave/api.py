@@ -114,6 +114,7 @@ class Hierarchy(Declaration):
     def _go_on(self, run: RunDirectory, quiet: bool, evolve: Evolve) -> Run:
         with ExitStack() as stack:
             stack.callback(run.close)
+            run.begin()
             progress = stack.enter_context(Progress(quiet=quiet))
             trackers = make_trackers(run.manifest.get("track", ()), run)
             for tracker in trackers:

@@ -374,7 +374,7 @@ def phase_of(name: str, save_buffer: bool = True) -> Phase:
 
 def new_run(path: Path, phase: Phase) -> RunDirectory:
     manifest = {
-        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 250, "skills": [],
+        "kind": "flat", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 250, "skills": [],
         "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "phases": [phase.entry()],
     }  # fmt: skip
     return RunDirectory.create(path, manifest)

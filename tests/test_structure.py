@@ -19,12 +19,13 @@ MODULES = sorted(ROOT.rglob("*.py"))
 LONGEST_FILE, LONGEST_FUNCTION = 300, 60
 
 # The table of docs/architecture.md: what a room may import. `seeding` is open to all.
-BASE = {"types"}
+BASE = {"types", "reading"}
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "recipes", "api"}
 ROOMS: dict[str, set[str]] = {
     "seeding": set(),
     "types": set(),
+    "reading": {"types"},
     "ops": BASE,
     "spaces": BASE,
     "skills": BASE | {"spaces"},
@@ -47,10 +48,12 @@ ROOMS: dict[str, set[str]] = {
 # Modules that are stricter than their room: settings, which help and errors read, need no torch.
 LEAVES: dict[str, set[str]] = {
     "networks.config": {"types"},
-    "algorithms.config": {"types", "networks.config", "algorithms.config_off_policy"},
+    "reading": {"types"},
+    "algorithms.config": {"types", "reading", "networks.config", "algorithms.config_off_policy"},
     "algorithms.config_off_policy": {"types", "networks.config"},
     "evolution.config": {
         "types",
+        "reading",
         "networks.config",
         "algorithms.config",
         "algorithms.config_off_policy",

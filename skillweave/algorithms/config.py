@@ -6,7 +6,7 @@ does not import torch, so that ``--help`` and argument errors are instant.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import gymnasium as gym
@@ -23,7 +23,8 @@ from skillweave.algorithms.config_off_policy import (
     positive,
     whole,
 )
-from skillweave.networks.config import CNN, RNN, Network
+from skillweave.networks.config import Network
+from skillweave.reading import fit, shown
 from skillweave.types import SkillweaveError
 
 
@@ -150,40 +151,25 @@ def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
     return {"algorithm": type(config).__name__, **asdict(config)}
 
 
-def config_from_json(data: dict[str, Any]) -> AlgorithmConfig:
+def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConfig:
     """The inverse of ``config_to_json``.
 
+    Args:
+        file: where it was read, for messages.
+        path: the field in it: ``phases[0].algorithm``.
+
     Raises:
-        SkillweaveError: an unknown algorithm or field, named, or a value out of range.
+        SkillweaveError: an unknown algorithm or field, named, or a value of another type or out
+            of range.
     """
-    values = dict(data)
+    values: dict[str, Any] = fit(dict[str, Any], data, file, path)
     kind = values.pop("algorithm", None)
-    if kind not in _KINDS:
-        raise SkillweaveError(f"unknown algorithm {kind!r}; known are: {', '.join(_KINDS)}")
-    for name in ("network", "critic"):
-        if values.get(name) is not None:
-            values[name] = _network_from_json(values[name], f"{kind}.{name}")
-    config: AlgorithmConfig = _made(_KINDS[kind], values, kind)
+    if not isinstance(kind, str) or kind not in _KINDS:
+        where = f"{file}: {path}: " if file else ""
+        known = ", ".join(_KINDS)
+        raise SkillweaveError(f"{where}unknown algorithm {shown(kind)}; known are: {known}")
+    config: AlgorithmConfig = fit(_KINDS[kind], values, file, path or kind)
     return config
-
-
-def _network_from_json(data: dict[str, Any], where: str) -> Network:
-    values = dict(data)
-    for name, kind in (("cnn", CNN), ("rnn", RNN)):
-        if values.get(name) is not None:
-            values[name] = _made(kind, values[name], f"{where}.{name}")
-    network: Network = _made(Network, values, where)
-    return network
-
-
-def _made(kind: Any, values: dict[str, Any], where: str) -> Any:
-    """``kind`` from plain JSON: lists are tuples."""
-    unknown = sorted(set(values) - {f.name for f in fields(kind)})
-    if unknown:
-        raise SkillweaveError(
-            f"{where} has no field {', '.join(unknown)}: made by a newer version?"
-        )
-    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
 __all__ = ["DQN", "PPO", "SAC", "TD3", "AlgorithmConfig", "OffPolicy"]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, NotRequired, TypedDict, TypeVar
 
 import numpy as np
 import torch
@@ -22,9 +25,11 @@ from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.algorithms.sac import SACAlgorithm
 from skillweave.algorithms.td3 import TD3Algorithm
+from skillweave.reading import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless, SkillweaveError
 
+S = TypeVar("S")
 _ALGORITHMS: dict[type, type[Algorithm]] = {
     PPO: PPOAlgorithm,
     DQN: DQNAlgorithm,
@@ -84,6 +89,16 @@ class AgentPolicy(Memoryless):
         memory = {} if after is None else {"rnn": after[0].numpy()}
         return self.algorithm.to_env(action[0].numpy()), memory
 
+    def source(self) -> dict[str, Any]:
+        """The checksum of what it acts by, for a run that it is a skill of."""
+        digest = hashlib.sha256(type(self.algorithm).__name__.encode())
+        for space in (self.observation_space, self.action_space):
+            digest.update(json.dumps(space_to_json(space), sort_keys=True).encode())
+        for name, value in sorted(self.weights.items()):
+            digest.update(f"{name}{tuple(value.shape)}".encode())
+            digest.update(value.reshape(-1).numpy().data)
+        return {"sha256": digest.hexdigest()}
+
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and the JSON that ``from_file`` needs."""
         return self.weights, {
@@ -100,16 +115,70 @@ class AgentPolicy(Memoryless):
         """The inverse of ``to_file``.
 
         Raises:
-            SkillweaveError: tensors are missing or have other shapes than the header says.
+            SkillweaveError: the header is damaged; or tensors are missing, have other shapes or
+                types than the header says, or are not finite.
         """
-        missing = [k for k in ("algorithm", "observation_space", "action_space") if k not in header]
-        if missing:
-            raise SkillweaveError(f"{where} holds no agent: its header has no {', '.join(missing)}")
-        spaces = (space_from_json(header[f"{k}_space"]) for k in ("observation", "action"))
-        algorithm = make_algorithm(config_from_json(header["algorithm"]), *spaces)
-        wanted = algorithm.weight_shapes()
-        for name, shape in wanted.items():
-            if name not in tensors or tuple(tensors[name].shape) != shape:
-                found = tuple(tensors[name].shape) if name in tensors else "nothing"
-                raise SkillweaveError(f"{where}: tensor {name} should be {shape}, found {found}")
-        return cls(algorithm, {name: tensors[name] for name in wanted})
+        fit(AgentHeader, header, where)
+        try:
+            spaces = (space_from_json(header[f"{k}_space"]) for k in ("observation", "action"))
+            config = config_from_json(header["algorithm"], path="algorithm")
+            algorithm = make_algorithm(config, *spaces)
+        except SkillweaveError as error:
+            raise SkillweaveError(f"{where}: {error}") from error
+        weights = {
+            name: checked_tensor(tensors, name, shape, torch.float32, where)
+            for name, shape in algorithm.weight_shapes().items()
+        }
+        for name, value in weights.items():
+            if not value.isfinite().all():
+                raise SkillweaveError(
+                    f"{where}: tensor {name} holds NaN or infinity: what was trained had diverged, "
+                    "or the file was altered"
+                )
+        return cls(algorithm, weights)
+
+
+class AgentHeader(TypedDict):
+    """What a policy's file says of it."""
+
+    algorithm: dict[str, Any]
+    observation_space: dict[str, Any]
+    action_space: dict[str, Any]
+    kind: NotRequired[str]
+    run: NotRequired[str]
+    """The run that it was trained in."""
+    phase: NotRequired[str]
+    env: NotRequired[str]
+    env_kwargs: NotRequired[dict[str, Any]]
+    recipe: NotRequired[str | None]
+    about: NotRequired[dict[str, Any]]
+
+
+def checked_tensor(
+    tensors: Mapping[str, Tensor], name: str, shape: tuple[int, ...], dtype: torch.dtype, where: str
+) -> Tensor:
+    """A tensor by name.
+
+    Raises:
+        SkillweaveError: it is missing, or has another shape or type.
+    """
+    found = tensors.get(name)
+    if found is None or tuple(found.shape) != shape:
+        what = "nothing" if found is None else tuple(found.shape)
+        raise SkillweaveError(f"{where}: tensor {name} should be {shape}, found {what}")
+    if found.dtype != dtype:
+        raise SkillweaveError(f"{where}: tensor {name} should hold {dtype}, found {found.dtype}")
+    return found
+
+
+def state_from(tensors: Mapping[str, Tensor], like: S, where: str) -> S:
+    """The state that ``tensors`` hold by field, if it is of the shapes and types of ``like``.
+
+    Raises:
+        SkillweaveError: it is not; the tensor is named.
+    """
+    found = {
+        name: checked_tensor(tensors, name, tuple(value.shape), value.dtype, where)
+        for name, value in vars(like).items()
+    }
+    return type(like)(**found)

@@ -12,6 +12,7 @@ from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.hierarchy.settings import apply_settings, list_settings
+from skillweave.hierarchy.weights import open_weights
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.agilerl import convert
 from skillweave.runs.directory import RunDirectory
@@ -181,7 +182,7 @@ def _target(command: commands.Watched) -> Run:
     if path.is_dir():
         return _hierarchy_of_run(path, command.recipe).load(path)
     if path.suffix == ".safetensors":
-        header = read_tensors(path)[1]
+        header = open_weights(path)[1]
         if header.get("kind") == "agent" and "env" in header:
             return Hierarchy.from_manifest(header | {"kind": "flat"}).load_weights(path)
         recipe = command.recipe or header.get("recipe")
@@ -241,8 +242,8 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
     if not (path / "run.json").exists():
         return KeyboardInterrupt("nothing was trained yet")
     manifest = RunDirectory.open(path).manifest
-    recipe, hint = manifest["recipe"], ""
-    if manifest["resume_needs_recipe"] and recipe not in recipes.names():
+    recipe, hint = manifest.get("recipe"), ""
+    if manifest.get("resume_needs_recipe", True) and recipe not in recipes.names():
         hint = f" --recipe {recipe or 'FILE.py'}"
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]

@@ -122,9 +122,12 @@ class EnvPoolEngine:
     def restore(self, state: dict[str, Array]) -> Array:
         """Play everything again; the observations (N, *obs_shape) that this led to."""
         self._seeds = [int(seed) for seed in state["seeds"]]
-        self._pools = [self.make_pool(seed) for seed in self._seeds]
         self._place = state["place"].copy()
+        wrong = self._place.shape != (self.num_envs,) or not 0 < len(self._seeds) < 3
+        if wrong or not ((self._place >= 0) & (self._place < len(self._seeds))).all():
+            raise ValueError("environments are said to be in pools that there are not")
         self._history.load(state)
+        self._pools = [self.make_pool(seed) for seed in self._seeds]
         obs = np.array(self._begin(self._all))
         for begins, ids, action in self._history.play():
             if len(begins):

@@ -74,12 +74,22 @@ class History:
         }
 
     def load(self, state: dict[str, Array]) -> None:
-        """The inverse of ``state``."""
-        self.length = state["length"].astype(np.int64)
+        """The inverse of ``state``.
+
+        Raises:
+            ValueError: it is not the history of so many environments.
+        """
+        length, begins = state["length"], state["begins"]
+        fits = length.shape == self.length.shape and length.dtype.kind == "i"
+        if not fits or length.min(initial=0) < 0 or length.sum() != len(state["action"]):
+            raise ValueError("lengths and actions of the history do not belong together")
+        if begins.shape[1:] != (2,) or (begins < 0).any() or (begins[:, 0] > length.max()).any():
+            raise ValueError("the history's episodes begin where nothing was done")
+        self.length = length.astype(np.int64)
         longest = int(self.length.max(initial=0))
         capacity = max(64, 1 << (longest + 1).bit_length())
         self._action = np.zeros((capacity, *self._action.shape[1:]), self._action.dtype)
         self._begins = np.zeros((capacity, len(self.length)), bool)
         done = np.arange(longest)[:, None] < self.length
         self._action[:longest][done] = state["action"]
-        self._begins[tuple(state["begins"].T)] = True
+        self._begins[tuple(begins.T)] = True

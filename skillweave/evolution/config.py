@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.config_off_policy import check, number, one_of, whole
 from skillweave.networks.config import Activation
+from skillweave.reading import fit
 from skillweave.types import SkillweaveError
 
 Scale = Literal["linear", "log", "complement"]
@@ -240,23 +241,25 @@ def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = No
     """The inverse of ``evolution_to_json``; ``selection``: the user's own, which is not in it.
 
     Raises:
-        SkillweaveError: an unknown field or a value out of range, or the selection is missing.
+        SkillweaveError: an unknown field, a value of another type or out of range, or the
+            selection is missing.
     """
-    try:
-        values, mutations = dict(data), dict(data["mutations"])
-        chosen = dict(values["selection"])
-        kind = chosen.pop("kind")
-        known: dict[str, Any] = {"Tournament": Tournament, "Truncation": Truncation}
-        if kind not in known and type(selection).__name__ != kind:
-            raise SkillweaveError(
-                f"{where} evolves by a selection of your own, {kind}; give it: "
-                f"resume(..., evolve=Evolution(selection={kind}(), ...))"
-            )
-        values["selection"] = known[kind](**chosen) if kind in known else selection
-        if mutations["ranges"] is not None:
-            mutations["ranges"] = {k: Range(**r) for k, r in mutations["ranges"].items()}
-        mutations = {k: tuple(v) if isinstance(v, list) else v for k, v in mutations.items()}
-        values["mutations"] = Mutations(**mutations)
-        return Evolution(**values)
-    except (KeyError, TypeError) as error:
-        raise SkillweaveError(f"{where}: its evolution is damaged, or newer: {error}") from error
+    values: dict[str, Any] = fit(dict[str, Any], data, where, "evolution")
+    chosen: dict[str, Any] = fit(_Selection, values.get("selection"), where, "evolution.selection")
+    kind = chosen.pop("kind")
+    known: dict[str, Any] = {"Tournament": Tournament, "Truncation": Truncation}
+    if kind not in known and type(selection).__name__ != kind:
+        raise SkillweaveError(
+            f"{where} evolves by a selection of your own, {kind[:60]}; give it: "
+            f"resume(..., evolve=Evolution(selection={kind[:60]}(), ...))"
+        )
+    if kind in known:
+        selection = fit(known[kind], chosen, where, "evolution.selection")
+    evolution: Evolution = fit(Evolution, values | {"selection": selection}, where, "evolution")
+    return evolution
+
+
+class _Selection(TypedDict):
+    """How a selection begins in JSON; the rest are its settings."""
+
+    kind: str

@@ -7,14 +7,14 @@ A generation is one piece: a run that was killed goes on from the last complete 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from skillweave.algorithms.config import config_from_json, config_to_json
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.lineage import lineage_of, settings_of
 from skillweave.evolution.population import Population, score
@@ -253,8 +253,10 @@ class _Evolving:
         members = []
         for i, told in enumerate(at["members"]):
             member = _member_from_json(told)
-            kind: Any = make_algorithm(member.config, *self.spaces).state_type
-            member.state = kind(**{f.name: tensors[f"{i}.{f.name}"] for f in fields(kind)})
+            fresh = make_algorithm(member.config, *self.spaces).init([self.seeds])
+            member.state = state_from(
+                unprefixed(str(i), tensors), fresh, f"{self.run.path}: member {i}"
+            )
             members.append(member)
         self.population = Population(
             members, self.evolution, self.phase.make_env, self.spaces, self.seeds

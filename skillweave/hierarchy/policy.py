@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from typing import Any
+
 import numpy as np
 
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.skills import apply_reflexes
+from skillweave.skills.foreign import checksum, source_of
 from skillweave.types import Array, Memory, Policy, Step
 
 _SELECTOR = "selector."
@@ -22,6 +26,19 @@ class HierarchyPolicy:
         self.observation_space = selector.observation_space
         self.action_space = skills.policies[0].action_space
         self.labels = tuple(s.name for s in skills.skills)
+
+    def source(self) -> dict[str, Any]:
+        """The checksum of all that it acts by, for a run that it is a skill of.
+
+        Of the user's code (termination, reflexes) the names alone are in it.
+        """
+        told = self.skills
+        parts = [source_of(policy) for policy in (self.selector, *told.policies)]
+        acts = [[part["kind"], part.get("sha256")] for part in parts]
+        skills = [[s.name, s.max_steps] for s in told.skills]
+        reflexes = [r.name for r in told.reflexes]
+        whole = json.dumps([acts, skills, reflexes, told.call_steps, told.greedy])
+        return {"sha256": checksum(whole.encode())}
 
     def start(self, n: int) -> Memory:
         """Memory of n environments that wait for their first decision."""

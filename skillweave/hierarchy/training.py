@@ -10,6 +10,7 @@ from skillweave.envs.skill_env import SkillEnv
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
@@ -106,7 +107,9 @@ def load(declaration: Declaration, run: RunDirectory) -> Policy:
     ready = _ready(declaration, run)
     names = [s.name for s in declaration.skills]
     policies = [ready[n] if n in ready else run.load_policy(n) for n in names]
-    return HierarchyPolicy(run.load_policy("selector"), declaration.skill_set(policies))
+    selector = run.load_policy("selector")
+    check_parts(declaration, policies, selector, str(run.path))
+    return HierarchyPolicy(selector, declaration.skill_set(policies))
 
 
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:

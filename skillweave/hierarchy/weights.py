@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
+import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.reading import Positive, fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.skills.foreign import Foreign, as_recorded, source_of
+from skillweave.skills.foreign import Foreign, Source, as_recorded, source_of
+from skillweave.spaces import same_space
 from skillweave.types import Policy, SkillweaveError
 
 
@@ -54,27 +58,57 @@ def write_weights(path: Path, declaration: Declaration, policy: Policy, recipe: 
     write_tensors(path, tensors, header)
 
 
+class HierarchyHeader(TypedDict):
+    """What the file of a hierarchy's weights says of them."""
+
+    kind: str
+    env: str
+    env_kwargs: NotRequired[dict[str, Any]]
+    recipe: NotRequired[str | None]
+    skills: list[str]
+    call_steps: Positive | None
+    greedy_skills: bool
+    parts: dict[str, dict[str, Any]]
+    ready: NotRequired[dict[str, Source]]
+
+
+def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and header of a file of a hierarchy's weights, or of a flat agent's.
+
+    Raises:
+        SkillweaveError: the file is damaged, or holds something else.
+    """
+    tensors, header = read_tensors(path)
+    if header.get("kind") == "agent" and "algorithm" in header:
+        fit(AgentHeader, header, str(path))
+        if header.get("phase") == "selector":
+            raise SkillweaveError(
+                f"{path} holds a selector alone, which chooses skills and no actions; write the "
+                "whole hierarchy's weights: skillweave weights RUN"
+            )
+        return tensors, header
+    if header.get("kind") != "hierarchy":
+        raise SkillweaveError(f"{path} holds a {header.get('kind')}, not a hierarchy")
+    fit(HierarchyHeader, header, str(path))
+    return tensors, header
+
+
 def read_weights(declaration: Declaration, path: Path) -> Policy:
     """The inverse of ``write_weights``; the declaration takes over the file's call length.
 
     Raises:
         SkillweaveError: the file is damaged, or belongs to other skills or another environment.
     """
-    tensors, header = read_tensors(path)
+    tensors, header = open_weights(path)
     names = [s.name for s in declaration.skills]
-    if header.get("kind") == "agent" and "algorithm" in header:
+    if header["kind"] == "agent":
         return AgentPolicy.from_file(tensors, header, str(path))
-    if header.get("kind") != "hierarchy":
-        raise SkillweaveError(f"{path} holds a {header.get('kind')}, not a hierarchy")
     if header["skills"] != names or header["env"] != declaration.spec.name:
+        theirs = ", ".join(header["skills"])
         raise SkillweaveError(
-            f"{path} is of skills {', '.join(header['skills'])} on {header['env']}, but the "
+            f"{path} is of skills {theirs[:300]} on {header['env'][:100]}, but the "
             f"hierarchy has {', '.join(names)} on {declaration.spec.name}"
         )
-    declaration.call_steps, declaration.greedy_skills = (
-        header["call_steps"],
-        header["greedy_skills"],
-    )
 
     def part(name: str) -> AgentPolicy:
         own = {k.split("/", 1)[1]: v for k, v in tensors.items() if k.split("/", 1)[0] == name}
@@ -84,7 +118,7 @@ def read_weights(declaration: Declaration, path: Path) -> Policy:
 
     def copied(name: str) -> bytes | None:
         content = tensors.get(f"{name}/content")
-        return None if content is None else content.numpy().tobytes()
+        return None if content is None else content.contiguous().numpy().tobytes()
 
     policies: list[Policy] = []
     ready, recorded = declaration.ready_policies(), header.get("ready", {})
@@ -94,4 +128,30 @@ def read_weights(declaration: Declaration, path: Path) -> Policy:
             policies.append(as_recorded(ready[name], recorded.get(name), read, where))
         else:
             policies.append(part(name))
-    return HierarchyPolicy(part("selector"), declaration.skill_set(policies))
+    selector = part("selector")
+    check_parts(declaration, policies, selector, str(path))
+    declaration.call_steps = header["call_steps"]
+    declaration.greedy_skills = header["greedy_skills"]
+    return HierarchyPolicy(selector, declaration.skill_set(policies))
+
+
+def check_parts(
+    declaration: Declaration, policies: Sequence[Policy], selector: Policy, where: str
+) -> None:
+    """Raise a SkillweaveError where a policy is not of the spaces that its place asks for.
+
+    The selector chooses among the skills; they all see and do what the first of them does.
+    """
+    first = policies[0]
+    wanted = {"observation_space": first.observation_space, "action_space": first.action_space}
+    places = {s.name: (p, wanted) for s, p in zip(declaration.skills, policies, strict=True)}
+    choices = gym.spaces.Discrete(len(policies))
+    places["selector"] = selector, wanted | {"action_space": choices}
+    for name, (policy, spaces) in places.items():
+        for kind, space in spaces.items():
+            found = getattr(policy, kind)
+            if not same_space(found, space):
+                raise SkillweaveError(
+                    f"{where}: the policy in the place of {name!r} has {kind} {shown(found)}, but "
+                    f"{shown(space)} belongs there"
+                )

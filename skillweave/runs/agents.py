@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.policy import AgentPolicy, state_from
+from skillweave.reading import check_file
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
@@ -29,6 +29,7 @@ def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str
     Raises:
         SkillweaveError: the file is missing, damaged, a pickle, or holds no agent.
     """
+    check_file(Path(path))
     if zipfile.is_zipfile(path):
         raise SkillweaveError(
             f"{path} is a pickle of torch.save's, and a pickle can run code. If it is a checkpoint "
@@ -39,7 +40,7 @@ def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str
     algorithm = AgentPolicy.from_file(tensors, header, str(path)).algorithm
     state = algorithm.init([seeds])
     algorithm.set_weights(state, tensors)
-    for f in fields(state):
-        if f"state.{f.name}" in tensors:
-            setattr(state, f.name, tensors[f"state.{f.name}"])
+    saved = {k[len("state.") :]: v for k, v in tensors.items() if k.startswith("state.")}
+    if saved:
+        state = state_from(vars(state) | saved, state, str(path))
     return algorithm, state, header.get("about", {})

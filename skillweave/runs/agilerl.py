@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import gymnasium as gym
 import numpy as np
+import torch
 from torch import Tensor
 
 from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
+from skillweave.reading import Asked, Positive, fit, shown
 from skillweave.runs.agents import save_agent
 from skillweave.runs.pickles import read_torch_pickle
 from skillweave.seeding import Seeds
@@ -37,12 +40,14 @@ def convert(path: Path, out: Path) -> str:
             AgileRL's, or holds what no native policy computes; the message says what.
     """
     data = read_torch_pickle(path)
-    algo = data.get("algo") if isinstance(data, dict) else None
-    if algo not in _KINDS or "actor_state_dict" not in data or "actor_init_dict" not in data:
+    algo: Any = data.get("algo") if isinstance(data, dict) else None
+    known = isinstance(algo, str) and algo in _KINDS
+    if not known or "actor_state_dict" not in data or "actor_init_dict" not in data:
         raise SkillweaveError(
-            f"{path} holds no agent that can be converted (algorithm {algo!r}): it must be a "
+            f"{path} holds no agent that can be converted (algorithm {shown(algo)}): it must be a "
             f"checkpoint of AgileRL 0.1 or 1.0 of {', '.join(_KINDS)}"
         )
+    fit(_Checkpoint, data, str(path))
     init = data["actor_init_dict"]
     output = init.get("mlp_output_activation")
     if "num_inputs" not in init or output != _OUTPUTS[algo]:
@@ -53,15 +58,56 @@ def convert(path: Path, out: Path) -> str:
         )
     try:
         algorithm, state = _agent(algo, data)
+        past = {k: [float(x) for x in data.get(k, ())] for k in ("scores", "fitness")}
+        steps = [int(x) for x in data.get("steps", (0,))]
     except SkillweaveError as error:
         raise SkillweaveError(f"{path}: {error}") from error
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise SkillweaveError(f"{path}: its networks are not as it describes: {error!r}") from error
-    past = {k: [float(x) for x in data.get(k, ())] for k in ("scores", "fitness")}
-    steps = [int(x) for x in data.get("steps", (0,))]
-    about = {"algo": algo, **past, "steps": steps, "index": int(data.get("index", 0)), "mut": None}
+    except (LookupError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
+        told = f"{type(error).__name__}: {str(error)[:300]}"
+        raise SkillweaveError(f"{path}: its networks are not as it describes: {told}") from error
+    about = {"algo": algo, **past, "steps": steps, "index": data.get("index", 0), "mut": None}
     save_agent(out, algorithm, state, about)
     return str(algo)
+
+
+_MOST_UNITS = 10**6
+_Units = Annotated[int, Asked("between 1 and a million", lambda n: 1 <= n <= _MOST_UNITS)]
+
+
+def _is_size(data: Any) -> bool:
+    sizes = data if isinstance(data, list | tuple) else [data]
+    return all(type(n) is int and n >= 1 for n in sizes) and math.prod(sizes) <= _MOST_UNITS
+
+
+class _Init(TypedDict):
+    """How AgileRL says what an MLP is made of."""
+
+    num_inputs: NotRequired[Annotated[Any, Asked("sizes, a million in all at most", _is_size)]]
+    num_outputs: NotRequired[_Units]
+    hidden_size: NotRequired[list[_Units]]
+    mlp_output_activation: NotRequired[str | None]
+
+
+class _Checkpoint(TypedDict):
+    """What is read of a checkpoint, besides settings of the same name as ours."""
+
+    actor_init_dict: _Init
+    actor_state_dict: dict[str, Any]
+    critic_init_dict: NotRequired[_Init]
+    critic_state_dict: NotRequired[dict[str, Any]]
+    critic_1_init_dict: NotRequired[_Init]
+    critic_1_state_dict: NotRequired[dict[str, Any]]
+    critic_2_state_dict: NotRequired[dict[str, Any]]
+    one_hot: NotRequired[bool | None]
+    scores: NotRequired[list[float]]
+    fitness: NotRequired[list[float]]
+    steps: NotRequired[list[float]]
+    index: NotRequired[int]
+    lr: NotRequired[float]
+    lr_actor: NotRequired[float]
+    lr_critic: NotRequired[float]
+    learn_step: NotRequired[Positive]
+    policy_freq: NotRequired[Positive]
 
 
 def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -83,16 +129,19 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     if kind is not DQN:
         config["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])
     algorithm: Any = make_algorithm(kind(**config), *_spaces(kind, data))
-    state = algorithm.init([Seeds(0)])
-    views = algorithm.layout.views(state.params)
-    _fill(views, "q" if kind is DQN else "actor", data["actor_state_dict"])
+    acting, shapes = "q" if kind is DQN else "actor", algorithm.layout.shapes
+    weights = _named(shapes, acting, data["actor_state_dict"])
     if kind is PPO:
-        _fill(views, "critic", critics[0])
-    else:
+        weights |= _named(shapes, "critic", critics[0])
+    apart = critics if kind is TD3 else []
+    valued = [_named(algorithm.critics.layout.shapes, "critic", critic) for critic in apart]
+    state = algorithm.init([Seeds(0)])  # only now: what is described is as large as what is there
+    _fill(algorithm.layout.views(state.params), weights)
+    if kind is not PPO:
         state.target.copy_(state.params)
-    for i, critic in enumerate(critics if kind is TD3 else ()):
+    for i, named in enumerate(valued):
         for flat in (state.critic, state.critic_target):
-            _fill(algorithm.critics.layout.views(flat[:, i]), "critic", critic)
+            _fill(algorithm.critics.layout.views(flat[:, i]), named)
     return algorithm, state
 
 
@@ -136,8 +185,8 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
     known = described.get("arch") in ("mlp", "cnn") and name in ACTIVATIONS
     if not known or "hidden_size" not in described:
         raise SkillweaveError(
-            f"a network is described by {dict(described)}; it must have a hidden_size, arch be "
-            f"'mlp' or 'cnn', and its activation be one of {', '.join(ACTIVATIONS)}"
+            f"a network is described by {shown(dict(described), 500)}; it must have a hidden_size, "
+            f"arch be 'mlp' or 'cnn', and its activation be one of {', '.join(ACTIVATIONS)}"
         )
     sizes = [tuple(described.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
     cnn, hidden = CNN("plain", *sizes) if sizes[0] else None, described["hidden_size"]
@@ -145,20 +194,42 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
     return Network(tuple(int(n) for n in hidden), activation, layer_norm, cnn)  # type: ignore[arg-type]
 
 
-def _fill(views: Views, prefix: str, weights: Mapping[str, Tensor]) -> None:
-    """Write a state dict into the views of one network, all of it."""
-    left = {k for k in views if k.startswith(f"{prefix}.")}
-    depth = max(int(k.split(".")[1]) for k in left)
+def _named(
+    shapes: Mapping[str, tuple[int, ...]], prefix: str, weights: Mapping[str, Any]
+) -> dict[str, Tensor]:
+    """A state dict under the names and in the shapes of one of our networks, all of it.
+
+    Raises:
+        SkillweaveError: a weight is missing, unknown, of another shape, or not finite.
+    """
+    wanted = {k: shape for k, shape in shapes.items() if k.startswith(f"{prefix}.")}
+    depth = max(int(k.split(".")[1]) for k in wanted)
+    named: dict[str, Tensor] = {}
     for key, value in weights.items():
-        if (found := _LAYER.search(key)) is None:
-            raise ValueError(f"unknown weights {key}")
+        told = f"{prefix}_state_dict: {key[:100]}"
+        if (found := _LAYER.search(key)) is None or not isinstance(value, Tensor):
+            raise SkillweaveError(f"{told} is no weights of an MLP: unknown weights {key[:100]}")
         layer, number, what = found.groups()
+        matrix = layer == "linear_layer" and what == "weight"
         name = f"norm_{what}" if layer == "layer_norm" else what
-        name = f"{prefix}.{depth if number == 'output' else number}.{name}"
-        value = value.t() if layer == "linear_layer" else value
-        if views[name][0].numel() != value.numel():
-            raise ValueError(f"{key} has the shape {tuple(value.shape)}")
-        views[name].copy_(value.reshape(views[name].shape))
-        left.discard(name)
-    if left:
-        raise ValueError(f"no weights for {', '.join(sorted(left))}")
+        name = f"{prefix}.{depth if number == 'output' else int(number)}.{name}"
+        if name not in wanted or name in named:
+            raise SkillweaveError(f"{told} belongs to no layer that is described")
+        # Stored as torch has it: (out, in), where ours is (in, out).
+        asked = wanted[name][::-1] if matrix else wanted[name][-1:]
+        if tuple(value.shape) != asked:
+            raise SkillweaveError(
+                f"{told} has the shape {tuple(value.shape)}, but {asked} is described"
+            )
+        value = value.to(torch.float32) if value.is_floating_point() else value
+        if value.dtype != torch.float32 or not value.isfinite().all():
+            raise SkillweaveError(f"{told} holds NaN, infinity, or no real numbers")
+        named[name] = (value.t() if matrix else value).reshape(wanted[name])
+    if left := sorted(set(wanted) - set(named)):
+        raise SkillweaveError(f"there are no weights for {', '.join(left)}")
+    return named
+
+
+def _fill(views: Views, weights: Mapping[str, Tensor]) -> None:
+    for name, value in weights.items():
+        views[name][0].copy_(value)

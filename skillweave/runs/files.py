@@ -6,22 +6,28 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import safetensors
 import safetensors.torch
+import torch
 from torch import Tensor
 
+from skillweave.reading import check_file, parse_json, read_file, shown
 from skillweave.types import SkillweaveError
 
 SCHEMA = 1
 """Version of everything written here; readers refuse newer ones."""
+TEMPORARY = ".*.tmp"
+"""What files are named while they are written; only a killed process leaves some behind."""
+LARGEST_JSON = 16 * 2**20
+"""Bytes of a JSON file."""
 
 
-def write_bytes(path: Path, data: bytes) -> None:
+def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> None:
     """Replace ``path`` by ``data``, or leave it exactly as it was.
 
     Raises:
@@ -29,103 +35,191 @@ def write_bytes(path: Path, data: bytes) -> None:
     """
     temporary = ""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        if make_directories:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(".tmp", f".{path.name}.", path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+        _sync(path.parent)
     except BaseException as error:
         if temporary:
             with suppress(OSError):
                 os.unlink(temporary)
         if isinstance(error, OSError):
-            raise SkillweaveError(
-                f"could not write {path}: {error.strerror or error}. What was saved before "
-                "is intact"
-            ) from error
+            raise _unwritten(path, error) from error
         raise
 
 
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Replace a JSON file; ``schema`` is added."""
-    text = _json(path, {"schema": SCHEMA, **data}, indent=2)
-    write_bytes(path, text.encode() + b"\n")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file written by ``write_json``.
+def move(source: Path, target: Path) -> None:
+    """Give a file another name, in place of what has that name.
 
     Raises:
-        SkillweaveError: missing, damaged, or of a newer schema.
+        SkillweaveError: the disk is full or cannot be written; both are as they were.
     """
     try:
-        data = json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise SkillweaveError(f"{path} does not exist") from error
-    except (OSError, ValueError) as error:
-        raise SkillweaveError(f"{path} is damaged: {error}") from error
+        os.replace(source, target)
+        _sync(target.parent)
+    except OSError as error:
+        raise _unwritten(target, error) from error
+
+
+def remove(path: Path) -> None:
+    """Delete a file, if it is there.
+
+    Raises:
+        SkillweaveError: it cannot be deleted.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise SkillweaveError(f"could not delete {path}: {error.strerror or error}") from error
+
+
+def _unwritten(path: Path, error: OSError) -> SkillweaveError:
+    if isinstance(error, FileNotFoundError):
+        return SkillweaveError(
+            f"could not write {path}: its directory is not there any more; was it deleted or moved?"
+        )
+    return SkillweaveError(
+        f"could not write {path}: {error.strerror or error}. What was saved before is intact"
+    )
+
+
+def _sync(directory: Path) -> None:
+    """See that a new name is on the disk, too, before anything older is deleted."""
+    with suppress(OSError):  # not every system can
+        handle = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def write_json(path: Path, data: Mapping[str, Any], *, make_directories: bool = True) -> None:
+    """Replace a JSON file; ``schema`` and a checksum of it all are added."""
+    plain = json.loads(_json(path, {"schema": SCHEMA, **data}))
+    text = _json(path, plain | {"sha256": _json_digest(plain)}, indent=2)
+    write_bytes(path, text.encode() + b"\n", make_directories=make_directories)
+
+
+def read_json(
+    path: Path, check: Callable[[dict[str, Any]], object] | None = None
+) -> dict[str, Any]:
+    """A JSON file written by ``write_json``, without its checksum.
+
+    Args:
+        check: looks at the content before the checksum does, for an error that says more.
+
+    Raises:
+        SkillweaveError: missing, damaged, altered, no plain file, or of a newer schema.
+    """
+    data = parse_json(read_file(path, LARGEST_JSON), path)
     if not isinstance(data, dict):
         raise SkillweaveError(f"{path} is damaged: not a JSON object")
     check_schema(data, path)
+    if check is not None:
+        check(data)
+    found = data.pop("sha256", None)
+    if found is not None and found != _json_digest(data):  # files of older versions have none
+        raise SkillweaveError(
+            f"{path} is damaged: its contents do not match its checksum (edited by hand?)"
+        )
     return data
+
+
+def _json_digest(data: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def check_schema(data: Mapping[str, Any], where: Path | str) -> None:
     """Raise a SkillweaveError where ``data`` comes from a newer Skillweave."""
     found = data.get("schema")
-    if not isinstance(found, int):
+    if type(found) is not int:
         raise SkillweaveError(f"{where} was not written by Skillweave: it has no schema number")
     if found > SCHEMA:
         raise SkillweaveError(
-            f"{where} has schema {found}; this Skillweave reads up to {SCHEMA}. Upgrade skillweave"
+            f"{where} has schema {shown(found)}; this Skillweave reads up to {SCHEMA}. Upgrade "
+            "skillweave"
         )
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Replace a safetensors file; ``header`` is JSON, a checksum covers both."""
+def write_tensors(
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    header: Mapping[str, Any],
+    *,
+    make_directories: bool = True,
+) -> str:
+    """Replace a safetensors file; ``header`` is JSON, a checksum covers both and is returned."""
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     whole = {"schema": SCHEMA, **header}
     whole["sha256"] = _digest(_json(path, whole, sort_keys=True), plain)
     # One key only: safetensors writes several in random order, and equal runs make equal files.
     metadata = {"skillweave": _json(path, whole, sort_keys=True)}
-    write_bytes(path, safetensors.torch.save(plain, metadata))
+    content = safetensors.torch.save(plain, metadata)
+    write_bytes(path, content, make_directories=make_directories)
+    return str(whole["sha256"])
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and header written by ``write_tensors``.
 
     Raises:
-        SkillweaveError: missing, truncated, altered, not Skillweave's, or of a newer schema.
+        SkillweaveError: missing, truncated, altered, no plain file, not Skillweave's, or of a
+            newer schema.
     """
-    try:
-        with safetensors.safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
-        text = metadata["skillweave"]
-        header = json.loads(text)
-    except FileNotFoundError as error:
-        raise SkillweaveError(f"{path} does not exist") from error
-    except KeyError as error:
-        raise SkillweaveError(f"{path} was not written by Skillweave") from error
-    except (OSError, ValueError, safetensors.SafetensorError) as error:
-        raise SkillweaveError(f"{path} is damaged (truncated?): {error}") from error
-    if not isinstance(header, dict):
-        raise SkillweaveError(f"{path} was not written by Skillweave: its header is no object")
-    check_schema(header, path)
-    if header.pop("sha256", None) != _digest(json.dumps(header, sort_keys=True), tensors):
+    return read_signed(path)[:2]
+
+
+def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
+    """Like ``read_tensors``, and the checksum."""
+    header, tensors = _opened(path, with_tensors=True)
+    told = header.pop("sha256", None)
+    sha256 = _digest(json.dumps(header, sort_keys=True), tensors)
+    if told != sha256:
         raise SkillweaveError(f"{path} is damaged: its contents do not match its checksum")
     # Copies: in the file tensors are aligned to 4 bytes only, and matrix products of such differ in
     # the last bit, so that a resumed run would drift.
-    return {k: v.clone() for k, v in tensors.items()}, header
+    return {k: v.clone() for k, v in tensors.items()}, header, sha256
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """The header alone, quickly: its checksum is not compared.
+
+    Raises:
+        SkillweaveError: as ``read_tensors``.
+    """
+    return _opened(path, with_tensors=False)[0]
+
+
+def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    check_file(path)
+    try:
+        with safetensors.safe_open(str(path), framework="pt") as file:
+            metadata = file.metadata() or {}
+            names = file.keys() if with_tensors else ()
+            tensors = {k: file.get_tensor(k) for k in names}
+    except (OSError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise SkillweaveError(f"{path} is damaged (truncated?): {error}") from error
+    except safetensors.SafetensorError as error:
+        raise SkillweaveError(f"{path} is damaged (truncated?): {error}") from error
+    if "skillweave" not in metadata:
+        raise SkillweaveError(f"{path} was not written by Skillweave")
+    header = parse_json(metadata["skillweave"], path)
+    if not isinstance(header, dict):
+        raise SkillweaveError(f"{path} was not written by Skillweave: its header is no object")
+    check_schema(header, path)
+    return header, tensors
 
 
 def _json(path: Path, data: Mapping[str, Any], **how: Any) -> str:
     try:
         return json.dumps(data, allow_nan=False, **how)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise SkillweaveError(f"could not write {path}: {error}") from error
 
 
@@ -133,5 +227,6 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(f"{name}{tensors[name].dtype}{tuple(tensors[name].shape)}".encode())
-        digest.update(tensors[name].numpy().tobytes())
+        # As bytes, so that it may be of a type that NumPy does not know.
+        digest.update(tensors[name].reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from skillweave.reading import check_file, shown
 from skillweave.types import SkillweaveError
 
 
@@ -37,35 +38,48 @@ class JsonLines:
             self._file.write(text)
             self._file.flush()
         except OSError as error:
+            self.close()  # what could not be written must not be tried again
             raise SkillweaveError(
                 f"could not write {self.path}: {error.strerror}. The checkpoint is intact; free "
                 f"space, then: skillweave resume {self.path.parent}"
             ) from error
 
     def rewind(self, size: int | None) -> None:
-        """Drop what was written after ``size`` bytes: training is about to write it again."""
+        """Drop what was written after ``size`` bytes: training is about to write it again.
+
+        Raises:
+            SkillweaveError: the disk cannot be written.
+        """
         self.close()
-        if size is not None and self.size > size:
-            os.truncate(self.path, size)
+        try:
+            if size is not None and self.size > size:
+                os.truncate(self.path, size)
+        except OSError as error:
+            raise SkillweaveError(f"could not write {self.path}: {error.strerror}") from error
 
     def read(self) -> Iterator[dict[str, Any]]:
         """The records; a half-written last line is left out.
 
         Raises:
-            SkillweaveError: a line is damaged.
+            SkillweaveError: a line is damaged, or this is no plain file.
         """
         if not self.path.exists():
             return
-        with self.path.open() as file:
+        check_file(self.path)
+        with self.path.open("rb") as file:
             for number, line in enumerate(file, 1):
-                if not line.endswith("\n"):
+                if not line.endswith(b"\n"):
                     return
                 try:
                     record = json.loads(line)
-                except ValueError as error:
+                except (ValueError, RecursionError) as error:
                     raise SkillweaveError(
-                        f"{self.path} is damaged in line {number}: {error}"
+                        f"{self.path} is damaged in line {number}: {str(error)[:300]}"
                     ) from error
+                if not isinstance(record, dict):
+                    raise SkillweaveError(
+                        f"{self.path} is damaged in line {number}: {shown(record)} is no object"
+                    )
                 yield record
 
     def close(self) -> None:

@@ -7,9 +7,9 @@ is known to do nothing else; everything else stops the reading.
 
 from __future__ import annotations
 
+import io
 import pickle
 import zipfile
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.reading import check_file, shown
+from skillweave.runs.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
 from skillweave.types import SkillweaveError
 
 _STORAGES = {
@@ -31,22 +33,62 @@ _STORAGES = {
 class Inert:
     """Stands for an object that carries nothing worth having, such as a loss of torch's."""
 
+    def __setstate__(self, state: Any) -> None:
+        """Forget it."""
+
+
+class _Dict(dict[Any, Any]):
+    """An OrderedDict; a dict keeps its order, too."""
+
+    def __setstate__(self, state: Any) -> None:
+        """Forget it: torch keeps the versions of its modules there."""
+
+
+class _Held:
+    """A tensor while the pickle is being read, so that the pickle cannot alter it."""
+
+    __slots__ = ("tensor",)
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.tensor = tensor
+
+    def __setstate__(self, state: Any) -> None:
+        raise SkillweaveError("refused: the pickle sets the attributes of a tensor")
+
+
+class _Maker:
+    """A function that the pickle may call, and do nothing else with."""
+
+    __slots__ = ("_function",)
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._function(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise SkillweaveError("refused: the pickle sets the attributes of a function")
+
 
 def read_torch_pickle(path: Path) -> Any:
     """What ``torch.save`` wrote, if it is tensors, numbers, arrays and plain containers.
 
     Raises:
-        SkillweaveError: the file is missing or damaged, or names anything else; it is named.
+        SkillweaveError: the file is missing, damaged, too large or nested too deep, or names
+            anything else; it is named.
     """
+    check_file(path)
     try:
         with zipfile.ZipFile(path) as file:
             name = next((n for n in file.namelist() if n.endswith("/data.pkl")), None)
             if name is None:
-                raise SkillweaveError(f"{path} is a zip, but not one of torch.save's")
-            with file.open(name) as data:
-                return _Reader(data, file, name.removesuffix("data.pkl")).load()
-    except FileNotFoundError as error:
-        raise SkillweaveError(f"{path} does not exist") from error
+                raise SkillweaveError("it is a zip, but not one of torch.save's")
+            check_sizes(file, path.stat().st_size, name)
+            program = file.read(name)
+            check_program(program)
+            prefix = name.removesuffix("data.pkl")
+            return _Plain()(_Reader(io.BytesIO(program), file, prefix).load())[0]
     except zipfile.BadZipFile as error:
         raise SkillweaveError(
             f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {error}"
@@ -54,38 +96,87 @@ def read_torch_pickle(path: Path) -> Any:
     except SkillweaveError as error:
         raise SkillweaveError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle can fail in any way
-        raise SkillweaveError(f"{path} is damaged: {type(error).__name__}: {error}") from error
+        told = f"{type(error).__name__}: {str(error)[:300]}"
+        raise SkillweaveError(f"{path} is damaged: {told}") from error
+
+
+class _Plain:
+    """What was read, with tensors where they were held, and Python's numbers for NumPy's."""
+
+    def __init__(self) -> None:
+        self._done: dict[int, tuple[Any, int]] = {}
+
+    def __call__(self, data: Any, depth: int = 0) -> tuple[Any, int]:
+        """The same in plain objects, and how many they are if written out."""
+        if id(data) in self._done:
+            return self._done[id(data)]
+        if depth > DEEPEST:  # lists and dicts can be put into one another later, even in a circle
+            raise SkillweaveError(f"its pickle nests objects more than {DEEPEST} deep")
+        inner: list[Any] = []
+        if isinstance(data, dict):
+            inner = [part for item in data.items() for part in item]
+        elif isinstance(data, list | tuple | set | frozenset):
+            inner = list(data)
+        found = [self(part, depth + 1) for part in inner]
+        size = 1 + sum(n for _, n in found)
+        if size > MOST_STEPS:
+            raise SkillweaveError(f"its pickle holds more than {MOST_STEPS:,} objects")
+        self._done[id(data)] = _rebuilt(data, [value for value, _ in found]), size
+        return self._done[id(data)]
+
+
+def _rebuilt(data: Any, inner: list[Any]) -> Any:
+    if isinstance(data, dict):
+        return dict(zip(inner[::2], inner[1::2], strict=True))
+    if isinstance(data, list | tuple | set | frozenset):
+        return type(data)(inner)
+    if isinstance(data, _Held):
+        return data.tensor
+    if isinstance(data, _Array):
+        return np.asarray(data)
+    return data.item() if isinstance(data, np.generic) else data
 
 
 class _Reader(pickle.Unpickler):
     def __init__(self, data: Any, file: zipfile.ZipFile, prefix: str) -> None:
         super().__init__(data, encoding="utf-8")
         self._file, self._prefix = file, prefix
+        self._storages: dict[tuple[str, torch.dtype], Tensor] = {}
+        # Made anew for each file: a pickle may set attributes of a class.
+        self._inert = type("Inert", (Inert,), {})
 
     def find_class(self, module: str, name: str) -> Any:
         module = module.replace("numpy._core", "numpy.core")
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
-        if (module, name) not in _ALLOWED:
+        found = _ALLOWED.get((module, name))
+        if found is None:
             raise SkillweaveError(
-                f"refused: the pickle names {module}.{name}, which is neither a tensor, a number, "
-                "an array, a device nor a plain container"
+                f"refused: the pickle names {module[:60]}.{name[:60]}, which is neither a tensor, "
+                "a number, an array, a device nor a plain container"
             )
-        return _ALLOWED[module, name]
+        return self._inert if found is Inert else _Maker(found)
 
-    def persistent_load(self, pid: Any) -> Tensor:
+    def persistent_load(self, pid: Any) -> _Held:
         kind, dtype, key, _, size = pid
-        if kind != "storage" or not isinstance(dtype, torch.dtype):
-            raise SkillweaveError(f"refused: the pickle refers to {pid!r}")
-        data = bytearray(self._file.read(f"{self._prefix}data/{key}"))
-        return torch.frombuffer(data, dtype=dtype, count=size) if size else torch.empty(0).to(dtype)
+        if kind != "storage" or not isinstance(dtype, torch.dtype) or not isinstance(key, str):
+            raise SkillweaveError(f"refused: the pickle refers to {shown(pid)}")
+        if (key, dtype) not in self._storages:
+            data = bytearray(self._file.read(f"{self._prefix}data/{key}"))
+            empty = torch.empty(0).to(dtype)
+            self._storages[key, dtype] = torch.frombuffer(data, dtype=dtype) if data else empty
+        found = self._storages[key, dtype]
+        if len(found) != size:
+            raise SkillweaveError(f"is damaged: storage {shown(key)} does not hold {shown(size)}")
+        return _Held(found)
 
 
-def _tensor(storage: Tensor, offset: int, size: Any, stride: Any, *_: Any) -> Tensor:
-    return storage.as_strided(size, stride, offset).clone()  # as_strided checks the bounds
+def _tensor(storage: _Held, offset: int, size: Any, stride: Any, *_: Any) -> _Held:
+    # No copy: a file of one number could ask for a billion. as_strided checks the bounds.
+    return _Held(storage.tensor.as_strided(size, stride, offset))
 
 
-def _parameter(data: Tensor, *_: Any) -> Tensor:
+def _parameter(data: _Held, *_: Any) -> _Held:
     return data
 
 
@@ -117,8 +208,8 @@ class _Array(np.ndarray[Any, Any]):
 
 
 def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
-    if make is not _Array:  # dill's way to write an array
-        raise SkillweaveError(f"refused: the pickle makes an array by {make}")
+    if not isinstance(make, _Maker) or make._function is not _Array:  # dill writes arrays so
+        raise SkillweaveError(f"refused: the pickle makes an array by {shown(make)}")
     found = _Array(*arguments)
     found.__setstate__(state)
     return found
@@ -131,7 +222,7 @@ def _encode(text: str, encoding: str) -> bytes:
 def _load_type(name: str) -> type:
     kinds: dict[str, type] = {k.__name__: k for k in (set, frozenset, dict, list, tuple)}
     if name not in kinds:  # dill's function knows all types, that of code too
-        raise SkillweaveError(f"refused: the pickle names the type {name!r}")
+        raise SkillweaveError(f"refused: the pickle names the type {shown(name)}")
     return kinds[name]
 
 
@@ -141,7 +232,7 @@ _ALLOWED: dict[tuple[str, str], Callable[..., Any] | type] = {
     ("torch", "device"): torch.device,
     ("torch.nn.modules.loss", "MSELoss"): Inert,
     ("torch.nn.modules.loss", "SmoothL1Loss"): Inert,
-    ("collections", "OrderedDict"): OrderedDict,
+    ("collections", "OrderedDict"): _Dict,
     ("builtins", "set"): set,
     ("__builtin__", "set"): set,
     ("dill._dill", "_load_type"): _load_type,

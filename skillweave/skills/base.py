@@ -10,7 +10,8 @@ import numpy as np
 
 from skillweave.types import Array, SkillweaveError, Step
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
+"""What a skill may be named: its name names files, too."""
 
 
 class Skill:
@@ -76,7 +77,7 @@ class Skill:
         where = f"skill {self.name!r} ({type(self).__name__})"
         if not self.name:
             raise SkillweaveError(f"{where} has no name: set the class attribute 'name'")
-        if not _NAME.fullmatch(self.name):
+        if not NAME.fullmatch(self.name):
             raise SkillweaveError(
                 f"{where}: the name names files too; use letters, digits, '_' and '-', at most 64"
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, NotRequired, Self, TypedDict
 
 import numpy as np
 from gymnasium import Space
@@ -115,11 +115,25 @@ def fitted(
     return policy
 
 
-def source_of(policy: Policy) -> dict[str, Any]:
+class Source(TypedDict):
     """Where a ready policy comes from, as JSON."""
-    if isinstance(policy, Foreign):
-        return policy.source()
-    return {"kind": "policy", "name": qualified(type(policy))}
+
+    kind: str
+    name: NotRequired[str]
+    file: NotRequired[str]
+    sha256: NotRequired[str]
+    """Of what it acts by, where there is a way to tell."""
+
+
+def source_of(policy: Policy) -> dict[str, Any]:
+    """Where a ready policy comes from, as JSON; see ``Source``.
+
+    A policy may have a method ``source`` that says so, with a checksum of all that it acts by;
+    of others the class is named.
+    """
+    own = getattr(policy, "source", None)
+    found: dict[str, Any] = own() if callable(own) else {}
+    return {"kind": "policy", "name": qualified(type(policy))} | found
 
 
 def as_recorded(
@@ -141,11 +155,10 @@ def as_recorded(
         raise SkillweaveError(
             f"{where} had a policy of kind {_described(recorded)}, but now it is {_described(now)}"
         )
-    if now.get("sha256") == recorded.get("sha256"):
+    if recorded.get("sha256") in (None, now.get("sha256")):
         return policy
-    assert isinstance(policy, Foreign)
-    content = read()
-    if content is None:
+    content = read() if isinstance(policy, Foreign) else None
+    if content is None or not isinstance(policy, Foreign):
         raise SkillweaveError(
             f"{where} had the policy {_described(recorded)}, but now it is {_described(now)}: "
             "another checksum. Put the file back that it was trained with, or train anew"
@@ -169,7 +182,7 @@ def qualified(thing: Any) -> str:
 
 def _described(source: dict[str, Any]) -> str:
     sha256 = f" (sha256 {source['sha256'][:12]}…)" if "sha256" in source else ""
-    return f"{source['kind']} {source.get('file') or source.get('name')}{sha256}"
+    return f"{source['kind']} {(source.get('file') or source.get('name') or '')[:300]}{sha256}"
 
 
 def _made_up(space: Space[Any], n: int) -> Array:

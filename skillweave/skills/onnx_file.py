@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from gymnasium import Space
 
+from skillweave.reading import check_file
 from skillweave.skills.actions import decoded
 from skillweave.skills.foreign import Foreign, checksum
 from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
@@ -141,16 +142,33 @@ def from_onnx(
         import onnx
     except ImportError as error:
         raise MissingExtra("an ONNX file", "onnx") from error
+    check_file(Path(path))
     try:
         model = onnx.load(str(path))
     except OSError as error:
         raise SkillweaveError(f"could not read {path}: {error.strerror or error}") from error
     except Exception as error:  # protobuf's own errors have no common class
-        raise SkillweaveError(f"{path} is no ONNX model: {error}") from error
+        raise SkillweaveError(f"{path} is no ONNX model: {str(error)[:300]}") from error
+    for tensor in model.graph.initializer:
+        if np.isnan(_numbers(tensor, path)).any():
+            raise SkillweaveError(f"{path}: its weights {tensor.name[:60]!r} hold NaN")
     return OnnxPolicy(
         model.SerializeToString(deterministic=True),
         Path(path), output, observation_space, action_space,
     )  # fmt: skip
+
+
+def _numbers(tensor: Any, path: str | Path) -> Array:
+    """A weight as an array; of what is no real number, nothing."""
+    from onnx import numpy_helper
+
+    try:
+        found = numpy_helper.to_array(tensor)
+    except Exception as error:
+        raise SkillweaveError(
+            f"{path}: its weights {tensor.name[:60]!r} are damaged: {str(error)[:300]}"
+        ) from error
+    return found if np.issubdtype(found.dtype, np.floating) else np.zeros(0)
 
 
 def _session(data: bytes, file: Path) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
 
+from skillweave.reading import read_file
 from skillweave.skills.actions import checked_actions
 from skillweave.skills.foreign import Foreign, checksum
 from skillweave.skills.torch_module import weights_of, with_weights
@@ -119,10 +120,7 @@ def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = F
             f"from_sb3({str(file)!r}, {algorithm!r}, trust=True)"
         )
     kind = _algorithm(algorithm, file)
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise SkillweaveError(f"could not read {file}: {error.strerror}") from error
+    content = read_file(file)
     # A replay buffer is for training only, and may take gigabytes.
     less = {"buffer_size": 1} if _learns_off_policy(kind) else {}
     try:

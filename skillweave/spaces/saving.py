@@ -2,14 +2,72 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import gymnasium as gym
 import numpy as np
 
+from skillweave.reading import LARGEST, Asked, Positive, fit, shown
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import OBSERVATIONS, obs_dtype, parts
 from skillweave.types import Array, SkillweaveError
+
+_MOST = 10**8
+"""Numbers of one space: a damaged shape must not take all memory."""
+
+
+def _is_whole(data: Any) -> bool:
+    """Whether it is a whole number, or lists of such."""
+    if isinstance(data, list):
+        return all(_is_whole(x) for x in data)
+    return type(data) is int and abs(data) < LARGEST
+
+
+def _is_shape(data: Any) -> bool:
+    sizes = data if isinstance(data, list) else [data]
+    return all(type(n) is int and n >= 0 for n in sizes) and math.prod(sizes) <= _MOST
+
+
+_SIZES = Asked(f"sizes, of at most {_MOST:,} numbers in all", _is_shape)
+_Whole = Annotated[Any, Asked("whole numbers below 2^63", _is_whole)]
+
+
+class _Tuple(TypedDict):
+    spaces: list[Any]
+
+
+class _Dict(TypedDict):
+    spaces: list[tuple[str, Any]]
+
+
+class _Box(TypedDict):
+    shape: Annotated[list[Any], _SIZES]
+    dtype: str
+    low: Any
+    high: Any
+
+
+class _Discrete(TypedDict):
+    n: Positive
+    start: int
+    dtype: NotRequired[str]
+
+
+class _MultiDiscrete(TypedDict):
+    nvec: _Whole
+    start: _Whole
+    dtype: NotRequired[str]
+
+
+class _MultiBinary(TypedDict):
+    n: Annotated[Any, _SIZES]
+
+
+_SCHEMAS: dict[str, Any] = {
+    "Dict": _Dict, "Tuple": _Tuple, "Box": _Box, "Discrete": _Discrete,
+    "MultiDiscrete": _MultiDiscrete, "MultiBinary": _MultiBinary,
+}  # fmt: skip
 
 
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
@@ -44,34 +102,47 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
     raise SkillweaveError(f"space {space} is not supported; supported are: {OBSERVATIONS}")
 
 
-def space_from_json(data: dict[str, Any]) -> gym.Space[Any]:
+def space_from_json(data: Any) -> gym.Space[Any]:
     """The inverse of ``space_to_json``.
 
     Raises:
         SkillweaveError: the JSON does not describe a supported space.
     """
+    kind = data.get("type") if isinstance(data, dict) else None
+    if not isinstance(kind, str) or kind not in _SCHEMAS:
+        raise SkillweaveError(
+            f"{shown(data)} is no space, or one of a type that is not supported; supported are: "
+            f"{OBSERVATIONS}"
+        )
+    fit(_SCHEMAS[kind], data, "", "space")
     try:
-        match data["type"]:
-            case "Dict":  # of pairs: of a plain dict Gymnasium would sort the names
-                return gym.spaces.Dict([(k, space_from_json(v)) for k, v in data["spaces"]])
-            case "Tuple":
-                return gym.spaces.Tuple([space_from_json(part) for part in data["spaces"]])
-            case "Box":
-                shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
+        return _made(data)
+    # Gymnasium's own checks of values are assertions, partly.
+    except (TypeError, ValueError, ArithmeticError, AssertionError, AttributeError) as error:
+        raise SkillweaveError(f"not a space: {shown(data)} ({error})") from error
+
+
+def _made(data: dict[str, Any]) -> gym.Space[Any]:
+    match data["type"]:
+        case "Dict":  # of pairs: of a plain dict Gymnasium would sort the names
+            return gym.spaces.Dict([(k, space_from_json(v)) for k, v in data["spaces"]])
+        case "Tuple":
+            return gym.spaces.Tuple([space_from_json(part) for part in data["spaces"]])
+        case "Box":
+            shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
+            if dtype.kind not in "biuf":
+                raise ValueError(f"numbers of type {dtype}")
+            with np.errstate(over="raise"):
                 low, high = (_bounds_from_json(data[k], shape, dtype) for k in ("low", "high"))
-                box: gym.Space[Any] = gym.spaces.Box(low, high, shape, dtype)
-                return box
-            case "Discrete":
-                return gym.spaces.Discrete(data["n"], start=data["start"], **_dtype(data))
-            case "MultiDiscrete":
-                return gym.spaces.MultiDiscrete(data["nvec"], start=data["start"], **_dtype(data))
-            case "MultiBinary":
-                return gym.spaces.MultiBinary(data["n"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise SkillweaveError(f"not a space: {data!r} ({error})") from error
-    raise SkillweaveError(
-        f"space type {data['type']!r} is not supported; supported are: {OBSERVATIONS}"
-    )
+            if not (low <= high).all():
+                raise ValueError("low is not at most high")
+            box: gym.Space[Any] = gym.spaces.Box(low, high, shape, dtype)
+            return box
+        case "Discrete":
+            return gym.spaces.Discrete(data["n"], start=data["start"], **_dtype(data))
+        case "MultiDiscrete":
+            return gym.spaces.MultiDiscrete(data["nvec"], start=data["start"], **_dtype(data))
+    return gym.spaces.MultiBinary(data["n"])
 
 
 def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:

@@ -138,6 +138,7 @@ class Record:
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
         entry["final"] = at["metrics"]
         self.run.save()
+        self.run.drop_checkpoints()
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 
@@ -148,7 +149,13 @@ def resume_episodes(
     """Bring the environments back to where a checkpoint left them; say where that cannot be."""
     if not saved:
         return
-    collector.restore(saved, seeds / "restart" / record.at["update"])
+    try:
+        collector.restore(saved, seeds / "restart" / record.at["update"])
+    except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
+        raise SkillweaveError(
+            f"{record.run.path}: the checkpoint of phase {record.entry['name']!r} does not hold "
+            f"episodes of these environments: {error!r}"
+        ) from error
     if count := len(collector.begun_anew):
         record.tell(
             f"{count} of {collector.num_envs} episodes in flight begin anew, so the end may differ "
@@ -173,8 +180,9 @@ def train_phase(
     probe = Probe(phase.make_env, config.gamma, seeds, every, episodes)
     try:
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
-        found = run.load_checkpoint(algorithm.state_type, phase.name)
-        state, at, extra = found or (algorithm.init([seeds / "member" / 0]), dict(START), {})
+        fresh = algorithm.init([seeds / "member" / 0])
+        found = run.load_checkpoint(algorithm.state_type, phase.name, like=fresh)
+        state, at, extra = found or (fresh, dict(START), {})
         record = Record(phase.name, run, listeners, at)
         collector = Collector(env)
         resume_episodes(collector, unprefixed("collector", extra), seeds, record)

@@ -126,7 +126,7 @@ def test_settings_survive_json(config):
     [
         ({"momentum": 1}, "SAC has no field momentum"),
         ({"network": {"cnn": {"depth": 3}}}, r"SAC\.network\.cnn has no field depth"),
-        ({"network": {"rnn": {"kind": "elman"}}}, r"RNN\.kind is 'elman'; .* lstm, gru"),
+        ({"network": {"rnn": {"kind": "elman"}}}, r"rnn\.kind is 'elman'; .* lstm, gru"),
         ({"network": {"rnn": {"kind": "gru"}}}, r"SAC\.network is .*only PPO has memory"),
     ],
 )

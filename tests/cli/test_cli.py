@@ -15,6 +15,7 @@ import pytest
 
 from skillweave import recipes
 from skillweave.cli import main
+from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 
 COMMANDS = ("train", "resume", "evaluate", "render", "list", "info", "weights", "import-agilerl")
 
@@ -392,7 +393,7 @@ def test_info_of_a_run_shows_its_phases_and_what_made_it(call: Call, trained: Tr
     assert f"recipe: {trained.coded}" in answer.out
     assert all(name in answer.out for name in ("left", "balance", "selector", "torch"))
     found = call("info", trained.coded_run, "--json").json
-    assert found == json.loads((trained.coded_run / "run.json").read_text())
+    assert found == read_json(trained.coded_run / "run.json")
 
 
 def test_info_of_a_recipe_shows_settings_that_can_be_set(
@@ -558,9 +559,9 @@ def trap(run: Path, source: Path, recipe: str, **fields: Any) -> Path:
     marker = run.parent / "executed"
     for place in (run / "trap.py", run / "policies" / "trap.py", run / "__init__.py"):
         place.write_text(TRAP.format(marker=str(marker)) + PLAIN)
-    data = json.loads((run / "run.json").read_text())
+    data = read_json(run / "run.json")
     data |= {"recipe": recipe, **fields}
-    (run / "run.json").write_text(json.dumps(data))
+    write_json(run / "run.json", data)  # with the checksum of what it says now
     return marker
 
 
@@ -611,8 +612,6 @@ def test_the_trap_would_spring(tmp_path: Path, trained: Trained) -> None:
 def test_a_weights_file_that_names_code_is_refused(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    from skillweave.runs.files import read_tensors, write_tensors
-
     path = tmp_path / "w.safetensors"
     assert call("weights", trained.coded_run, "--recipe", trained.coded, "-o", path).code == 0
     tensors, header = read_tensors(path)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 import pickle
+import subprocess
+import sys
+import zipfile
 from collections import OrderedDict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +20,8 @@ from skillweave.cli import main
 from skillweave.compat.agilerl.algorithms.dqn import DQN
 from skillweave.compat.agilerl.algorithms.ppo import PPO
 from skillweave.compat.agilerl.algorithms.td3 import TD3
+from skillweave.runs import pickles
+from skillweave.runs.files import read_tensors
 from skillweave.runs.pickles import read_torch_pickle
 from skillweave.types import SkillweaveError
 
@@ -199,6 +205,159 @@ def test_what_cannot_be_converted_is_said(tmp_path, capsys, change, says):
     ppo_file(tmp_path / "old.pt", **change)
     assert command(tmp_path / "old.pt", "--trust") == 1
     assert says in capsys.readouterr().err
+
+
+# What a file of a stranger's may hold
+
+
+def write_program(path: Path, program: bytes, **how: Any) -> Path:
+    """A zip as torch.save writes it, of a pickle's program and nothing else."""
+    with zipfile.ZipFile(path, "w", **how) as file:
+        file.writestr("archive/data.pkl", program)
+    return path
+
+
+DEEP = 200_000
+PROGRAMS = {
+    # Hashing such a key overflows the stack of the interpreter.
+    "a tuple as a key": b"\x80\x02})" + b"\x85" * DEEP + b"K\x01s.",
+    "a frozenset": b"\x80\x04" + b"(" * DEEP + b"\x91" * DEEP + b".",
+    "lists": b"\x80\x02" + b"]" * DEEP + b"a" * (DEEP - 1) + b".",
+    "a circle": b"\x80\x02]q\x00]q\x01h\x00h\x01a0h\x01h\x00a.",
+}
+
+
+@pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS.keys())
+def test_a_pickle_nested_too_deep_is_refused(tmp_path, program):
+    path = write_program(tmp_path / "x.pt", program)
+    code = "from pathlib import Path; from skillweave.runs.pickles import read_torch_pickle as r\n"
+    code += f"from skillweave.types import SkillweaveError as E\ntry: r(Path({str(path)!r}))\n"
+    code += "except E as error: print(error)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "deep" in done.stdout
+
+
+def test_a_pickle_that_is_huge_when_written_out_is_refused(tmp_path):
+    doubling = b"".join(b"](h%ch%ceq%c" % (i, i, i + 1) for i in range(60))
+    path = write_program(tmp_path / "x.pt", b"\x80\x02]q\x00" + doubling + b".")
+    with pytest.raises(SkillweaveError, match="more than 500,000 objects"):
+        read_torch_pickle(path)
+    path = write_program(tmp_path / "x.pt", b"\x80\x02(" + b"N" * 600_000 + b"t.")
+    with pytest.raises(SkillweaveError, match="more than 500,000 operations"):
+        read_torch_pickle(path)
+
+
+def test_sizes_that_a_file_declares_are_looked_at_before_it_is_read(tmp_path):
+    zeros = b"\x80\x02(" + b"0" * 10_000_000
+    path = write_program(tmp_path / "x.pt", zeros, compression=zipfile.ZIP_DEFLATED)
+    assert path.stat().st_size < 50_000
+    with pytest.raises(SkillweaveError, match=r"x\.pt: refused: it declares 10,000,003 bytes"):
+        read_torch_pickle(path)
+    with pytest.raises(SkillweaveError, match="its pickle declares 20,000,000 bytes"):
+        read_torch_pickle(write_program(path, b"N" * 20_000_000))
+
+
+def test_a_tensor_that_repeats_one_number_takes_no_memory(tmp_path):
+    torch.save({"x": torch.ones(1).expand(10**12)}, tmp_path / "x.pt")
+    found = read_torch_pickle(tmp_path / "x.pt")["x"]
+    assert found.shape == (10**12,)
+    assert found.untyped_storage().nbytes() == 4
+
+
+# BUILD sets attributes: of what `find_class` returned, too, if that lets it.
+BUILDS = {
+    "a function": b"ctorch._utils\n_rebuild_parameter\n",
+    "a class": b"cnumpy\nndarray\n",
+    "a loss's class": b"ctorch.nn.modules.loss\nMSELoss\n",
+    "a container's class": b"ccollections\nOrderedDict\n",
+    "a device's class": b"ctorch\ndevice\n",
+}
+
+
+@pytest.mark.parametrize("thing", BUILDS.values(), ids=BUILDS.keys())
+@pytest.mark.parametrize(
+    "state", [b"}X\x04\x00\x00\x00evilK\x01s", b"N}X\x04\x00\x00\x00evilK\x01s\x86"]
+)
+def test_a_pickle_cannot_set_attributes_of_what_reads_it(tmp_path, thing, state):
+    path = write_program(tmp_path / "x.pt", b"\x80\x02" + thing + state + b"b.")
+    with pytest.raises(SkillweaveError, match=r"refused|is damaged"):
+        read_torch_pickle(path)
+    for kind in (*pickles._ALLOWED.values(), pickles.Inert, pickles._Array, torch.Tensor):
+        assert not hasattr(kind, "evil")
+
+
+def test_a_pickle_cannot_set_attributes_of_a_tensor(tmp_path):
+    torch.save({"x": torch.ones(3)}, tmp_path / "x.pt")
+    with zipfile.ZipFile(tmp_path / "x.pt") as file:
+        members = {n: file.read(n) for n in file.namelist()}
+    name = next(n for n in members if n.endswith("data.pkl"))
+    head, tail = members[name].rsplit(b"R", 1)  # the tensor is made, and put into the dict
+    members[name] = head + b"R}X\x04\x00\x00\x00evilK\x01sb" + tail
+    with zipfile.ZipFile(tmp_path / "y.pt", "w") as file:
+        for n, data in members.items():
+            file.writestr(n, data)
+    with pytest.raises(
+        SkillweaveError, match="refused: the pickle sets the attributes of a tensor"
+    ):
+        read_torch_pickle(tmp_path / "y.pt")
+
+
+def altered(change):
+    """The state dict of ``ppo_file``'s actor with one weight changed."""
+    torch.manual_seed(0)
+    weights = dict(network(4, True, nn.Tanh).state_dict())
+    key = "feature_net.linear_layer_1.weight"
+    return {"actor_state_dict": weights | {key: change(weights[key])}}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (altered(lambda w: w.t().contiguous()), "(16, 12), but (12, 16) is described"),
+        (altered(lambda w: w.reshape(6, 32)), "(6, 32), but (12, 16) is described"),
+        (altered(lambda w: w.reshape(-1)), "(192,), but (12, 16) is described"),
+        (altered(lambda w: w * float("nan")), "holds NaN, infinity"),
+        (altered(lambda w: w.double() * 1e300), "holds NaN, infinity"),
+        (altered(lambda w: w.long()), "no real numbers"),
+        (altered(lambda w: 5), "linear_layer_1.weight is no weights"),
+        ({"actor_state_dict": 5}, "actor_state_dict is 5; it must be an object"),
+        ({"actor_init_dict": [1]}, "actor_init_dict is [1]; it must be an object"),
+        ({"actor_init_dict": init_dict(10**9, True, "Tanh", "Softmax")}, "num_outputs is 10000000"),
+        (
+            {"actor_init_dict": init_dict(4, True, "Tanh", "Softmax", inputs=10**12)},
+            "num_inputs is",
+        ),
+        ({"lr": "a"}, "lr is 'a'; it must be a finite number"),
+        ({"lr": float("nan")}, "lr is nan; it must be a finite number"),
+        ({"gamma": 7.0}, "PPO.gamma is 7.0"),
+        ({"index": [1]}, "index is [1]; it must be a whole number"),
+        ({"scores": 5}, "scores is 5; it must be a list"),
+        ({"scores": ["a"]}, "scores[0] is 'a'; it must be a finite number"),
+        ({"algo": ["PPO"]}, "algorithm ['PPO']"),
+        ({"critic_init_dict": None}, "critic_init_dict is None; it must be an object"),
+    ],
+)
+def test_what_is_not_as_agilerl_writes_it_is_told_by_its_field(tmp_path, capsys, change, says):
+    ppo_file(tmp_path / "old.pt", **change)
+    assert command(tmp_path / "old.pt", "--trust") == 1
+    told = capsys.readouterr().err
+    assert says in told
+    assert "old.pt" in told
+    assert len(told) < 600
+    assert not (tmp_path / "old.safetensors").exists()
+
+
+def test_weights_are_turned_as_ours_lie(tmp_path):
+    # Stored as (out, in), ours are (in, out).
+    ppo_file(tmp_path / "old.pt", norm=False)
+    data = torch.load(tmp_path / "old.pt", weights_only=False)
+    weight = torch.arange(192.0).reshape(12, 16) / 192
+    data["actor_state_dict"]["feature_net.linear_layer_1.weight"] = weight
+    torch.save(data, tmp_path / "old.pt")
+    assert command(tmp_path / "old.pt", "--trust") == 0
+    found, _ = read_tensors(tmp_path / "old.safetensors")
+    assert torch.equal(found["actor.1.weight"], weight.t())
 
 
 def test_missing_damaged_and_foreign_files(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Foreign skills from declaration to training, loading and evaluation."""
 
 import json
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +11,8 @@ from gymnasium.spaces import Box, MultiDiscrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, sb3_zip
 
 from skillweave import PPO, Hierarchy, Skill, SkillweaveError, from_onnx, from_sb3, from_torch
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.types import Memoryless
 
 SMALL = PPO(num_envs=4, n_steps=16, batch_size=64)
 
@@ -150,6 +153,52 @@ def test_a_hierarchy_of_foreign_skills_is_a_skill_again(tmp_path):
     assert run.info()["skills"][0]["policy"]["kind"] == "policy"
     loaded = declare(whole, skill("c", linear(-WEIGHT))).load(run.path)
     assert acts(loaded.policy) == acts(run.policy)
+
+
+def test_a_hierarchy_as_a_skill_must_be_the_one_that_the_run_was_trained_with(tmp_path):
+    def inner(name, seed, policy=upright):
+        own = declare(skill("a", linear()), skill("b", policy))
+        return own.train(tmp_path / name, seed=seed, quiet=True).as_skill("inner")
+
+    first = inner("in", 0)
+    middle = declare(first, skill("c", linear())).train(tmp_path / "middle", quiet=True)
+    run = declare(middle.as_skill("whole")).train(tmp_path / "out", quiet=True)
+    weights = run.save_weights(tmp_path / "weights.safetensors")
+    assert len(run.info()["skills"][0]["policy"]["sha256"]) == 64
+    same = Hierarchy.load(declare(first, skill("c", linear())), tmp_path / "middle")
+    assert acts(declare(same.as_skill("whole")).load(run.path).policy) == acts(run.policy)
+    # Another selector, two levels below; then another torch module, another call length there.
+    changed = [inner("seed", 1), inner("in 2", 0, linear(-WEIGHT))]
+    changed.append(inner("in 3", 0))
+    changed[2].policy.skills = replace(changed[2].policy.skills, call_steps=6)
+    for one in changed:
+        parts = [one.policy, middle.policy.skills.policies[1]]
+        skills = declare(one, skill("c", linear())).skill_set(parts)
+        outer = declare(skill("whole", HierarchyPolicy(middle.policy.selector, skills)))
+        for read, path in (
+            (outer.load, run.path),
+            (outer.resume, run.path),
+            (outer.load_weights, weights),
+        ):
+            with pytest.raises(SkillweaveError, match=r"'whole'.*policy.*another checksum"):
+                read(path)
+
+
+def test_a_policy_of_ones_own_class_is_only_named(tmp_path):
+    class Own(Memoryless):
+        observation_space = Box(-np.inf, np.inf, (4,), np.float32)
+        action_space = gym.spaces.Discrete(2)
+
+        def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
+            return upright(obs), memory
+
+    env = gym.make("CartPole-v1")
+    Own.observation_space = env.observation_space
+    run = declare(skill("own", Own())).train(tmp_path / "run", quiet=True)
+    recorded = run.info()["skills"][0]["policy"]
+    assert recorded == {"kind": "policy", "name": recorded["name"]}
+    assert recorded["name"].endswith("Own")
+    declare(skill("own", Own())).load(run.path)
 
 
 def test_the_flat_baseline_leaves_foreign_skills_alone(tmp_path):

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,17 +18,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.config import PPO
+from skillweave.algorithms.config import PPO, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.networks.config import Network
-from skillweave.runs.directory import RunDirectory, versions
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
+from skillweave.runs.manifest import versions
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 
+ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
 PHASES = [
-    {"name": "landing", "status": "training", "budget": 10},
-    {"name": "selector", "status": "waiting", "budget": 10},
+    {"name": "landing", "status": "training", "budget": 10, "algorithm": ALGORITHM},
+    {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM},
 ]
+AT = {"seconds": 1.0, "metrics": {}}
 
 
 def manifest() -> dict[str, Any]:
@@ -70,7 +79,7 @@ def damage(path: Path) -> None:
 
 def save(run: RunDirectory, seed: int, phase: str = "landing") -> Learnt:
     state = learnt(seed)
-    run.save_checkpoint(state, {"phase": phase, "update": seed, "steps": 10 * seed})
+    run.save_checkpoint(state, {"phase": phase, "update": seed, "steps": 10 * seed} | AT)
     return state
 
 
@@ -142,9 +151,9 @@ def test_an_unknown_phase_is_answered_with_those_there_are(run: RunDirectory) ->
 
 
 def test_a_run_is_finished_when_every_phase_is_done(run: RunDirectory) -> None:
-    run.phase("landing")["status"] = "done"
+    run.phase("landing").update(status="done", steps=1, seconds=1.0)
     assert not run.finished
-    run.phase("selector")["status"] = "done"
+    run.phase("selector").update(status="done", steps=1, seconds=1.0)
     assert run.finished
     run.save()
     assert RunDirectory.open(run.path).finished
@@ -228,7 +237,8 @@ def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None
     class Other:
         bias: Tensor
 
-    run.save_checkpoint(Other(torch.zeros(1)), {"phase": "landing"})
+    at = {"phase": "landing", "update": 1, "steps": 1} | AT
+    run.save_checkpoint(Other(torch.zeros(1)), at)
     with pytest.raises(SkillweaveError, match="does not hold a Learnt"):
         run.load_checkpoint(Learnt, "landing")
 
@@ -365,3 +375,333 @@ def test_metrics_on_a_full_disk_say_so_and_the_run_can_still_be_closed(tmp_path:
         run.log({"update": 1})
     assert "skillweave resume" in str(caught.value)
     run.close()
+
+
+# What is wrong in run.json is told by its field
+
+
+def write_manifest(run: RunDirectory, change: Any) -> None:
+    """Write ``run.json`` anew, with the checksum of what it says then."""
+    data = read_json(run.path / "run.json")
+    change(data)
+    write_json(run.path / "run.json", data)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda m: m.update(phases=5), "phases is 5; it must be a list"),
+        (
+            lambda m: m["phases"][0].update(status=5),
+            "phases[0].status is 5; it must be one of wait",
+        ),
+        (lambda m: m["phases"][0].pop("status"), "damaged: phases[0] has no field 'status'"),
+        (lambda m: m["phases"][0].update(status="done"), "phases[0] is done, but has no field 's"),
+        (lambda m: m["phases"][1].update(name="landing"), "phases[1].name is 'landing', a second"),
+        (
+            lambda m: m["phases"][1].update(name="../../x"),
+            "phases[1].name is '../../x'; it must be",
+        ),
+        (lambda m: m["skills"].__setitem__(0, None), "skills[0] is None; it must be an object"),
+        (lambda m: m.update(cut_every=[[]]), "cut_every is [[]]; it must be a whole number"),
+        (lambda m: m.update(cut_every=0), "cut_every is 0; it must be at least 1"),
+        (lambda m: m.update(seed=-1), "seed is -1; it must be at least 0"),
+        (lambda m: m.update(kind="x" * 10_000), "kind is 'xxx"),
+        (
+            lambda m: m["phases"][0]["algorithm"].update(gamma="a"),
+            "phases[0].algorithm.gamma is 'a'; it must be a finite number",
+        ),
+        (
+            lambda m: m["phases"][0]["algorithm"].update(gamma=2.0),
+            "phases[0].algorithm: PPO.gamma is 2.0; it must be between 0 and 1",
+        ),
+        (
+            lambda m: m["phases"][0]["algorithm"]["network"].update(hidden=[[]]),
+            "phases[0].algorithm.network.hidden[0] is []; it must be a whole number",
+        ),
+    ],
+)
+def test_a_wrong_field_of_a_manifest_is_named(run: RunDirectory, change: Any, says: str) -> None:
+    write_manifest(run, change)
+    with pytest.raises(SkillweaveError) as caught:
+        RunDirectory.open(run.path)
+    assert str(caught.value).startswith(str(run.path / "run.json"))
+    assert says in str(caught.value)
+    assert len(str(caught.value)) < len(str(run.path)) + 250
+
+
+def test_a_manifest_edited_by_hand_is_refused_with_or_without_its_checksum(
+    run: RunDirectory,
+) -> None:
+    path = run.path / "run.json"
+    data = json.loads(path.read_text()) | {"call_steps": 11}
+    path.write_text(json.dumps(data))
+    with pytest.raises(SkillweaveError, match="checksum"):
+        RunDirectory.open(run.path)
+    del data["sha256"]
+    path.write_text(json.dumps(data))
+    with pytest.raises(SkillweaveError, match=r"damaged.*'sha256'"):
+        RunDirectory.open(run.path)
+    del data["id"]  # as an older version wrote it
+    path.write_text(json.dumps(data))
+    assert RunDirectory.open(run.path).manifest["call_steps"] == 11
+
+
+def test_a_run_json_that_is_no_plain_file_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "run.json")
+    with pytest.raises(SkillweaveError, match="a pipe or a device"):
+        RunDirectory.open(tmp_path)
+
+
+# Files belong to their run and phase
+
+
+def finished(run: RunDirectory, *policies: AgentPolicy) -> None:
+    """Every phase of the run, done."""
+    for entry, policy in zip(run.manifest["phases"], policies, strict=True):
+        run.save_policy(entry["name"], policy)
+        entry.update(status="done", steps=1, seconds=1.0)
+    run.save()
+
+
+def other(policy: AgentPolicy, seed: int = 1) -> AgentPolicy:
+    """A policy of the same kind with other weights."""
+    return AgentPolicy.of(policy.algorithm, policy.algorithm.init([Seeds(seed)]))
+
+
+def test_a_policy_of_another_phase_is_refused(run: RunDirectory, policy: AgentPolicy) -> None:
+    finished(run, policy, other(policy))
+    a, b = run.policy_path("landing"), run.policy_path("selector")
+    a.write_bytes(b.read_bytes())
+    with pytest.raises(SkillweaveError, match=r"landing.*holds the policy of phase 'selector'"):
+        RunDirectory.open(run.path).load_policy("landing")
+
+
+def test_a_policy_of_another_run_is_refused(
+    run: RunDirectory, policy: AgentPolicy, tmp_path: Path
+) -> None:
+    finished(run, policy, other(policy))
+    theirs = RunDirectory.create(tmp_path / "other", manifest() | {"seed": 8})
+    finished(theirs, other(policy, 2), other(policy, 3))
+    run.policy_path("landing").write_bytes(theirs.policy_path("landing").read_bytes())
+    with pytest.raises(SkillweaveError, match="belongs to another run"):
+        run.load_policy("landing")
+
+
+def test_a_policy_that_the_run_did_not_end_with_is_refused(
+    run: RunDirectory, policy: AgentPolicy
+) -> None:
+    finished(run, policy, other(policy))
+    before = run.policy_path("landing").read_bytes()
+    run.save_policy("landing", other(policy, 2))  # not said in run.json
+    with pytest.raises(SkillweaveError, match="another checksum"):
+        RunDirectory.open(run.path).load_policy("landing")
+    run.policy_path("landing").write_bytes(before)
+    assert RunDirectory.open(run.path).load_policy("landing").source() == policy.source()
+
+
+def test_equal_runs_have_the_same_identity_and_equal_files(
+    run: RunDirectory, policy: AgentPolicy, tmp_path: Path
+) -> None:
+    again = RunDirectory.create(tmp_path / "again", manifest() | {"recipe": "elsewhere.py"})
+    other_seed = RunDirectory.create(tmp_path / "seed", manifest() | {"seed": 8})
+    assert again.manifest["id"] == run.manifest["id"] != other_seed.manifest["id"]
+    for one in (run, again):
+        finished(one, policy, policy)
+    for phase in ("landing", "selector"):
+        assert again.policy_path(phase).read_bytes() == run.policy_path(phase).read_bytes()
+
+
+def test_a_run_of_an_older_version_still_loads(run: RunDirectory, policy: AgentPolicy) -> None:
+    for phase in ("landing", "selector"):
+        path = run.policy_path(phase)
+        write_tensors(path, *policy.to_file())  # neither run nor phase in its header
+        run.phase(phase).update(status="done", steps=1, seconds=1.0)
+    del run.manifest["id"]
+    run.save()
+    assert RunDirectory.open(run.path).load_policy("landing").source() == policy.source()
+
+
+def test_a_checkpoint_of_another_run_is_refused(run: RunDirectory, tmp_path: Path) -> None:
+    theirs = RunDirectory.create(tmp_path / "other", manifest() | {"seed": 8})
+    save(theirs, 1)
+    shutil.copy(theirs.path / "checkpoint.safetensors", run.path)
+    with pytest.raises(SkillweaveError, match="belongs to another run"):
+        run.load_checkpoint(Learnt, "landing")
+
+
+@pytest.mark.parametrize("how", ["shape", "dtype"])
+def test_a_checkpoint_of_other_shapes_or_types_is_refused_by_tensor(
+    run: RunDirectory, how: str
+) -> None:
+    state = save(run, 1)
+    weight = state.weight.T if how == "shape" else state.weight.double()
+    with pytest.raises(SkillweaveError, match="tensor weight should"):
+        run.load_checkpoint(Learnt, "landing", like=Learnt(weight, state.count))
+    assert run.load_checkpoint(Learnt, "landing", like=learnt(7)) is not None
+
+
+def test_a_checkpoint_with_a_damaged_header_falls_back_to_the_one_before(
+    run: RunDirectory,
+) -> None:
+    save(run, 1)
+    save(run, 2)
+    tensors, header = read_tensors(run.path / "checkpoint.safetensors")
+    write_tensors(run.path / "checkpoint.safetensors", tensors, header | {"steps": "many"})
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert found[1]["update"] == 1
+
+
+# One process at a time, and what a killed one leaves
+
+
+def test_two_may_not_train_a_run_at_once(run: RunDirectory) -> None:
+    run.begin()
+    second = RunDirectory.open(run.path)  # may be read
+    with pytest.raises(SkillweaveError, match="being trained by another process") as caught:
+        second.begin()
+    assert str(run.path) in str(caught.value)
+    run.close()
+    second.begin()
+    second.close()
+
+
+HOLD = """
+import sys, time
+from skillweave.runs.directory import RunDirectory
+run = RunDirectory.open(sys.argv[1])
+run.begin()
+if sys.argv[2] == "fork":  # a worker that outlives its parent
+    import os
+    if os.fork() == 0:
+        os.close(1)
+        time.sleep(60)
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("worker", ["alone", "fork"])
+def test_a_process_that_is_killed_holds_the_run_no_longer(run: RunDirectory, worker: str) -> None:
+    command = [sys.executable, "-c", HOLD, str(run.path), worker]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(SkillweaveError, match="another process"):
+            run.begin()
+        process.kill()
+        process.wait()
+        run.begin()
+        if worker == "fork":
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def test_what_another_process_did_in_between_is_seen(run: RunDirectory) -> None:
+    second = RunDirectory.open(run.path)
+    run.begin()
+    run.phase("landing").update(status="done", steps=5, seconds=1.0)
+    run.save()
+    run.close()
+    second.begin()
+    assert second.phase("landing")["status"] == "done"
+    second.close()
+
+
+def test_a_finished_run_is_not_locked(run: RunDirectory, policy: AgentPolicy) -> None:
+    finished(run, policy, policy)
+    before = sorted(p.name for p in run.path.iterdir())
+    run.begin()
+    assert sorted(p.name for p in run.path.iterdir()) == before
+
+
+def test_files_that_a_killed_process_left_half_written_are_removed(run: RunDirectory) -> None:
+    save(run, 1)
+    save(run, 2)
+    run.policy_path("x").parent.mkdir()
+    for name in (".run.json.abc.tmp", "policies/.landing.safetensors.abc.tmp"):
+        (run.path / name).write_text("half")
+    shutil.copy(run.path / "checkpoint.safetensors", run.path / "checkpoint.new.safetensors")
+    (run.path / "mine.txt").write_text("a note")
+    run.begin()
+    names = {p.name for p in run.path.rglob("*")}
+    assert names == {
+        ".lock", "run.json", "checkpoint.safetensors", "checkpoint.previous.safetensors",
+        "policies", "mine.txt",
+    }  # fmt: skip
+
+
+def test_a_checkpoint_between_its_two_renames_is_not_lost(run: RunDirectory) -> None:
+    save(run, 1)
+    state = save(run, 2)
+    latest = run.path / "checkpoint.safetensors"
+    latest.rename(run.path / "checkpoint.new.safetensors")
+    run.begin()
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert_same(found[0], state)
+
+
+def test_checkpoints_go_when_their_phase_is_done_and_not_before(run: RunDirectory) -> None:
+    save(run, 1, "landing")
+    save(run, 2, "landing")
+    save(run, 3, "selector")  # the one before is landing's
+    run.phase("landing").update(status="done", steps=5, seconds=1.0)
+    run.save()
+    run.begin()
+    assert not (run.path / "checkpoint.previous.safetensors").exists()
+    assert run.load_checkpoint(Learnt, "selector") is not None
+    run.drop_checkpoints()
+    assert run.load_checkpoint(Learnt, "selector") is None
+    assert not list(run.path.glob("checkpoint*"))
+
+
+WRITES: dict[str, Any] = {
+    "run.json": lambda run, policy: run.save(),
+    "a checkpoint": lambda run, policy: save(run, 1),
+    "metrics": lambda run, policy: run.log({"update": 1}),
+    "a policy": lambda run, policy: run.save_policy("landing", policy),
+}
+
+
+@pytest.mark.parametrize("write", WRITES.values(), ids=WRITES.keys())
+@pytest.mark.parametrize("how", ["deleted", "made again"])
+def test_a_run_deleted_while_it_is_trained_is_not_made_again(
+    run: RunDirectory, policy: AgentPolicy, write: Any, how: str
+) -> None:
+    run.begin()
+    shutil.rmtree(run.path)
+    if how == "made again":
+        RunDirectory.create(run.path, manifest())
+    before = list(run.path.glob("**/*"))
+    with pytest.raises(SkillweaveError, match="was deleted or moved while"):
+        write(run, policy)
+    assert list(run.path.glob("**/*")) == before
+
+
+@pytest.mark.parametrize("call", [1, 2])
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EIO])
+def test_a_checkpoint_that_cannot_be_renamed_is_an_error_for_people(
+    run: RunDirectory, monkeypatch: pytest.MonkeyPatch, call: int, error: int
+) -> None:
+    save(run, 1)
+    kept = save(run, 2)
+    real, calls = os.replace, 0
+
+    def failing(source: Any, target: Any) -> None:
+        nonlocal calls
+        calls += ".tmp" not in str(source)
+        if ".tmp" not in str(source) and calls == call:
+            raise OSError(error, os.strerror(error))
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", failing)
+    with pytest.raises(SkillweaveError, match=r"could not write .*checkpoint"):
+        save(run, 3)
+    monkeypatch.undo()
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert_same(found[0], kept)
+    assert not (run.path / "checkpoint.new.safetensors").exists()

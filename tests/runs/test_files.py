@@ -22,6 +22,7 @@ from skillweave.runs import files
 from skillweave.runs.files import (
     SCHEMA,
     read_json,
+    read_signed,
     read_tensors,
     write_bytes,
     write_json,
@@ -219,6 +220,27 @@ def test_damaged_json_is_an_error_that_names_the_file(tmp_path: Path, content: b
     assert str(path) in str(caught.value)
 
 
+def test_an_altered_json_file_is_told_by_its_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    write_json(path, {"steps": 12, "sizes": (1, 2)})
+    assert read_json(path) == {"schema": SCHEMA, "steps": 12, "sizes": [1, 2]}
+    path.write_text(path.read_text().replace("12", "13"))
+    with pytest.raises(SkillweaveError, match=r"checksum.*edited by hand"):
+        read_json(path)
+
+
+def test_json_without_a_checksum_is_of_an_older_version(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text('{"schema": 1, "steps": 12}')
+    assert read_json(tmp_path / "x.json")["steps"] == 12
+
+
+def test_a_pipe_in_the_place_of_a_file_does_not_block(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "x")
+    for read in (read_json, read_tensors):
+        with pytest.raises(SkillweaveError, match="a pipe or a device"):
+            read(tmp_path / "x")
+
+
 def test_missing_files_are_named(tmp_path: Path) -> None:
     for read in (read_json, read_tensors):
         with pytest.raises(SkillweaveError, match="does not exist") as caught:
@@ -268,6 +290,24 @@ def test_what_is_read_lies_in_memory_as_torch_would_have_put_it(tensors: Path) -
     # last bit, so a run resumed from such tensors does not end with the same weights.
     found, _ = read_tensors(tensors)
     assert {name: value.data_ptr() % 64 for name, value in found.items()} == dict.fromkeys(found, 0)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.complex64, torch.float8_e5m2])
+def test_tensors_of_any_type_have_a_checksum(tmp_path: Path, dtype: torch.dtype) -> None:
+    path = tmp_path / "x.safetensors"
+    given = torch.arange(6.0).reshape(2, 3).to(dtype)
+    sha256 = write_tensors(path, {"x": given, "scalar": given[0, 0].clone()}, {})
+    found, _, told = read_signed(path)
+    assert told == sha256
+    assert torch.equal(found["x"].view(torch.uint8), given.view(torch.uint8))
+
+
+@pytest.mark.parametrize("text", ["[" * 3000 + "]" * 3000, '{"schema": 1, "x": NaN}', "5"])
+def test_a_header_that_is_nested_deep_or_no_object_is_damaged(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(safetensors.torch.save({"x": torch.zeros(2)}, {"skillweave": text}))
+    with pytest.raises(SkillweaveError, match=r"x\.safetensors"):
+        read_tensors(path)
 
 
 def test_the_same_content_gives_the_same_bytes(tensors: Path) -> None:

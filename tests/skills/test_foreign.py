@@ -217,14 +217,14 @@ def test_wrong_files_are_named(tmp_path):
     (tmp_path / "junk").write_bytes(b"junk")
     for make, match in [
         (lambda: from_sb3(tmp_path / "junk", "ppo", trust=True), "junk could not be opened.*PPO"),
-        (lambda: from_sb3(tmp_path / "none", "ppo", trust=True), "could not read .*none"),
+        (lambda: from_sb3(tmp_path / "none", "ppo", trust=True), "none does not exist"),
         (lambda: from_sb3(tmp_path / "junk", trust=True), "algorithm is None.*ppo, a2c"),
         (lambda: from_sb3(tmp_path / "junk", "ppoo", trust=True), "'ppoo'"),
         (lambda: from_sb3(3), "neither"),
         (lambda: from_torch(torch.nn.Linear), "made of its class"),
         (lambda: from_function(3), "not 3"),
         (lambda: from_onnx(tmp_path / "junk"), "junk is no ONNX model|junk cannot be run"),
-        (lambda: from_onnx(tmp_path / "none"), "could not read .*none"),
+        (lambda: from_onnx(tmp_path / "none"), "none does not exist"),
         (lambda: from_onnx(onnx_file(tmp_path / "x", batch=7)), "exactly 7.*dynamic"),
         (lambda: from_onnx(onnx_file(tmp_path / "x"), output="y"), "no output 'y'.*logits, action"),
     ]:

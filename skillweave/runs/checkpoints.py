@@ -1,0 +1,87 @@
+"""The checkpoints of the phase under way: the latest, and the one before it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from skillweave.reading import fit
+from skillweave.runs.files import move, read_header, read_tensors, remove, write_tensors
+from skillweave.runs.manifest import Checkpoint
+from skillweave.types import SkillweaveError
+
+
+class Checkpoints:
+    """Two files in a run; at every moment one of them is whole."""
+
+    def __init__(self, directory: Path) -> None:
+        names = "checkpoint.new", "checkpoint", "checkpoint.previous"
+        self._files = [directory / f"{name}.safetensors" for name in names]
+
+    def save(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+        """Write the latest; the one that was becomes the one before.
+
+        Raises:
+            SkillweaveError: the disk is full or cannot be written; there still is a whole one.
+        """
+        fresh, latest, before = self._files
+        write_tensors(fresh, tensors, header, make_directories=False)
+        try:
+            if latest.exists():
+                move(latest, before)
+            move(fresh, latest)
+        except SkillweaveError:
+            with suppress(OSError):
+                fresh.unlink(missing_ok=True)
+            raise
+
+    def load(
+        self, phase: str, check: Callable[[dict[str, Any], Path], None]
+    ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
+        """Tensors and header of a phase's latest good one, and its file; None: there is none yet.
+
+        Args:
+            check: given a header and its file, raises where they do not belong here.
+
+        Raises:
+            SkillweaveError: there are some of this phase, but none is good.
+        """
+        problems = []
+        for path in self._files[1:]:
+            if not os.path.lexists(path):
+                continue
+            try:
+                tensors, header = read_tensors(path)
+                if header.get("phase") != phase:
+                    continue
+                check(fit(Checkpoint, header, str(path)), path)
+                return tensors, header, path
+            except SkillweaveError as error:
+                problems.append(str(error))
+        if problems:
+            raise SkillweaveError(
+                "; ".join(problems) + f". Delete it to train the phase {phase!r} from its start"
+            )
+        return None
+
+    def drop(self) -> None:
+        """Remove them: their phase is done, and ``run.json`` says so."""
+        for path in self._files:
+            remove(path)
+
+    def clear(self, done: Sequence[str]) -> None:
+        """Put in order what a killed process left; ``done`` are the phases that need none."""
+        fresh, latest, _ = self._files
+        if fresh.exists() and not latest.exists():  # killed between two renames: it is whole
+            move(fresh, latest)
+        remove(fresh)
+        for path in self._files:
+            with suppress(SkillweaveError):  # a damaged one is told when it is needed
+                if path.exists() and read_header(path).get("phase") in done:
+                    read_tensors(path)  # not on the word of a damaged header
+                    remove(path)

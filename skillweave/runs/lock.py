@@ -1,0 +1,75 @@
+"""One process at a time trains a run: a lock that the system releases when its process dies."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from skillweave.types import SkillweaveError
+
+try:
+    import fcntl
+except ImportError:  # Windows: nothing keeps two processes apart there
+    fcntl = None  # type: ignore[assignment]
+
+NAME = ".lock"
+"""The file in the run that is locked; it is empty."""
+_held: set[int] = set()
+
+
+class Lock:
+    """Held from ``__init__`` to ``release``."""
+
+    def __init__(self, directory: Path) -> None:
+        """Take it.
+
+        Raises:
+            SkillweaveError: another process has it, or the directory cannot be written.
+        """
+        self._directory, self._path = directory, directory / NAME
+        try:
+            self._handle = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise SkillweaveError(f"could not write {self._path}: {error.strerror}") from error
+        _held.add(self._handle)
+        if fcntl is None:
+            return
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self.release()
+            raise SkillweaveError(
+                f"{directory} is being trained by another process (or by another run of this one); "
+                "wait until it ends, or stop it"
+            ) from error
+        except OSError:  # a file system without locks
+            return
+
+    def check(self) -> None:
+        """Raise a SkillweaveError where the run is not there any more."""
+        try:
+            there = os.path.samestat(os.stat(self._path), os.fstat(self._handle))
+        except OSError:
+            there = False
+        if not there:
+            raise SkillweaveError(
+                f"{self._directory} was deleted or moved while it was being trained; training ends "
+                "here, for there is no run to write to"
+            )
+
+    def release(self) -> None:
+        """Let it go, if it is held."""
+        if self._handle in _held:
+            _held.discard(self._handle)
+            os.close(self._handle)
+
+
+def _let_go() -> None:
+    """In a process forked from this one: a worker must not hold the lock when its parent dies."""
+    for handle in _held:
+        os.close(handle)
+    _held.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go)

@@ -1,0 +1,172 @@
+"""What ``run.json`` and the headers of checkpoints hold: the schema that reading them goes by.
+
+To add a field, add a line; ``NotRequired`` where older runs do not have it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
+
+from skillweave.algorithms.config import config_from_json
+from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
+from skillweave.skills.base import NAME
+from skillweave.skills.foreign import Source
+from skillweave.types import SkillweaveError
+
+Name = Annotated[
+    str, Asked("letters, digits, '_' and '-', at most 64", lambda x: NAME.fullmatch(x) is not None)
+]
+"""It names a file, too."""
+
+
+class SkillEntry(TypedDict):
+    """A skill of the run."""
+
+    name: Name
+    max_steps: Positive | None
+    ready: NotRequired[bool]
+    policy: NotRequired[Source]
+
+
+class Winner(TypedDict):
+    """The member that a population's phase ended with."""
+
+    member: Count
+    fitness: float
+    generation: Count
+    generations: Count
+
+
+class PhaseEntry(TypedDict):
+    """A phase: what it is to train, and how far it is."""
+
+    name: Name
+    budget: Positive
+    algorithm: dict[str, Any]
+    status: Literal["waiting", "training", "done"]
+    evolution: NotRequired[dict[str, Any] | None]
+    metrics_bytes: NotRequired[Count]
+    lineage_bytes: NotRequired[Count]
+    steps: NotRequired[Count]
+    evaluation_steps: NotRequired[Count]
+    seconds: NotRequired[Seconds]
+    steps_per_second: NotRequired[float]
+    final: NotRequired[dict[str, float | None]]
+    winner: NotRequired[Winner]
+    sha256: NotRequired[str]
+    """Of its policy's file."""
+
+
+class Manifest(TypedDict):
+    """``run.json``."""
+
+    kind: Literal["hierarchy", "flat"]
+    env: str
+    env_kwargs: dict[str, Any]
+    seed: Count
+    cut_every: Positive
+    skills: list[SkillEntry]
+    call_steps: Positive | None
+    greedy_skills: bool
+    needs_recipe: bool
+    phases: list[PhaseEntry]
+    created: str
+    versions: dict[str, str]
+    id: NotRequired[str]
+    eval_every: NotRequired[Positive | None]
+    eval_episodes: NotRequired[Positive]
+    reflexes: NotRequired[list[str]]
+    reflexes_in_training: NotRequired[bool]
+    resume_needs_recipe: NotRequired[bool]
+    recipe: NotRequired[str | None]
+    track: NotRequired[list[str]]
+
+
+class MemberEntry(TypedDict):
+    """A member of a population, in a checkpoint's header."""
+
+    number: Count
+    steps: Count
+    config: dict[str, Any]
+    origin: Origin
+
+
+class Origin(TypedDict):
+    """Where a member comes from."""
+
+    parent: Count | None
+    mutation: str
+    changes: dict[str, tuple[Any, Any]]
+
+
+class BestEntry(TypedDict):
+    """The best member of a population so far."""
+
+    fitness: float
+    number: Count
+    generation: Count
+    policy: dict[str, Any]
+
+
+class Checkpoint(TypedDict):
+    """A checkpoint's header."""
+
+    phase: Name
+    update: Count
+    steps: Count
+    seconds: Seconds
+    metrics: dict[str, float | None]
+    metrics_bytes: Count
+    run: NotRequired[str]
+    evaluation_steps: NotRequired[Count]
+    fitness_steps: NotRequired[Count]
+    lineage_bytes: NotRequired[Count]
+    generation: NotRequired[Count]
+    rounds: NotRequired[Count]
+    next_number: NotRequired[Count]
+    members: NotRequired[list[MemberEntry]]
+    best: NotRequired[BestEntry]
+
+
+def check_manifest(data: Mapping[str, Any], file: str) -> None:
+    """Raise a SkillweaveError that names the file and the field where a manifest is wrong."""
+    manifest = fit(Manifest, data, file)
+    for kind in ("skills", "phases"):
+        names = [entry["name"] for entry in manifest[kind]]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise SkillweaveError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
+    for i, phase in enumerate(manifest["phases"]):
+        where = f"phases[{i}]"
+        config_from_json(phase["algorithm"], file, f"{where}.algorithm")
+        if phase["status"] == "done" and not {"steps", "seconds"} <= set(phase):
+            raise SkillweaveError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
+    if "id" in data and "sha256" not in data:
+        raise SkillweaveError(f"{file} is damaged: no field 'sha256', the checksum of it all")
+
+
+def identity(manifest: Mapping[str, Any]) -> str:
+    """What distinguishes a new run from others, in 16 letters.
+
+    Runs that are bound to end with the same weights have the same.
+    """
+    settled = {k: v for k, v in manifest.items() if k not in ("recipe", "track")}
+    return hashlib.sha256(json.dumps(settled, sort_keys=True, default=str).encode()).hexdigest()[
+        :16
+    ]
+
+
+def versions() -> dict[str, str]:
+    """Of Skillweave, Python, what it stands on, and the machine."""
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in ("skillweave", "torch", "gymnasium", "numpy", "envpool"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,186 @@
+"""A policy plays only where it belongs, and only if its numbers are numbers."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+
+from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
+from skillweave.algorithms.policy import make_algorithm, state_from
+from skillweave.cli import main
+from skillweave.runs.agents import load_agent, save_agent
+from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
+from skillweave.seeding import Seeds
+
+SMALL = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)), overlap=False)
+NAMES = "left", "right", "stay"
+
+
+def declare(names: tuple[str, ...] = NAMES) -> Hierarchy:
+    skills = [type(name, (Skill,), {"name": name})() for name in names]
+    how: dict[str, Any] = {"skill_steps": 32, "selector_steps": 64, "call_steps": 4}
+    return Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, **how)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("places")
+    declare().train(folder / "run", quiet=True).save_weights(folder / "w.safetensors")
+    return folder
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    shutil.copytree(trained / "run", tmp_path / "run")
+    return tmp_path / "run"
+
+
+def policy(run: Path, phase: str) -> Path:
+    return run / "policies" / f"{phase}.safetensors"
+
+
+def test_swapped_skills_are_refused(run: Path) -> None:
+    a, b = policy(run, "left"), policy(run, "right")
+    first, second = a.read_bytes(), b.read_bytes()
+    a.write_bytes(second)
+    b.write_bytes(first)
+    with pytest.raises(SkillweaveError, match=r"left\.safetensors holds the policy of .*'right'"):
+        declare().load(run)
+
+
+def older(run: Path) -> None:
+    """The run as a version wrote it that bound no files."""
+    data = read_json(run / "run.json")
+    data.pop("id")
+    for entry in data["phases"]:
+        entry.pop("sha256")
+        tensors, header = read_tensors(policy(run, entry["name"]))
+        plain = {k: v for k, v in header.items() if k not in ("run", "phase")}
+        write_tensors(policy(run, entry["name"]), tensors, plain)
+    write_json(run / "run.json", data)
+
+
+def test_of_an_older_run_a_selector_in_the_place_of_a_skill_is_refused(run: Path) -> None:
+    older(run)
+    declare().load(run).evaluate(1)
+    for target, source in (("left", "selector"), ("selector", "right")):
+        before = policy(run, target).read_bytes()
+        policy(run, target).write_bytes(policy(run, source).read_bytes())
+        with pytest.raises(SkillweaveError, match=r"in the place of .* has action_space Discrete"):
+            declare().load(run)
+        policy(run, target).write_bytes(before)
+
+
+def test_a_selector_alone_is_no_flat_agent(run: Path) -> None:
+    with pytest.raises(SkillweaveError, match="holds a selector alone"):
+        declare(("left", "right")).load_weights(policy(run, "selector"))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["actor.0.weight", "critic.1.bias"])
+def test_weights_that_are_not_finite_are_refused_by_name(
+    run: Path, trained: Path, tmp_path: Path, name: str, value: float
+) -> None:
+    tensors, header = read_tensors(policy(run, "selector"))
+    tensors[name].view(-1)[0] = value
+    data = read_json(run / "run.json")
+    data["phases"][-1]["sha256"] = write_tensors(policy(run, "selector"), tensors, header)
+    write_json(run / "run.json", data)
+    with pytest.raises(SkillweaveError, match=f"tensor {name} holds NaN or infinity"):
+        declare().load(run)
+    tensors, header = read_tensors(trained / "w.safetensors")
+    tensors[f"left/{name}"].view(-1)[0] = value
+    write_tensors(tmp_path / "w.safetensors", tensors, header)
+    with pytest.raises(SkillweaveError, match=rf"\(left\): tensor {name} holds NaN or infinity"):
+        declare().load_weights(tmp_path / "w.safetensors")
+
+
+def test_weights_of_another_type_are_refused_by_name(run: Path) -> None:
+    tensors, header = read_tensors(policy(run, "left"))
+    tensors["actor.0.weight"] = tensors["actor.0.weight"].double()
+    data = read_json(run / "run.json")
+    data["phases"][0]["sha256"] = write_tensors(policy(run, "left"), tensors, header)
+    write_json(run / "run.json", data)
+    says = r"tensor actor\.0\.weight should hold torch\.float32, found torch\.float64"
+    with pytest.raises(SkillweaveError, match=says):
+        declare().load(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"skills": 5}, "skills is 5; it must be a list"),
+        ({"call_steps": "a"}, "call_steps is 'a'; it must be a whole number"),
+        ({"parts": {"left": 5}}, "parts['left'] is 5; it must be an object"),
+        ({"ready": {"left": []}}, "ready['left'] is []; it must be an object"),
+        ({"env": ["CartPole-v1"]}, "env is ['CartPole-v1']; it must be a text"),
+    ],
+)
+def test_a_wrong_field_of_a_weights_file_is_named(
+    trained: Path, tmp_path: Path, change: dict[str, Any], says: str
+) -> None:
+    path = tmp_path / "w.safetensors"
+    tensors, header = read_tensors(trained / "w.safetensors")
+    write_tensors(path, tensors, header | change)
+    h = declare()
+    with pytest.raises(SkillweaveError) as caught:
+        h.load_weights(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert says in str(caught.value)
+    assert h.call_steps == 4
+
+
+@pytest.mark.parametrize("part", ["observation_space", "action_space", "algorithm"])
+@pytest.mark.parametrize("value", [{}, {"type": []}, {"type": "Box", "shape": [10**12]}, None])
+def test_a_damaged_part_of_a_policys_header_is_named(
+    trained: Path, tmp_path: Path, part: str, value: Any
+) -> None:
+    path = tmp_path / "w.safetensors"
+    tensors, header = read_tensors(trained / "w.safetensors")
+    header["parts"]["left"][part] = value
+    write_tensors(path, tensors, header)
+    with pytest.raises(SkillweaveError) as caught:
+        declare().load_weights(path)
+    assert str(caught.value).startswith(f"{path} (left)")
+
+
+def test_a_flat_agents_damaged_header_is_told_by_the_command_line(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tensors, header = read_tensors(policy(run, "left"))
+    path = tmp_path / "w.safetensors"
+    for change in ({"env": 5, "env_kwargs": {}}, {"env": "CartPole-v1", "env_kwargs": 5}):
+        write_tensors(path, tensors, header | change)
+        assert main(["evaluate", str(path)]) == 1
+        assert "is 5; it must be" in capsys.readouterr().err
+
+
+def test_an_agents_state_of_another_shape_or_type_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "agent.safetensors"
+    made = agent()
+    save_agent(path, made, made.init([Seeds(0)]), {})
+    tensors, header = read_tensors(path)
+    load_agent(path, Seeds(1))
+    for changed in (tensors["state.mu"][:, :-1].clone(), tensors["state.mu"].double()):
+        write_tensors(path, tensors | {"state.mu": changed}, header)
+        with pytest.raises(SkillweaveError, match="tensor mu should"):
+            load_agent(path, Seeds(1))
+
+
+def agent() -> Any:
+    box = gym.spaces.Box(-1.0, 1.0, (3,))
+    return make_algorithm(DQN(network=Network((4,))), box, gym.spaces.Discrete(2))
+
+
+def test_a_state_that_lacks_a_tensor_is_refused_by_name() -> None:
+    state = agent().init([Seeds(0)])
+    tensors = dict(vars(state))
+    assert torch.equal(state_from(tensors, state, "x").params, state.params)
+    del tensors["params"]
+    with pytest.raises(SkillweaveError, match=r"x: tensor params should be .*found nothing"):
+        state_from(tensors, state, "x")
