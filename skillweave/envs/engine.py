@@ -8,6 +8,7 @@ An environment that has ended must be reset before the next step.
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,8 +17,10 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from skillweave.envs.checks import Watch
+from skillweave.envs.workers import WorkerVector
 from skillweave.spaces import pack
 from skillweave.types import Array, MissingExtra, SkillweaveError
 
@@ -88,16 +91,14 @@ class Pausable(gym.Wrapper[Any, Any, Any, Any]):
 class GymnasiumEngine:
     """Gymnasium environments, in this process or in processes of their own."""
 
-    def __init__(self, make: Any, num_envs: int, processes: bool = False) -> None:
-        makers = [lambda: Pausable(make())] * num_envs
-        kwargs: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}
-        self._vector: Any = (
-            AsyncVectorEnv(makers, **kwargs) if processes else SyncVectorEnv(makers, **kwargs)
-        )
+    def __init__(self, make: Any, num_envs: int, name: str, processes: bool = False) -> None:
+        makers = [functools.partial(_pausable, make, i) for i in range(num_envs)]
+        self._vector: Any = WorkerVector(makers, name) if processes else _vector_here(makers, name)
         self.num_envs = num_envs
         self.observation_space: gym.Space[Any] = self._vector.single_observation_space
         go_and_action: Any = self._vector.single_action_space
         self.action_space: gym.Space[Any] = go_and_action[1]
+        self._watch = Watch(name, self.observation_space, num_envs)
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
         self._actions: Any = gym.vector.utils.create_empty_array(
             self.action_space, num_envs, np.zeros
@@ -107,7 +108,7 @@ class GymnasiumEngine:
         """Start all anew from one seed; observations (N, *obs_shape)."""
         seeds = np.random.SeedSequence(seed).generate_state(self.num_envs, np.uint32) >> 1
         obs, _ = self._vector.reset(seed=[int(s) for s in seeds])
-        return pack(self.observation_space, obs)
+        return self._watch.begun(pack(self.observation_space, obs))
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
         """Start some anew; observations (n, *obs_shape)."""
@@ -117,7 +118,7 @@ class GymnasiumEngine:
         for i, seed in zip(ids, seeds or (), strict=False):
             each[int(i)] = int(seed)
         obs, _ = self._vector.reset(seed=each, options={"reset_mask": mask})
-        return pack(self.observation_space, obs)[ids]
+        return self._watch.begun(pack(self.observation_space, obs)[ids], ids)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
         """Act in some environments; the others stand still."""
@@ -138,7 +139,9 @@ class GymnasiumEngine:
             )
             info = _info_rows(info, ids)
         truncated = truncated & ~terminated
-        return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
+        raw = RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
+        self._watch.stepped(raw, ids)
+        return raw
 
     def close(self) -> None:
         """Release the environments."""
@@ -155,6 +158,7 @@ class EnvPoolEngine:
         # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
         self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
+        self._watch = Watch(env_id, self.observation_space, num_envs)
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
@@ -200,14 +204,14 @@ class EnvPoolEngine:
         # A pool takes its seed only when made; making one takes milliseconds.
         self._pool = self.make_pool(seed)
         obs, _ = self._pool.reset()
-        return np.asarray(obs)
+        return self._watch.begun(np.asarray(obs))
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
         """Start some anew; observations (n, *obs_shape)."""
         if seeds is not None:
             raise SkillweaveError("EnvPool cannot reset single environments to a seed")
         obs, _ = self._pool.reset(ids.astype(np.int32))
-        return np.asarray(obs)
+        return self._watch.begun(np.asarray(obs), ids)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
         """Act in some environments; the others stand still."""
@@ -217,11 +221,34 @@ class EnvPoolEngine:
         obs, reward, terminated, truncated, info = self._pool.step(action, ids)
         # An episode that terminates on the very step of its time limit arrives as truncated:
         # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
-        return RawStep(obs, reward, terminated, truncated, info)
+        raw = RawStep(obs, reward, terminated, truncated, info)
+        self._watch.stepped(raw, ids)
+        return raw
 
     def close(self) -> None:
         """Release the environments."""
         self._pool = None
+
+
+def _pausable(make: Any, number: int) -> Pausable:
+    return Pausable(make(number=number))
+
+
+def _vector_here(makers: Sequence[Any], name: str) -> SyncVectorEnv[Any, Any]:
+    """The environments in this process.
+
+    Raises:
+        SkillweaveError: they have different spaces, or are one and the same.
+    """
+    try:
+        vector = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
+    except RuntimeError as error:
+        raise SkillweaveError(f"{name}: its environments differ: {error}") from error
+    if len({id(env.unwrapped) for env in vector.envs}) < len(makers):
+        raise SkillweaveError(
+            f"{name} gives the same environment each time; the function must make a new one"
+        )
+    return vector
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
 
 from skillweave.skills import Reflex, Skill, apply_reflexes, checked
 from skillweave.types import SkillweaveError, Step
@@ -73,20 +74,20 @@ OBS = np.array([[0.0], [1.0], [2.0]])
 
 def test_a_reflex_overrides_the_action_where_it_holds_and_leaves_its_argument_alone():
     action = np.array([5, 5, 5])
-    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(OBS, action)
+    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(OBS, action, Discrete(6))
     assert (overridden.tolist(), holds.tolist()) == ([5, 0, 0], [False, True, True])
     assert action.tolist() == [5, 5, 5]
 
 
 def test_a_reflex_may_compute_its_actions_from_the_observations_where_it_holds():
     reflex = Reflex(lambda obs: obs[:, 0] > 0, lambda obs: 10 * obs)
-    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0))
+    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0), Box(-50, 50, (1,)))
     assert overridden.tolist() == [[5], [10], [20]]
 
 
 def test_the_last_reflex_wins():
     reflexes = (Reflex(lambda o: o[:, 0] > 0, 1), Reflex(lambda o: o[:, 0] > 1, 2))
-    assert apply_reflexes(reflexes, OBS, np.zeros(3, int)).tolist() == [0, 1, 2]
+    assert apply_reflexes(reflexes, OBS, np.zeros(3, int), Discrete(3)).tolist() == [0, 1, 2]
 
 
 def test_a_reflex_is_named_after_its_condition():
@@ -98,7 +99,8 @@ def test_a_reflex_is_named_after_its_condition():
     with pytest.raises(
         SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"
     ):
-        Reflex(lambda obs: np.zeros(2, bool), 0, name="leg_touches").apply(OBS, np.zeros(3))
+        reflex = Reflex(lambda obs: np.zeros(2, bool), 0, name="leg_touches")
+        reflex.apply(OBS, np.zeros(3, int), Discrete(2))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
