@@ -15,7 +15,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, plan, trainer
 from skillweave.hierarchy import training
-from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.declaration import Declaration, check_budgets
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.weights import read_weights, write_weights
 from skillweave.reporting.progress import Progress
@@ -24,7 +24,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
-from skillweave.types import Memory, Policy, SkillweaveError
+from skillweave.types import Memory, Policy, SkillweaveError, short, whole_number
 
 
 class Hierarchy(Declaration):
@@ -57,11 +57,12 @@ class Hierarchy(Declaration):
         Raises:
             SkillweaveError: the declaration does not fit the environment, or training diverged.
         """
-        if seed < 0:
-            raise SkillweaveError(f"seed is {seed}; it must be at least 0")
+        seed = whole_number(seed, "seed", 0)
+        run_dir = _as_path(run_dir, "run_dir")
         self.check_spaces()
         content = training.manifest(self, seed=seed, flat=flat)
         plan(content["phases"], evolve)
+        check_budgets(content["phases"])
         track = tuple(track)
         make_trackers(track, None)  # a missing extra is said before anything is written
         run = RunDirectory.create(run_dir, content | {"recipe": self.recipe, "track": track})
@@ -72,19 +73,20 @@ class Hierarchy(Declaration):
 
         ``evolve`` is needed only where the population evolves by a selection of your own.
         """
-        run = RunDirectory.open(run_dir)
+        run = RunDirectory.open(_as_path(run_dir, "run_dir"))
         self._must_fit(run)
         return self._go_on(run, quiet, evolve)
 
     def load(self, run_dir: str | Path) -> Run:
         """A finished run of this hierarchy."""
-        run = RunDirectory.open(run_dir)
+        run = RunDirectory.open(_as_path(run_dir, "run_dir"))
         self._must_fit(run)
         return Run(self, run.path, training.load(self, run))
 
     def load_weights(self, path: str | Path) -> Run:
         """This hierarchy with the weights of one file (see ``Run.save_weights``)."""
-        return Run(self, Path(path), read_weights(self, Path(path)))
+        path = _as_path(path, "path")
+        return Run(self, path, read_weights(self, path))
 
     @staticmethod
     def pretrained(name: str) -> Run:
@@ -134,6 +136,12 @@ class Hierarchy(Declaration):
         self.greedy_skills = run.manifest["greedy_skills"]
 
 
+def _as_path(path: str | Path, name: str) -> Path:
+    if not isinstance(path, str | Path) or "\0" in str(path):
+        raise SkillweaveError(f"{name} is {short(path)}; it must be a path")
+    return Path(path)
+
+
 class Task(Skill):
     """The environment's own reward and ends."""
 
@@ -178,14 +186,20 @@ class Run:
         seed: int = 0,
         deterministic: bool = True,
         skill: str | None = None,
+        max_steps: int | None = None,
     ) -> Evaluation:
-        """Score it on Gymnasium's environment; ``skill`` scores one skill alone."""
+        """Score it on Gymnasium's environment; ``skill`` scores one skill alone.
+
+        An episode that nothing has ended after ``max_steps`` is cut, and the result says so; None:
+        after the environment's own time limit, or 100,000 steps.
+        """
         return evaluate(
             self._policy(skill),
             self.hierarchy.spec,
             episodes=episodes,
             seed=seed,
             deterministic=deterministic,
+            max_steps=max_steps,
         )
 
     def render(
@@ -211,7 +225,8 @@ class Run:
             name = policy.labels[int(acting[0])]
             return name, colors[name]
 
-        policy = self._policy(skill)
+        policy, path = self._policy(skill), _as_path(path, "path")
+        seed = whole_number(seed, "seed", 0)
         return render_policy(
             self.hierarchy.spec,
             policy,
@@ -226,8 +241,9 @@ class Run:
 
     def save_weights(self, path: str | Path) -> Path:
         """Write every policy into one file for ``Hierarchy.load_weights``."""
-        write_weights(Path(path), self.hierarchy, self.policy, self.hierarchy.recipe)
-        return Path(path)
+        path = _as_path(path, "path")
+        write_weights(path, self.hierarchy, self.policy, self.hierarchy.recipe)
+        return path
 
     def as_skill(self, name: str, **attributes: Any) -> Skill:
         """The whole hierarchy as one skill of another."""

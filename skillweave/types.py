@@ -8,6 +8,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -74,8 +75,14 @@ class _Plain(str):
 def read_only(array: Array) -> Array:
     """A view that cannot be written to."""
     view = array.view()
-    view.flags.writeable = False
+    view.setflags(False)  # type: ignore[call-arg]  # by name it takes three times as long
     return view
+
+
+def finite(array: Array) -> bool:
+    """Whether all numbers are; a sum of squares says so in a third of the time, or overflows."""
+    flat = array.ravel()
+    return isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
 def whole_number(value: object, name: str, least: int) -> int:
@@ -92,7 +99,7 @@ def whole_number(value: object, name: str, least: int) -> int:
     return int(value)
 
 
-@dataclass(slots=True, frozen=True)
+@dataclass(slots=True)
 class Step:
     """One environment transition as a skill's methods see it, batched over N environments.
 
@@ -113,11 +120,11 @@ class Step:
     info: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        for name in _STEP_ARRAYS:
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-
-
-_STEP_ARRAYS = tuple(f.name for f in fields(Step) if f.name != "info")
+        # Of every step of training: a loop over the names would take three times as long.
+        self.obs, self.next_obs = read_only(self.obs), read_only(self.next_obs)
+        self.action, self.reward = read_only(self.action), read_only(self.reward)
+        self.terminated, self.truncated = read_only(self.terminated), read_only(self.truncated)
+        self.timed_out, self.elapsed = read_only(self.timed_out), read_only(self.elapsed)
 
 
 @dataclass(slots=True)

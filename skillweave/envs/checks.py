@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.types import Array, SkillweaveError, short, told
+from skillweave.types import Array, SkillweaveError, finite, short, told
 
 LONGEST_EPISODE = 100_000
 """Steps after which an episode is cut that nothing ends, wherever a policy is only watched."""
@@ -125,6 +125,15 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         return SkillweaveError(f"{self._name}: {where}step {self._elapsed} of its episode: {what}")
 
 
+def time_limit(env: gym.Env[Any, Any]) -> int | None:
+    """Steps after which an environment truncates its episodes; None: nobody knows."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.TimeLimit):
+            return int(env._max_episode_steps)
+        env = env.env
+    return None
+
+
 class Watch:
     """Counts the steps of N environments' episodes, and sees where a number is not finite.
 
@@ -161,7 +170,7 @@ class Watch:
         else:
             self._elapsed[ids] += 1
         self._check(raw.next_obs, ids)
-        if not np.isfinite(raw.reward).all():
+        if not finite(raw.reward):
             row = int(np.flatnonzero(~np.isfinite(raw.reward))[0])
             raise self._wrong(row, ids, f"its reward is {raw.reward[row]}; it must be finite")
         return raw
@@ -171,7 +180,7 @@ class Watch:
             part = obs
             for name in place:
                 part = part[name]
-            if not np.isfinite(part).all():
+            if not finite(part):
                 raise self._not_finite(part, place, ids)
 
     def _not_finite(

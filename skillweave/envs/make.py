@@ -14,6 +14,8 @@ from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, EnvPoolEngine, GymnasiumEngine
 from skillweave.types import MissingExtra, SkillweaveError, short, told
 
+MOST = 65_536
+"""Environments in one engine."""
 EngineName = Literal["auto", "envpool", "sync", "async"]
 
 
@@ -114,6 +116,10 @@ class EnvSpec:
 
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None) -> Engine:
     """The engine for ``num_envs`` environments of this kind; ``threads`` for EnvPool's pool."""
+    if num_envs > MOST:
+        raise SkillweaveError(
+            f"{num_envs:,} environments of {spec.name}: at most {MOST:,} are made"
+        )
     cores = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0, 1])
     if spec.engine in ("auto", "envpool"):
         reference = spec.make()

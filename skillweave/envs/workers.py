@@ -77,7 +77,9 @@ class WorkerVector(VectorEnv[Any, Any, Any]):
                 )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._batch = create_empty_array(self.single_observation_space, self.num_envs, np.zeros)
+        self._batch: Any = create_empty_array(
+            self.single_observation_space, self.num_envs, np.zeros
+        )
         self._obs: list[Any] = [None] * self.num_envs
 
     def reset(

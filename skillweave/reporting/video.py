@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.checks import LONGEST_FILM
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds
-from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+from skillweave.types import Array, Memory, Policy, SkillweaveError, Step, whole_number
 
 if TYPE_CHECKING:
     from skillweave.envs.make import EnvSpec
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
-UNLIMITED = 10_000  # steps after which an episode is cut that nothing else would end
 HOLD = 1.0  # seconds that the last frame of an episode stands
 
 
@@ -47,22 +47,23 @@ def render_policy(
 
     Args:
         seed: episode i starts from ``reset(seed=seed + i)``.
-        max_steps: of an episode; None: the environment's own limit, at most ``UNLIMITED``.
+        max_steps: of an episode; None: the environment's own limit, at most ``LONGEST_FILM``.
         label: from the policy's memory after ``act`` to who acted, and its colour.
         fps: steps shown per second; None: as many as the environment says, so in real time.
         every: one frame for so many steps, and one for the end of each episode.
         rng: for ``act``; None: derived from ``seed``.
 
     Returns:
-        ``path``, ``frames``, and ``episodes``: for each its ``return``, its ``length`` and, as
-        ``skills``, how many steps each acted.
+        ``path``, ``frames``, and ``episodes``: for each its ``return``, its ``length``, whether it
+        was ``cut`` before its end and, as ``skills``, how many steps each acted.
 
     Raises:
         SkillweaveError: the environment gives no frames; see VideoWriter for more.
         MissingExtra: the extra 'video' is not installed.
     """
-    if episodes < 1 or every < 1:
-        raise SkillweaveError(f"episodes={episodes} and every={every} must be at least 1")
+    episodes, every = whole_number(episodes, "episodes", 1), whole_number(every, "every", 1)
+    seed = whole_number(seed, "seed", 0)
+    limit = LONGEST_FILM if max_steps is None else whole_number(max_steps, "max_steps", 1)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen
     act = functools.partial(
@@ -74,7 +75,7 @@ def render_policy(
         with VideoWriter(path, rate) as video:
             for i in range(episodes):
                 who, color, skills = "", BLACK, Counter[str]()
-                for now in _play(env, policy, act, seed + i, max_steps or UNLIMITED):
+                for now in _play(env, policy, act, seed + i, limit):
                     if label is not None and not now.over:
                         who, color = label(now.memory)
                         skills[who] += 1
@@ -83,7 +84,10 @@ def render_policy(
                         text = f"step {now.elapsed}   {word} {now.total:+.1f}"
                         frame = caption(_frame(env), who, color, text)
                         video.add(frame, HOLD if now.over else None)
-                told.append({"return": now.total, "length": now.elapsed, "skills": dict(skills)})
+                told.append({
+                    "return": now.total, "length": now.elapsed, "cut": not now.ended,
+                    "skills": dict(skills),
+                })  # fmt: skip
     finally:
         env.close()
     return {"path": str(path), "frames": video.frames, "episodes": told}
@@ -94,6 +98,7 @@ class _Moment(NamedTuple):
     elapsed: int  # steps
     total: float  # the return so far
     over: bool
+    ended: bool = False  # the environment ended it
 
 
 def _play(
@@ -115,7 +120,7 @@ def _play(
             np.array([elapsed]), {key: _batch_of_one(value) for key, value in info.items()},
         )  # fmt: skip
         memory = policy.observe(memory, step)
-    yield _Moment(memory, elapsed, total, True)
+    yield _Moment(memory, elapsed, total, True, bool(over))
 
 
 def _batch_of_one(value: Any) -> Any:

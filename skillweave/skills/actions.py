@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError
 from typing import Any
 
 import numpy as np
@@ -24,13 +23,19 @@ def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
     except SkillweaveError:
         raise
     except Exception as error:
-        when = "" if elapsed is None else f" at step {np.max(elapsed)}"
         # numpy says no more than that something cannot be written to
         hint = "; what it is given cannot be changed: change a copy"
-        hint = hint if isinstance(error, FrozenInstanceError) or "read-only" in str(error) else ""
+        hint = hint if "read-only" in str(error) else ""
         about = getattr(argument, "shape", None)
         given = "" if about is None else f" for observations of shape {about}"
-        raise SkillweaveError(f"{who} raised {told(error)}{when}{given}{hint}") from error
+        raise SkillweaveError(
+            f"{who} raised {told(error)}{at_step(elapsed)}{given}{hint}"
+        ) from error
+
+
+def at_step(elapsed: Any) -> str:
+    """When something happened, for messages; None: nobody knows."""
+    return "" if elapsed is None else f" at step {np.max(elapsed)}"
 
 
 def as_array(value: Any, who: str) -> Array:

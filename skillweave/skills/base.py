@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import Space
 
-from skillweave.skills.actions import as_array, called, checked_actions
-from skillweave.types import Array, SkillweaveError, Step, read_only, short
+from skillweave.skills.actions import as_array, at_step, called, checked_actions
+from skillweave.types import Array, SkillweaveError, Step, finite, read_only, short
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 
@@ -207,22 +207,24 @@ def checked(
         SkillweaveError: it has another shape or kind, or is a NaN or an infinity; the message
             names the skill, the method and the step.
     """
-    when = "" if elapsed is None else f" at step {np.max(elapsed)}"
     array = as_array(value, f"{who}: {method}()")
     if array.shape != (n,):
         raise SkillweaveError(
-            f"{who}: {method}() returned shape {array.shape}{when}, but ({n},) was expected: one "
-            f"number for each of the {n} environments"
+            f"{who}: {method}() returned shape {array.shape}{at_step(elapsed)}, but ({n},) was "
+            f"expected: one number for each of the {n} environments"
         )
     if dtype is bool:
-        return array if array.dtype == bool else _flags(array, f"{who}: {method}()", when)
+        return (
+            array if array.dtype == bool else _flags(array, f"{who}: {method}()", at_step(elapsed))
+        )
     if array.dtype.kind not in "fiub":
         raise SkillweaveError(
-            f"{who}: {method}() returned {_kind(array)}{when}, but rewards are real numbers"
+            f"{who}: {method}() returned {_kind(array)}{at_step(elapsed)}, but rewards are real "
+            "numbers"
         )
     with np.errstate(over="ignore"):  # an overflow is an infinity, reported below
         array = array.astype(dtype, copy=False)
-    if not np.isfinite(array).all():
+    if not finite(array):
         row = int(np.flatnonzero(~np.isfinite(array))[0])
         when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
         raise SkillweaveError(

@@ -96,10 +96,10 @@ def test_a_reflex_is_named_after_its_condition():
 
     assert Reflex(leg_touches, 0).name == "leg_touches"
     assert Reflex(leg_touches, 0, name="off").name == "off"
+    reflex = Reflex(lambda obs: np.zeros(2, bool), 0, name="leg_touches")
     with pytest.raises(
         SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"
     ):
-        reflex = Reflex(lambda obs: np.zeros(2, bool), 0, name="leg_touches")
         reflex.apply(OBS, np.zeros(3, int), Discrete(2))
 
 
