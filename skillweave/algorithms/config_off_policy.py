@@ -5,11 +5,11 @@ This module does not import torch; see ``config``, which has the rest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from skillweave.networks.config import Network
-from skillweave.types import SkillweaveError
+from skillweave.types import SkillweaveError, short
 
 Schedule = Literal["constant", "linear"]
 INFINITY = float("inf")
@@ -20,7 +20,7 @@ def check(config: object, field_name: str, ok: bool, asked: str) -> None:
     if not ok:
         value = getattr(config, field_name)
         raise SkillweaveError(
-            f"{type(config).__name__}.{field_name} is {value!r}; it must be {asked}"
+            f"{type(config).__name__}.{field_name} is {short(value)}; it must be {asked}"
         )
 
 
@@ -54,6 +54,13 @@ def positive(config: object, *names: str) -> None:
 def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
     """Raise where a field is none of the known words."""
     check(config, field_name, getattr(config, field_name) in known, f"one of {', '.join(known)}")
+
+
+def flags(config: Any) -> None:
+    """Raise where a field that is yes or no is something else."""
+    for f in fields(config):
+        if f.type == "bool":
+            check(config, f.name, isinstance(getattr(config, f.name), bool), "True or False")
 
 
 def check_networks(config: Any) -> None:
@@ -116,6 +123,7 @@ class OffPolicy:
 
     def __post_init__(self) -> None:
         check_networks(self)
+        flags(self)
         check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
         whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
         number(self, "gamma", "tau", "priority_alpha", "priority_beta", high=1.0)
