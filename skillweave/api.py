@@ -63,6 +63,8 @@ class Hierarchy(Declaration):
         content = training.manifest(self, seed=seed, flat=flat)
         plan(content["phases"], evolve)
         check_budgets(content["phases"])
+        if isinstance(track, str) or not isinstance(track, Sequence):
+            raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
         track = tuple(track)
         make_trackers(track, None)  # a missing extra is said before anything is written
         run = RunDirectory.create(run_dir, content | {"recipe": self.recipe, "track": track})

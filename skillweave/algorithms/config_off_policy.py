@@ -13,6 +13,8 @@ from skillweave.types import SkillweaveError, short
 
 Schedule = Literal["constant", "linear"]
 INFINITY = float("inf")
+HUGE = 1e18
+"""More than any setting may be: as a whole number it still fits into a tensor."""
 
 
 def check(config: object, field_name: str, ok: bool, asked: str) -> None:
@@ -39,16 +41,22 @@ def number(config: object, *names: str, low: float = 0.0, high: float = INFINITY
         asked = "a finite number"
     for name in names:
         value = getattr(config, name)
-        ok = type(value) in (int, float) and abs(value) < INFINITY
-        check(config, name, ok and low <= value <= high, asked)
+        ok = type(value) in (int, float) and abs(value) < HUGE
+        check(config, name, ok and low <= value <= high, f"{asked}{_huge(value)}")
 
 
 def positive(config: object, *names: str) -> None:
     """Raise where a field is no finite number above 0."""
     for name in names:
         value = getattr(config, name)
-        ok = type(value) in (int, float) and 0.0 < value < INFINITY
-        check(config, name, ok, "positive and finite")
+        ok = type(value) in (int, float) and 0.0 < value < HUGE
+        check(config, name, ok, f"positive and finite{_huge(value)}")
+
+
+def _huge(value: object) -> str:
+    """What to add where a number is finite, but too large."""
+    finite = type(value) in (int, float) and abs(value) < INFINITY  # type: ignore[arg-type]
+    return f", and below {HUGE:g}" if finite else ""
 
 
 def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:

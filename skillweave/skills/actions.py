@@ -25,7 +25,7 @@ def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
     except Exception as error:
         # numpy says no more than that something cannot be written to
         hint = "; what it is given cannot be changed: change a copy"
-        hint = hint if "read-only" in str(error) else ""
+        hint = hint if "read-only" in told(error) else ""
         about = getattr(argument, "shape", None)
         given = "" if about is None else f" for observations of shape {about}"
         raise SkillweaveError(

@@ -91,6 +91,8 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
         SkillweaveError: the space is not supported; the message says which are.
     """
     check_size(space, "action", _width(space))
+    if not _width(space):
+        raise SkillweaveError(f"action space {space} holds nothing to choose")
     if isinstance(space, gym.spaces.Discrete):
         return ActionCodec(space, (int(space.n),), _first(space.start))
     if isinstance(space, gym.spaces.MultiDiscrete):
