@@ -8,7 +8,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -80,9 +79,8 @@ def read_only(array: Array) -> Array:
 
 
 def finite(array: Array) -> bool:
-    """Whether all numbers are; a sum of squares says so in a third of the time, or overflows."""
-    flat = array.ravel()
-    return isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
+    """Whether all numbers are; of small arrays it takes half the time of ``isfinite().all()``."""
+    return b"\0" not in np.isfinite(array).tobytes()
 
 
 def whole_number(value: object, name: str, least: int) -> int:

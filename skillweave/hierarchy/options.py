@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.spaces import unpack
@@ -79,7 +80,9 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         steps = np.zeros(n, np.int64)
         terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
         rows = np.arange(n)
+        turns = 0
         while len(rows):
+            turns = self._turn(turns, rows, skill)
             here = obs if len(rows) == n else obs[rows]
             action = self.skills.act(self._memory, rows, here, self._rng)
             raw = self.engine.step(action, None if len(rows) == n else rows)
@@ -144,6 +147,21 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         for i in np.flatnonzero(ended):
             final[i] = unpack(self.single_observation_space, next_obs[i])
         return {"final_obs": final, "_final_obs": ended}
+
+    def _turn(self, turns: int, rows: Array, skill: Array) -> int:
+        """One more step of the calls of ``skill`` that still run, in environments ``rows``.
+
+        Raises:
+            SkillweaveError: there have been so many that nothing seems to end them.
+        """
+        if turns >= LONGEST_EPISODE:
+            name = self.skills.skills[int(skill[rows[0]])].name
+            raise SkillweaveError(
+                f"skill {name!r} has run for {turns:,} steps in environment {int(rows[0])}, and "
+                "neither its termination() nor the episode's end has come: give it max_steps, or "
+                "the hierarchy call_steps"
+            )
+        return turns + 1
 
     def _check(self, skill: Array) -> None:
         count = len(self.skills.skills)

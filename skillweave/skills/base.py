@@ -250,4 +250,5 @@ def _flags(array: Array, what: str, when: str) -> Array:
 
 
 def _kind(array: Array) -> str:
-    return f"{array.dtype} ({short(array.flat[0])})" if array.size else str(array.dtype)
+    first = array.reshape(-1)[:1].tolist()  # as Python's own values, which read better
+    return f"{array.dtype} ({short(first[0])})" if first else str(array.dtype)
