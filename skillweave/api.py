@@ -139,7 +139,7 @@ class Hierarchy(Declaration):
 
 
 def _as_path(path: str | Path, name: str) -> Path:
-    if not isinstance(path, str | Path) or "\0" in str(path):
+    if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
         raise SkillweaveError(f"{name} is {short(path)}; it must be a path")
     return Path(path)
 

@@ -13,8 +13,8 @@ from skillweave.types import SkillweaveError, short
 
 Schedule = Literal["constant", "linear"]
 INFINITY = float("inf")
-HUGE = 1e18
-"""More than any setting may be: as a whole number it still fits into a tensor."""
+HUGE = 1e38
+"""No setting may be as large: it has to fit into a tensor, a whole number into 63 bits."""
 
 
 def check(config: object, field_name: str, ok: bool, asked: str) -> None:
@@ -32,6 +32,13 @@ def whole(config: object, *names: str) -> None:
         value = getattr(config, name)
         check(config, name, type(value) is int, "a whole number")
         check(config, name, value >= 1, "at least 1")
+        _fits(config, name)
+
+
+def _fits(config: object, name: str) -> None:
+    value = getattr(config, name)
+    largest = 2**63 if isinstance(value, int) else HUGE
+    check(config, name, abs(value) < largest, f"below {largest:g}")
 
 
 def number(config: object, *names: str, low: float = 0.0, high: float = INFINITY) -> None:
@@ -41,22 +48,18 @@ def number(config: object, *names: str, low: float = 0.0, high: float = INFINITY
         asked = "a finite number"
     for name in names:
         value = getattr(config, name)
-        ok = type(value) in (int, float) and abs(value) < HUGE
-        check(config, name, ok and low <= value <= high, f"{asked}{_huge(value)}")
+        ok = type(value) in (int, float) and abs(value) < INFINITY
+        check(config, name, ok and low <= value <= high, asked)
+        _fits(config, name)
 
 
 def positive(config: object, *names: str) -> None:
     """Raise where a field is no finite number above 0."""
     for name in names:
         value = getattr(config, name)
-        ok = type(value) in (int, float) and 0.0 < value < HUGE
-        check(config, name, ok, f"positive and finite{_huge(value)}")
-
-
-def _huge(value: object) -> str:
-    """What to add where a number is finite, but too large."""
-    finite = type(value) in (int, float) and abs(value) < INFINITY  # type: ignore[arg-type]
-    return f", and below {HUGE:g}" if finite else ""
+        ok = type(value) in (int, float) and 0.0 < value < INFINITY
+        check(config, name, ok, "positive and finite")
+        _fits(config, name)
 
 
 def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
@@ -138,6 +141,7 @@ class OffPolicy:
         positive(self, "learning_rate", "max_grad_norm", "adam_eps", "update_ratio")
         number(self, "learning_starts")
         one_of(self, "learning_rate_schedule", ("constant", "linear"))
+        check(self, "batch_size", self.batch_size <= 1_000_000, "at most 1,000,000")
         least = self.num_envs * (self.n_step + 1)
         check(
             self,

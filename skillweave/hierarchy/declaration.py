@@ -147,7 +147,7 @@ class Declaration:
             if skill.name == name:
                 return skill
         raise SkillweaveError(
-            f"no skill {name!r}; there are: {', '.join(s.name for s in self.skills)}"
+            f"no skill {short(name)}; there are: {', '.join(s.name for s in self.skills)}"
         )
 
     def budget(self, skill: Skill) -> int:

@@ -84,10 +84,7 @@ def render_policy(
                         text = f"step {now.elapsed}   {word} {now.total:+.1f}"
                         frame = caption(_frame(env), who, color, text)
                         video.add(frame, HOLD if now.over else None)
-                told.append({
-                    "return": now.total, "length": now.elapsed, "cut": not now.ended,
-                    "skills": dict(skills),
-                })  # fmt: skip
+                told.append(now.told(skills))
     finally:
         env.close()
     return {"path": str(path), "frames": video.frames, "episodes": told}
@@ -99,6 +96,11 @@ class _Moment(NamedTuple):
     total: float  # the return so far
     over: bool
     ended: bool = False  # the environment ended it
+
+    def told(self, skills: Counter[str]) -> dict[str, Any]:
+        """The episode, at its end."""
+        how = {"return": self.total, "length": self.elapsed, "cut": not self.ended}
+        return how | {"skills": dict(skills)}
 
 
 def _play(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import replace as replaced
 from typing import Any
@@ -128,23 +130,18 @@ def evaluate(
     engine = make_engine(replaced(env, engine="sync"), n)
     try:
         _check_spaces(policy, engine.observation_space, engine.action_space, env.name)
-        return _play(policy, engine, threshold, episodes, seed, deterministic, limit)
+        rng = np.random.default_rng([seed, 1])
+        act = functools.partial(policy.act, deterministic=deterministic, rng=rng)
+        seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+        return replaced(_play(policy, act, engine, seeds, limit), threshold=threshold)
     finally:
         engine.close()
 
 
 def _play(
-    policy: Policy,
-    engine: Any,
-    threshold: float | None,
-    episodes: int,
-    seed: int,
-    deterministic: bool,
-    limit: int,
+    policy: Policy, act: Callable[..., Any], engine: Any, seeds: list[int], limit: int
 ) -> Evaluation:
-    n, cut = engine.num_envs, 0
-    rng = np.random.default_rng([seed, 1])
-    seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+    n, episodes, cut = engine.num_envs, len(seeds), 0
     episode = np.arange(n)  # which episode each environment plays
     upcoming = n
     engine.reset(0)
@@ -158,7 +155,7 @@ def _play(
     while len(rows):
         own = {k: v[rows] for k, v in memory.items()}
         here = obs[rows]
-        action, own = policy.act(own, here, deterministic=deterministic, rng=rng)
+        action, own = act(own, here)
         raw = engine.step(action, rows)
         elapsed[rows] += 1
         acting = policy.acting(own)
@@ -193,7 +190,7 @@ def _play(
     return Evaluation(
         tuple(returns.tolist()),
         tuple(lengths.tolist()),
-        threshold,
+        None,
         dict(zip(policy.labels, used.tolist(), strict=True)),
         dict(zip(policy.labels, calls.tolist(), strict=True)),
         cut,
