@@ -75,6 +75,8 @@ def test_a_call_that_nothing_ends_is_told_and_not_waited_for(options, monkeypatc
     monkeypatch.setattr("skillweave.hierarchy.options.LONGEST_EPISODE", 20)
 
     class Eternal(Left):
+        max_steps = None
+
         def termination(self, step):
             return np.zeros(len(step.reward), bool)
 
