@@ -15,7 +15,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, plan, trainer
 from skillweave.hierarchy import training
-from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.declaration import Declaration, check_budgets
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import read_weights, write_weights
 from skillweave.reporting.progress import Progress
@@ -25,7 +25,7 @@ from skillweave.runs.trackers import make_trackers
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.phase import check_replay
-from skillweave.types import Memory, Policy, SkillweaveError
+from skillweave.types import Memory, Policy, SkillweaveError, short, whole_number
 
 
 class Hierarchy(Declaration):
@@ -58,15 +58,18 @@ class Hierarchy(Declaration):
         Raises:
             SkillweaveError: the declaration does not fit the environment, or training diverged.
         """
-        if seed < 0:
-            raise SkillweaveError(f"seed is {seed}; it must be at least 0")
+        seed = whole_number(seed, "seed", 0)
+        run_dir = _as_path(run_dir, "run_dir")
         observation_space, action_space = self.check_spaces()
         content = training.manifest(self, seed=seed, flat=flat)
         plan(content["phases"], evolve)
+        check_budgets(content["phases"])
         for phase in content["phases"]:
             chooses = phase["name"] == "selector"
             acts = gym.spaces.Discrete(len(self.skills)) if chooses else action_space
             check_replay(phase, observation_space, acts)
+        if isinstance(track, str) or not isinstance(track, Sequence):
+            raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
         track = tuple(track)
         make_trackers(track, None)  # a missing extra is said before anything is written
         run = RunDirectory.create(run_dir, content | {"recipe": self.recipe, "track": track})
@@ -77,19 +80,20 @@ class Hierarchy(Declaration):
 
         ``evolve`` is needed only where the population evolves by a selection of your own.
         """
-        run = RunDirectory.open(run_dir)
+        run = RunDirectory.open(_as_path(run_dir, "run_dir"))
         self._must_fit(run)
         return self._go_on(run, quiet, evolve)
 
     def load(self, run_dir: str | Path) -> Run:
         """A finished run of this hierarchy."""
-        run = RunDirectory.open(run_dir)
+        run = RunDirectory.open(_as_path(run_dir, "run_dir"))
         self._must_fit(run)
         return Run(self, run.path, training.load(self, run))
 
     def load_weights(self, path: str | Path) -> Run:
         """This hierarchy with the weights of one file (see ``Run.save_weights``)."""
-        return Run(self, Path(path), read_weights(self, Path(path)))
+        path = _as_path(path, "path")
+        return Run(self, path, read_weights(self, path))
 
     @staticmethod
     def pretrained(name: str) -> Run:
@@ -140,6 +144,12 @@ class Hierarchy(Declaration):
         self.greedy_skills = run.manifest["greedy_skills"]
 
 
+def _as_path(path: str | Path, name: str) -> Path:
+    if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
+        raise SkillweaveError(f"{name} is {short(path)}; it must be a path")
+    return Path(path)
+
+
 class Task(Skill):
     """The environment's own reward and ends."""
 
@@ -184,6 +194,7 @@ class Run:
         seed: int = 0,
         deterministic: bool = True,
         skill: str | None = None,
+        max_steps: int | None = None,
     ) -> Evaluation:
         """Score it on Gymnasium's environment.
 
@@ -195,6 +206,8 @@ class Run:
             skill: score this skill alone, as if the selector always chose it: the hierarchy's
                 reflexes are in force, also where the skill was trained without them
                 (``reflexes_in_training=False``).
+            max_steps: an episode that nothing has ended by then is cut, and the result says so;
+                None: the environment's own time limit, or 100,000 steps.
         """
         return evaluate(
             self._policy(skill),
@@ -202,6 +215,7 @@ class Run:
             episodes=episodes,
             seed=seed,
             deterministic=deterministic,
+            max_steps=max_steps,
         )
 
     def render(
@@ -227,7 +241,8 @@ class Run:
             name = policy.labels[int(acting[0])]
             return name, colors[name]
 
-        policy = self._policy(skill)
+        policy, path = self._policy(skill), _as_path(path, "path")
+        seed = whole_number(seed, "seed", 0)
         return render_policy(
             self.hierarchy.spec,
             policy,
@@ -242,8 +257,9 @@ class Run:
 
     def save_weights(self, path: str | Path) -> Path:
         """Write every policy into one file for ``Hierarchy.load_weights``."""
-        write_weights(Path(path), self.hierarchy, self.policy, self.hierarchy.recipe)
-        return Path(path)
+        path = _as_path(path, "path")
+        write_weights(path, self.hierarchy, self.policy, self.hierarchy.recipe)
+        return path
 
     def as_skill(self, name: str, **attributes: Any) -> Skill:
         """The whole hierarchy as one skill of another."""

@@ -18,6 +18,7 @@ from skillweave.algorithms.config_off_policy import (
     OffPolicy,
     check,
     check_networks,
+    flags,
     number,
     one_of,
     positive,
@@ -87,6 +88,7 @@ class PPO:
 
     def __post_init__(self) -> None:
         check_networks(self)
+        flags(self)
         whole(self, "num_envs", "n_steps", "batch_size", "update_epochs", "threads")
         number(self, "gamma", "gae_lambda", high=1.0)
         positive(self, "learning_rate", "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")

@@ -5,14 +5,16 @@ This module does not import torch; see ``config``, which has the rest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from skillweave.networks.config import Network
-from skillweave.types import SkillweaveError
+from skillweave.types import SkillweaveError, short
 
 Schedule = Literal["constant", "linear"]
 INFINITY = float("inf")
+HUGE = 1e38
+"""No setting may be as large: it has to fit into a tensor, a whole number into 63 bits."""
 
 
 def check(config: object, field_name: str, ok: bool, asked: str) -> None:
@@ -20,7 +22,7 @@ def check(config: object, field_name: str, ok: bool, asked: str) -> None:
     if not ok:
         value = getattr(config, field_name)
         raise SkillweaveError(
-            f"{type(config).__name__}.{field_name} is {value!r}; it must be {asked}"
+            f"{type(config).__name__}.{field_name} is {short(value)}; it must be {asked}"
         )
 
 
@@ -30,6 +32,13 @@ def whole(config: object, *names: str) -> None:
         value = getattr(config, name)
         check(config, name, type(value) is int, "a whole number")
         check(config, name, value >= 1, "at least 1")
+        _fits(config, name)
+
+
+def _fits(config: object, name: str) -> None:
+    value = getattr(config, name)
+    largest = 2**63 if isinstance(value, int) else HUGE
+    check(config, name, abs(value) < largest, f"below {largest:g}")
 
 
 def number(config: object, *names: str, low: float = 0.0, high: float = INFINITY) -> None:
@@ -41,6 +50,7 @@ def number(config: object, *names: str, low: float = 0.0, high: float = INFINITY
         value = getattr(config, name)
         ok = type(value) in (int, float) and abs(value) < INFINITY
         check(config, name, ok and low <= value <= high, asked)
+        _fits(config, name)
 
 
 def positive(config: object, *names: str) -> None:
@@ -49,11 +59,19 @@ def positive(config: object, *names: str) -> None:
         value = getattr(config, name)
         ok = type(value) in (int, float) and 0.0 < value < INFINITY
         check(config, name, ok, "positive and finite")
+        _fits(config, name)
 
 
 def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
     """Raise where a field is none of the known words."""
     check(config, field_name, getattr(config, field_name) in known, f"one of {', '.join(known)}")
+
+
+def flags(config: Any) -> None:
+    """Raise where a field that is yes or no is something else."""
+    for f in fields(config):
+        if f.type == "bool":
+            check(config, f.name, isinstance(getattr(config, f.name), bool), "True or False")
 
 
 def check_networks(config: Any) -> None:
@@ -116,6 +134,7 @@ class OffPolicy:
 
     def __post_init__(self) -> None:
         check_networks(self)
+        flags(self)
         check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
         whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
         number(self, "gamma", "tau", "priority_alpha", "priority_beta", high=1.0)
@@ -124,6 +143,7 @@ class OffPolicy:
             positive(self, "max_grad_norm")
         number(self, "learning_starts")
         one_of(self, "learning_rate_schedule", ("constant", "linear"))
+        check(self, "batch_size", self.batch_size <= 1_000_000, "at most 1,000,000")
         least = self.num_envs * (self.n_step + 1)
         check(
             self,

@@ -9,14 +9,16 @@ from pathlib import Path
 from skillweave.types import SkillweaveError
 
 
-def check_memory(capacity: int, each: int, what: str) -> None:
+def check_memory(
+    capacity: int, each: int, what: str, buffer: str = "replay buffer", lower: str = "buffer_size"
+) -> None:
     """Raise a SkillweaveError where ``capacity`` transitions of ``each`` bytes do not fit."""
     free = free_memory()
     if free is not None and capacity * each > free:
         raise SkillweaveError(
-            f"a replay buffer of {capacity:,} transitions of {what} needs "
+            f"a {buffer} of {capacity:,} transitions of {what} needs "
             f"{capacity * each / 2**30:.1f} GiB, but {free / 2**30:.1f} GiB are free: "
-            f"lower buffer_size (at most about {free // each:,})"
+            f"lower {lower} (at most about {free // each:,})"
         )
 
 

@@ -11,6 +11,7 @@ was done since. Only an environment whose dynamics follow from these two can be 
 
 from __future__ import annotations
 
+import functools
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,15 +19,14 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from skillweave.envs.checks import Watch
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks, info_rows
+from skillweave.envs.workers import WorkerVector
 from skillweave.spaces import pack
-from skillweave.types import Array
-
-LONGEST_EPISODE = 100_000
-"""Steps after which an open episode is no longer kept for a checkpoint, but ended there."""
+from skillweave.types import Array, SkillweaveError
 
 
 @dataclass(slots=True)
@@ -119,17 +119,15 @@ class GymnasiumEngine:
     Every episode begins from a seed of its own, so that it can be played again.
     """
 
-    def __init__(self, make: Any, num_envs: int, processes: bool = False) -> None:
-        makers = [lambda: Pausable(make())] * num_envs
-        kwargs: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}
-        self._vector: Any = (
-            AsyncVectorEnv(makers, **kwargs) if processes else SyncVectorEnv(makers, **kwargs)
-        )
+    def __init__(self, make: Any, num_envs: int, name: str, processes: bool = False) -> None:
+        makers = [functools.partial(_pausable, make, i) for i in range(num_envs)]
+        self._vector: Any = WorkerVector(makers, name) if processes else _vector_here(makers, name)
         self.num_envs, self.steps_made = num_envs, 0
         self.observation_space: gym.Space[Any] = self._vector.single_observation_space
         go_and_action: Any = self._vector.single_action_space
         self.action_space: gym.Space[Any] = go_and_action[1]
         self._masks = ActionMasks(self.action_space, num_envs)
+        self._watch = Watch(name, self.observation_space, num_envs)
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._actions: Array = np.asarray(empty)
@@ -207,7 +205,7 @@ class GymnasiumEngine:
         options = None if mask.all() else {"reset_mask": mask}
         obs, info = self._vector.reset(seed=each, options=options)
         self._masks.see(info_rows(info, ids, self.num_envs), ids)
-        return np.array(pack(self.observation_space, obs)[ids])
+        return self._watch.begun(np.array(pack(self.observation_space, obs)[ids]), ids)
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
         go = np.ones(self.num_envs, np.int64)
@@ -228,7 +226,30 @@ class GymnasiumEngine:
             info = info_rows(info, ids, self.num_envs)
         self._masks.see(info, ids, terminated | truncated)
         truncated = truncated & ~terminated
-        return RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
+        raw = RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
+        self._watch.stepped(raw, ids)
+        return raw
+
+
+def _pausable(make: Any, number: int) -> Pausable:
+    return Pausable(make(number=number))
+
+
+def _vector_here(makers: Sequence[Any], name: str) -> SyncVectorEnv[Any, Any]:
+    """The environments in this process.
+
+    Raises:
+        SkillweaveError: they have different spaces, or are one and the same.
+    """
+    try:
+        vector = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
+    except RuntimeError as error:
+        raise SkillweaveError(f"{name}: its environments differ: {error}") from error
+    if len({id(env.unwrapped) for env in vector.envs}) < len(makers):
+        raise SkillweaveError(
+            f"{name} gives the same environment each time; the function must make a new one"
+        )
+    return vector
 
 
 def checksums(obs: Array) -> Array:

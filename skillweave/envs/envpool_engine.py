@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.checks import Watch
 from skillweave.envs.engine import RawStep
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
@@ -40,6 +41,7 @@ class EnvPoolEngine:
         example: Any = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._history = History(num_envs, example)
         self._masks = ActionMasks(self.action_space, num_envs)
+        self._watch = Watch(env_id, self.observation_space, num_envs)
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
@@ -151,8 +153,7 @@ class EnvPoolEngine:
 
         obs, info = self._in_pools(ids, reset)
         self._masks.see(info, ids)
-        found: Array = obs
-        return found
+        return self._watch.begun(obs, ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
         if self._discrete:
@@ -166,6 +167,7 @@ class EnvPoolEngine:
         # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
         raw = RawStep(*self._in_pools(ids, step))
         self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
+        self._watch.stepped(raw, ids)
         return raw
 
     def _in_pools(

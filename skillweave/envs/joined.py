@@ -94,6 +94,7 @@ class JoinedEnvs:
 
     def _infos(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
         """What all parts tell, array by array."""
+
         def batched(value: Any) -> bool:
             return isinstance(value, np.ndarray) and value.shape[:1] == (self._each,)
 

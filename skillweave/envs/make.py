@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import difflib
-import functools
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium as gym
 
+from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.types import MissingExtra, SkillweaveError
+from skillweave.types import MissingExtra, SkillweaveError, short, told
 
+MOST = 65_536
+"""Environments in one engine."""
 EngineName = Literal["auto", "envpool", "sync", "async"]
 
 
@@ -35,27 +37,58 @@ class EnvSpec:
     wrappers: tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...] = ()
     engine: EngineName = "auto"
 
-    def make(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
-        """One environment of Gymnasium's.
+    def __post_init__(self) -> None:
+        made = isinstance(self.env, gym.Env)
+        if made or not (isinstance(self.env, str) or callable(self.env)):
+            raise SkillweaveError(
+                f"env is {short(self.env)}; it must be a Gymnasium id, or a function that makes an "
+                "environment (environments are made many times over)"
+            )
+        if not isinstance(self.kwargs, dict) or not all(isinstance(k, str) for k in self.kwargs):
+            raise SkillweaveError(
+                f"{self.name}: kwargs is {short(self.kwargs)}; it must be a dict with names as keys"
+            )
+        wrappers = self.wrappers
+        if not isinstance(wrappers, tuple | list) or not all(callable(w) for w in wrappers):
+            raise SkillweaveError(
+                f"{self.name}: wrappers is {short(wrappers)}; it must be a tuple of functions that "
+                "take an environment and return one"
+            )
+        if self.engine not in get_args(EngineName):
+            known = ", ".join(get_args(EngineName))
+            raise SkillweaveError(
+                f"{self.name}: no engine {short(self.engine)}; there are: {known}"
+            )
+
+    def make(self, render_mode: str | None = None, number: int | None = None) -> CheckedEnv:
+        """One environment of Gymnasium's, whose errors say its name and its ``number``.
 
         Raises:
             SkillweaveError: no such environment (with close matches), or a missing dependency.
         """
-        if callable(self.env):
-            try:
-                env = self.env() if render_mode is None else self.env(render_mode=render_mode)  # type: ignore[call-arg]
-            except TypeError as error:
-                if render_mode is None:
-                    raise
-                raise SkillweaveError(
-                    f"{self.name} cannot be rendered: the function that makes it must take "
-                    f"render_mode ({error})"
-                ) from error
-        else:
-            env = self._from_registry(self.env, render_mode)
-        for wrapper in self.wrappers:
-            env = wrapper(env)
-        return env
+        try:
+            env = self._made(render_mode)
+            for wrapper in self.wrappers:
+                env = wrapper(env)
+        except SkillweaveError:
+            raise
+        except Exception as error:
+            which = "" if number is None else f" (environment {number})"
+            raise SkillweaveError(f"{self.name}{which} could not be made: {told(error)}") from error
+        return CheckedEnv(env, self.name, number)
+
+    def _made(self, render_mode: str | None) -> gym.Env[Any, Any]:
+        if isinstance(self.env, str):
+            return self._from_registry(self.env, render_mode)
+        if render_mode is None:
+            return self.env()
+        try:
+            return self.env(render_mode=render_mode)  # type: ignore[call-arg]
+        except TypeError as error:
+            raise SkillweaveError(
+                f"{self.name} cannot be rendered: the function that makes it must take "
+                f"render_mode ({error})"
+            ) from error
 
     def _from_registry(self, env_id: str, render_mode: str | None) -> gym.Env[Any, Any]:
         try:
@@ -67,14 +100,14 @@ class EnvSpec:
         except (gym.error.Error, ImportError) as error:
             near = difflib.get_close_matches(env_id, list(gym.registry), n=4, cutoff=0.6)
             hint = f" Close matches: {', '.join(near)}." if near else ""
-            raise SkillweaveError(f"no environment {env_id!r}: {error}.{hint}") from error
+            raise SkillweaveError(f"no environment {short(env_id)}: {error}.{hint}") from error
 
     @property
     def name(self) -> str:
         """The id, or the name of the function."""
         if isinstance(self.env, str):
             return self.env
-        return getattr(self.env, "__name__", type(self.env).__name__)
+        return str(getattr(self.env, "__name__", type(self.env).__name__))
 
     @property
     def is_data(self) -> bool:
@@ -84,6 +117,10 @@ class EnvSpec:
 
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None) -> Engine:
     """The engine for ``num_envs`` environments of this kind; ``threads`` for EnvPool's pool."""
+    if num_envs > MOST:
+        raise SkillweaveError(
+            f"{num_envs:,} environments of {spec.name}: at most {MOST:,} are made"
+        )
     cores = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0, 1])
     if spec.engine in ("auto", "envpool"):
         reference = spec.make()
@@ -98,4 +135,4 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None) -> Eng
                 f"EnvPool cannot run {spec.name}: it is not installed (extra 'envpool'), or "
                 "lacks the environment with these spaces, settings and wrappers; use engine='auto'"
             )
-    return GymnasiumEngine(functools.partial(spec.make), num_envs, spec.engine == "async")
+    return GymnasiumEngine(spec.make, num_envs, spec.name, spec.engine == "async")

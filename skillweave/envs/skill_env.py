@@ -6,18 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.envs.engine import LONGEST_EPISODE, Engine, checksums
+from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import allowed_rows, random_actions
 from skillweave.seeding import Seeds
-from skillweave.skills import Reflex, Skill, apply_reflexes, checked
-from skillweave.types import (
-    Array,
-    SkillweaveError,
-    Step,
-    VecStep,
-    prefixed,
-    unprefixed,
-)
+from skillweave.skills import Reflex, Skill, apply_reflexes, asked
+from skillweave.types import Array, SkillweaveError, Step, VecStep, prefixed, unprefixed
 
 _PATIENCE = 5_000  # steps of random acting in search of a state where the skill may start
 
@@ -91,7 +85,7 @@ class SkillEnv:
         """Act in all environments. ``info`` gains the task's reward and the skill's success."""
         obs = self.obs
         if self.reflexes:
-            action = apply_reflexes(self.reflexes, obs, action)
+            action = apply_reflexes(self.reflexes, obs, action, self.action_space)
         raw = self.engine.step(action)
         self._elapsed += 1
         reward, terminated, truncated, info = raw.reward, raw.terminated, raw.truncated, raw.info
@@ -125,7 +119,7 @@ class SkillEnv:
 
     def _judge(self, skill: Skill, obs: Array, action: Array, raw: Any) -> Any:
         """The skill's reward and ends for one step of all environments."""
-        n, who, at = self.num_envs, f"skill {skill.name!r}", self._elapsed
+        n, at = self.num_envs, self._elapsed
         timed_out = self._never
         if skill.max_steps is not None:
             timed_out = (self._elapsed >= skill.max_steps) & ~raw.terminated
@@ -133,15 +127,14 @@ class SkillEnv:
             obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
             timed_out, self._elapsed, raw.info,
         )  # fmt: skip
-        reward = checked(skill.reward(step), n, np.float32, who, "reward", at)
+        reward = asked(skill, "reward", step, n, at)
         terminated = raw.terminated
         if skill.defines("termination"):
-            stop = checked(skill.termination(step), n, bool, who, "termination", at)
-            terminated = terminated | stop
+            terminated = terminated | asked(skill, "termination", step, n, at)
         truncated = (raw.truncated | timed_out) & ~terminated
         info = {**raw.info, "task_reward": raw.reward}
         if skill.defines("success"):
-            info["success"] = checked(skill.success(step), n, bool, who, "success", at)
+            info["success"] = asked(skill, "success", step, n, at)
         return reward, terminated, truncated, info
 
     def _startable(self, obs: Array, ids: Array) -> Array:
@@ -151,7 +144,7 @@ class SkillEnv:
         who = f"skill {self.skill.name!r}"
         obs = obs.copy()
         for _ in range(_PATIENCE):
-            holds = checked(self.skill.initiation(obs), len(ids), bool, who, "initiation")
+            holds = asked(self.skill, "initiation", obs, len(ids))
             waiting = np.flatnonzero(~holds)
             if not len(waiting):
                 return obs

@@ -13,7 +13,7 @@ from skillweave.evolution.phase import evolve_phase
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.phase import Listener, Phase, Trainer
-from skillweave.types import SkillweaveError
+from skillweave.types import SkillweaveError, short
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
 """A population for every phase, or for those named."""
@@ -51,10 +51,16 @@ def _by_phase(phases: list[str], evolve: Evolve) -> dict[str, Evolution]:
         return {}
     if isinstance(evolve, Evolution):
         return dict.fromkeys(phases, evolve)
+    if not isinstance(evolve, Mapping):
+        raise SkillweaveError(
+            f"evolve is {short(evolve)}; it must be an Evolution(), or one for each phase by name"
+        )
     for name, how in evolve.items():
         if name not in phases:
             known = ", ".join(phases)
-            raise SkillweaveError(f"evolve: no phase {name!r} is trained; there are: {known}")
+            raise SkillweaveError(f"evolve: no phase {short(name)} is trained; there are: {known}")
         if not isinstance(how, Evolution | None):
-            raise SkillweaveError(f"evolve[{name!r}] is {how!r}; it must be an Evolution() or None")
+            raise SkillweaveError(
+                f"evolve[{name!r}] is {short(how)}; it must be an Evolution() or None"
+            )
     return {name: how for name, how in evolve.items() if how is not None}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skillweave.envs.infos import allowed_rows, info_rows
-from skillweave.skills import Reflex, Skill, apply_reflexes, checked
+from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
 
@@ -61,7 +61,7 @@ class SkillSet:
         """Where each skill may start, (n, S) bool; perhaps none in some observation."""
         return np.stack(
             [
-                checked(s.initiation(obs), len(obs), bool, f"skill {s.name!r}", "initiation")
+                asked(s, "initiation", obs, len(obs))
                 if s.defines("initiation")
                 else np.ones(len(obs), bool)
                 for s in self.skills
@@ -121,7 +121,9 @@ class SkillSet:
                 actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
             actions[mine] = some
         assert actions is not None, "act() before begin()"
-        return apply_reflexes(self.reflexes, obs, actions) if self.reflexes else actions
+        if not self.reflexes:
+            return actions
+        return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)
 
     def observe(self, memory: Memory, rows: Array, step: Step | None) -> Array:
         """Count a step of environments ``rows`` (k,); (k,) bool: the call is over.
@@ -146,8 +148,7 @@ class SkillSet:
             own = self._own(memory, i, rows[mine])
             self._put(memory, i, rows[mine], policy.observe(own, part))
             if skill.defines("termination"):
-                stop = skill.termination(part)
-                over[mine] |= checked(stop, len(mine), bool, f"skill {skill.name!r}", "termination")
+                over[mine] |= asked(skill, "termination", part, len(mine), elapsed[mine])
         return over
 
     def _own(self, memory: Memory, i: int, rows: Array) -> Memory:

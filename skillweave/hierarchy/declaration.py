@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import gymnasium as gym
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
+from skillweave.buffers.memory import check_memory
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.foreign import fitted
-from skillweave.spaces import action_codec, obs_codec
-from skillweave.types import Policy, SkillweaveError
+from skillweave.spaces import action_codec, obs_codec, obs_dtype, obs_shape
+from skillweave.types import Policy, SkillweaveError, short
 
 RESERVED = ("selector", "flat")
 """Names of phases that are not skills."""
@@ -62,21 +64,27 @@ class Declaration:
     def __post_init__(self) -> None:
         self._check_env()
         self._check_skills()
+        if isinstance(self.reflexes, str) or not isinstance(self.reflexes, Sequence):
+            raise SkillweaveError(
+                f"reflexes is {short(self.reflexes)}; it must be a list: reflexes=[Reflex(...)]"
+            )
         self.reflexes = tuple(self.reflexes)
         for reflex in self.reflexes:
             if not isinstance(reflex, Reflex):
                 raise SkillweaveError(
-                    f"reflexes holds {reflex!r}, which is not a Reflex: Reflex(condition, action)"
+                    f"reflexes holds {short(reflex)}, which is not a Reflex: Reflex(condition, "
+                    "action)"
                 )
         for name in ("algorithm", "selector", "flat"):
             _check_algorithm(getattr(self, name), f"{name}", optional=name == "flat")
         for f in fields(self):
             value, none = getattr(self, f.name), f.type == "int | None"
-            if f.type not in ("int", "int | None") or (value is None and none):
-                continue
-            if type(value) is not int or value < 1:
+            whole = f.type in ("int", "int | None") and not (value is None and none)
+            if whole and (type(value) is not int or value < 1):
                 what = "at least 1, or None" if none else "a whole number, at least 1"
-                raise SkillweaveError(f"{f.name} is {value!r}; it must be {what}")
+                raise SkillweaveError(f"{f.name} is {short(value)}; it must be {what}")
+            if f.type == "bool" and not isinstance(value, bool):
+                raise SkillweaveError(f"{f.name} is {short(value)}; it must be True or False")
         if self.call_steps is None:
             for skill in self.skills:
                 if skill.max_steps is None and not skill.defines("termination"):
@@ -89,12 +97,12 @@ class Declaration:
         made = isinstance(self.env, gym.Env)
         if made or not (isinstance(self.env, str | EnvSpec) or callable(self.env)):
             raise SkillweaveError(
-                f"env is {self.env!r}; it must be a Gymnasium id, a function that makes an "
+                f"env is {short(self.env)}; it must be a Gymnasium id, a function that makes an "
                 "environment, or an EnvSpec (environments are made many times over)"
             )
 
     def _check_skills(self) -> None:
-        if isinstance(self.skills, Skill | type):
+        if isinstance(self.skills, str) or not isinstance(self.skills, Sequence):
             raise SkillweaveError("skills must be a list of skills: skills=[Center(), ...]")
         self.skills = tuple(self.skills)
         if not self.skills:
@@ -102,7 +110,7 @@ class Declaration:
         for skill in self.skills:
             if not isinstance(skill, Skill):
                 hint = " (write Center(), not Center)" if isinstance(skill, type) else ""
-                raise SkillweaveError(f"skills holds {skill!r}, which is not a Skill{hint}")
+                raise SkillweaveError(f"skills holds {short(skill)}, which is not a Skill{hint}")
             skill.validate()
             _check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
             ready_policy(skill)  # says so where it cannot act
@@ -139,7 +147,7 @@ class Declaration:
             if skill.name == name:
                 return skill
         raise SkillweaveError(
-            f"no skill {name!r}; there are: {', '.join(s.name for s in self.skills)}"
+            f"no skill {short(name)}; there are: {', '.join(s.name for s in self.skills)}"
         )
 
     def budget(self, skill: Skill) -> int:
@@ -184,6 +192,9 @@ class Declaration:
             obs_codec(env.observation_space)
             action_codec(env.action_space)
             self._check_algorithms(env.action_space)
+            self._check_rollouts(env.observation_space)
+            for reflex in self.reflexes:
+                reflex.check(env.action_space)
             self._fitted(env)
             return env.observation_space, env.action_space
         finally:
@@ -198,6 +209,19 @@ class Declaration:
         check_spaces(self.selector, gym.spaces.Discrete(len(self.skills)), "selector: ")
         if self.flat is not None:
             check_spaces(self.flat, space, "flat: ")
+
+    def _check_rollouts(self, space: gym.Space[Any]) -> None:
+        """Whether the rollouts of every on-policy algorithm fit into memory."""
+        each = 2 * obs_dtype(space).itemsize * math.prod(obs_shape(space))
+        for config in (
+            self.algorithm,
+            self.selector,
+            self.flat,
+            *(s.algorithm for s in self.skills),
+        ):
+            if isinstance(config, PPO):
+                size = config.num_envs * config.n_steps
+                check_memory(size, each + 32, str(short(space)), "rollout", "num_envs or n_steps")
 
     def ready_policies(self) -> dict[str, Policy]:
         """By skill, the policies that are not trained, on the environment's spaces."""
@@ -222,4 +246,19 @@ def _check_algorithm(value: object, where: str, *, optional: bool) -> None:
     if (value is None and optional) or isinstance(value, AlgorithmConfig):
         return
     hint = f" (write {value.__name__}(), not {value.__name__})" if isinstance(value, type) else ""
-    raise SkillweaveError(f"{where} is {value!r}, which is no algorithm's settings{hint}")
+    raise SkillweaveError(f"{where} is {short(value)}, which is no algorithm's settings{hint}")
+
+
+def check_budgets(phases: Sequence[dict[str, Any]]) -> None:
+    """Raise a SkillweaveError where a phase of a manifest would end before it learns anything."""
+    for phase in phases:
+        starts = phase["algorithm"].get("learning_starts", 0)
+        population = (phase.get("evolution") or {}).get("population", 1)
+        budget = phase["budget"] // population
+        if budget <= starts:
+            each = " for each member" if population > 1 else ""
+            raise SkillweaveError(
+                f"phase {phase['name']!r}: its budget is {budget:,} steps{each}, but it begins to "
+                f"learn only after {starts:,} (learning_starts). Give it more steps, or start "
+                "earlier"
+            )

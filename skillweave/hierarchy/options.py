@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.envs.engine import LONGEST_EPISODE, Engine, checksums
+from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import allowed_rows
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.seeding import Seeds
@@ -133,7 +134,9 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
         each: list[Array] = []
         rows = np.arange(n)
+        turns = 0
         while len(rows):
+            turns = self._turn(turns, rows, skill)
             here = obs if len(rows) == n else obs[rows]
             allowed = allowed_rows(self.engine.mask(), rows)
             action = self.skills.act(self._memory, rows, here, rng, allowed)
@@ -205,6 +208,21 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         for i in np.flatnonzero(ended):
             final[i] = unpack(self.single_observation_space, next_obs[i])
         return {"final_obs": final, "_final_obs": ended}
+
+    def _turn(self, turns: int, rows: Array, skill: Array) -> int:
+        """One more step of the calls of ``skill`` that still run, in environments ``rows``.
+
+        Raises:
+            SkillweaveError: there have been so many that nothing seems to end them.
+        """
+        if turns >= LONGEST_EPISODE:
+            name = self.skills.skills[int(skill[rows[0]])].name
+            raise SkillweaveError(
+                f"skill {name!r} has run for {turns:,} steps in environment {int(rows[0])}, and "
+                "neither its termination() nor the episode's end has come: give it max_steps, or "
+                "the hierarchy call_steps"
+            )
+        return turns + 1
 
     def _check(self, skill: Array) -> None:
         count = len(self.skills.skills)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from skillweave.types import SkillweaveError
+from skillweave.types import SkillweaveError, short
 
+WIDEST = 65_536
+"""Units of a layer."""
 Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
 
 
@@ -58,8 +60,10 @@ class RNN:
 
     def __post_init__(self) -> None:
         _choice(self, "kind", ("lstm", "gru"))
-        if type(self.size) is not int or self.size < 1:
-            raise SkillweaveError(f"RNN.size is {self.size!r}; it must be at least 1")
+        if not _is_width(self.size):
+            raise SkillweaveError(
+                f"RNN.size is {short(self.size)}; it must be at least 1 and at most {WIDEST:,}"
+            )
 
 
 @dataclass(frozen=True)
@@ -86,26 +90,34 @@ class Network:
     def __post_init__(self) -> None:
         _widths(self, "hidden")
         _choice(self, "activation", get_args(Activation))
+        _choice(self, "layer_norm", (True, False))
+        if not isinstance(self.encoder, str | None):
+            raise SkillweaveError(f"Network.encoder is {short(self.encoder)}; it must be a name")
         for name, kind in (("cnn", CNN), ("rnn", RNN)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise SkillweaveError(
-                    f"Network.{name} is {value!r}; it must be a {kind.__name__}() or None"
+                    f"Network.{name} is {short(value)}; it must be a {kind.__name__}() or None"
                 )
 
 
 def _widths(config: object, field: str) -> None:
     value = getattr(config, field)
-    ok = isinstance(value, tuple) and all(type(x) is int and x >= 1 for x in value)
-    if not ok:
+    if not isinstance(value, tuple) or not all(_is_width(x) for x in value):
         raise SkillweaveError(
-            f"{type(config).__name__}.{field} is {value}; every entry must be at least 1"
+            f"{type(config).__name__}.{field} is {short(value)}; it must be a tuple whose entries "
+            f"must be at least 1 and at most {WIDEST:,}"
         )
 
 
+def _is_width(value: object) -> bool:
+    return type(value) is int and 1 <= value <= WIDEST
+
+
 def _choice(config: object, field: str, known: tuple[Any, ...]) -> None:
-    if getattr(config, field) not in known:
+    value = getattr(config, field)
+    if not any(type(value) is type(k) and value == k for k in known):
         raise SkillweaveError(
-            f"{type(config).__name__}.{field} is {getattr(config, field)!r}; "
-            f"it must be one of {', '.join(known)}"
+            f"{type(config).__name__}.{field} is {short(value)}; "
+            f"it must be one of {', '.join(map(str, known))}"
         )

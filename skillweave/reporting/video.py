@@ -13,18 +13,18 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.checks import LONGEST_FILM
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds
-from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+from skillweave.types import Array, Memory, Policy, SkillweaveError, Step, whole_number
 
 __all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
-UNLIMITED = 10_000  # steps after which an episode is cut that nothing else would end
 HOLD = 1.0  # seconds that the last frame of an episode stands
 
 
@@ -46,35 +46,37 @@ def render_policy(
 
     Args:
         seed: episode i starts from ``reset(seed=seed + i)``.
-        max_steps: of an episode; None: the environment's own limit, at most ``UNLIMITED``.
+        max_steps: of an episode; None: the environment's own limit, at most ``LONGEST_FILM``.
         label: from the policy's memory after ``act`` to who acted, and its colour.
         fps: steps shown per second; None: as many as the environment says, so in real time.
         every: one frame for so many steps, and one for the end of each episode.
         rng: for ``act``; None: derived from ``seed``.
 
     Returns:
-        ``path``, ``frames``, and ``episodes``: for each its ``return``, its ``length`` and, as
-        ``skills``, how many steps each acted.
+        ``path``, ``frames``, and ``episodes``: for each its ``return``, its ``length``, whether it
+        was ``cut`` before its end and, as ``skills``, how many steps each acted.
 
     Raises:
         SkillweaveError: the environment gives no frames; see VideoWriter for more.
         MissingExtra: the extra 'video' is not installed.
     """
-    if episodes < 1 or every < 1:
-        raise SkillweaveError(f"episodes={episodes} and every={every} must be at least 1")
+    episodes, every = whole_number(episodes, "episodes", 1), whole_number(every, "every", 1)
+    seed = whole_number(seed, "seed", 0)
+    limit = LONGEST_FILM if max_steps is None else whole_number(max_steps, "max_steps", 1)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen
     act = functools.partial(
         policy.act, deterministic=deterministic, rng=rng or (Seeds(seed) / "render").numpy()
     )
     env, told = env_spec.make(render_mode="rgb_array"), []
-    engine = GymnasiumEngine(lambda: env, 1)  # observations, infos and masks as everywhere else
+    # Observations, infos and masks are those of an evaluation.
+    engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
     try:
         rate = (fps or env.metadata.get("render_fps") or 30) / every
         with VideoWriter(path, rate) as video:
             for i in range(episodes):
                 who, color, skills = "", BLACK, Counter[str]()
-                for now in _play(engine, policy, act, seed + i, max_steps or UNLIMITED):
+                for now in _play(engine, policy, act, seed + i, limit):
                     if label is not None and not now.over:
                         who, color = label(now.memory)
                         skills[who] += 1
@@ -83,7 +85,7 @@ def render_policy(
                         text = f"step {now.elapsed}   {word} {now.total:+.1f}"
                         frame = caption(_frame(env), who, color, text)
                         video.add(frame, HOLD if now.over else None)
-                told.append({"return": now.total, "length": now.elapsed, "skills": dict(skills)})
+                told.append(now.told(skills))
     finally:
         engine.close()
     return {"path": str(path), "frames": video.frames, "episodes": told}
@@ -94,6 +96,12 @@ class _Moment(NamedTuple):
     elapsed: int  # steps
     total: float  # the return so far
     over: bool
+    ended: bool = False  # the environment ended it
+
+    def told(self, skills: Counter[str]) -> dict[str, Any]:
+        """The episode, at its end."""
+        how = {"return": self.total, "length": self.elapsed, "cut": not self.ended}
+        return how | {"skills": dict(skills)}
 
 
 def _play(
@@ -113,7 +121,7 @@ def _play(
             np.zeros(1, bool), np.array([elapsed]), raw.info,
         )  # fmt: skip
         obs, memory = raw.next_obs, policy.observe(memory, step)
-    yield _Moment(memory, elapsed, total, True)
+    yield _Moment(memory, elapsed, total, True, over)
 
 
 def _frame(env: gym.Env[Any, Any]) -> Array:

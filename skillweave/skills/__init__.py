@@ -1,6 +1,6 @@
 """Skills and reflexes: what a user declares."""
 
-from skillweave.skills.base import Reflex, Skill, apply_reflexes, checked
+from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, checked
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
 from skillweave.skills.sb3 import from_sb3
@@ -11,6 +11,7 @@ __all__ = [
     "Reflex",
     "Skill",
     "apply_reflexes",
+    "asked",
     "checked",
     "from_function",
     "from_onnx",

@@ -8,7 +8,48 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array, SkillweaveError, short, told
+
+
+def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
+    """What a function of the user's returns.
+
+    Raises:
+        SkillweaveError: it failed; the message names ``who``, the step where it is known, and the
+            line.
+    """
+    try:
+        return function(argument)
+    except SkillweaveError:
+        raise
+    except Exception as error:
+        # numpy says no more than that something cannot be written to
+        hint = "; what it is given cannot be changed: change a copy"
+        hint = hint if "read-only" in told(error) else ""
+        about = getattr(argument, "shape", None)
+        given = "" if about is None else f" for observations of shape {about}"
+        raise SkillweaveError(
+            f"{who} raised {told(error)}{at_step(elapsed)}{given}{hint}"
+        ) from error
+
+
+def at_step(elapsed: Any) -> str:
+    """When something happened, for messages; None: nobody knows."""
+    return "" if elapsed is None else f" at step {np.max(elapsed)}"
+
+
+def as_array(value: Any, who: str) -> Array:
+    """``value`` as an array.
+
+    Raises:
+        SkillweaveError: it cannot be one; the message names ``who``.
+    """
+    try:
+        return np.asarray(value)
+    except Exception as error:
+        raise SkillweaveError(
+            f"{who} returned {short(value)}, which is no array: {told(error)}"
+        ) from error
 
 
 def checked_actions(value: Any, n: int, space: Space[Any], who: str) -> Array:
@@ -18,7 +59,7 @@ def checked_actions(value: Any, n: int, space: Space[Any], who: str) -> Array:
         SkillweaveError: another shape, another kind of number, or a choice that does not exist;
             the message names ``who`` and the space.
     """
-    action, shape = np.asarray(value), (n, *(space.shape or ()))
+    action, shape = as_array(value, who), (n, *(space.shape or ()))
     if action.shape != shape:
         raise SkillweaveError(
             f"{who} returned shape {action.shape}, but {shape} was expected: one action of {space} "

@@ -7,8 +7,10 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium import Space
 
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.skills.actions import as_array, at_step, called, checked_actions
+from skillweave.types import Array, SkillweaveError, Step, finite, read_only, short
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 """What a skill may be named: its name names files, too."""
@@ -74,7 +76,9 @@ class Skill:
 
     def validate(self) -> None:
         """Raise a SkillweaveError that names what is wrong with the declaration."""
-        where = f"skill {self.name!r} ({type(self).__name__})"
+        where = f"skill {short(self.name)} ({type(self).__name__})"
+        if not isinstance(self.name, str):
+            raise SkillweaveError(f"{where}: the name must be text")
         if not self.name:
             raise SkillweaveError(f"{where} has no name: set the class attribute 'name'")
         if not NAME.fullmatch(self.name):
@@ -83,9 +87,14 @@ class Skill:
             )
         for field in ("max_steps", "steps"):
             value = getattr(self, field)
-            if value is not None and (not isinstance(value, int) or value < 1):
+            if value is not None and (type(value) is not int or value < 1):
                 raise SkillweaveError(
-                    f"{where}: {field} is {value!r}; it must be at least 1, or None"
+                    f"{where}: {field} is {short(value)}; it must be at least 1, or None"
+                )
+        for method in self.methods:
+            if not callable(getattr(self, method)):
+                raise SkillweaveError(
+                    f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
 
 
@@ -97,6 +106,9 @@ class Reflex:
         action: the action to take instead, or a function from observations (n, *obs_shape) to
             actions (n, ...).
         name: used in messages and captions; default: the condition's name.
+
+    Raises:
+        SkillweaveError: the condition is no function, or the name no text.
     """
 
     def __init__(
@@ -105,23 +117,88 @@ class Reflex:
         action: Any,
         name: str | None = None,
     ) -> None:
+        if not callable(condition):
+            raise SkillweaveError(
+                f"a Reflex's condition is {short(condition)}; it must be a function of observations"
+            )
+        if not isinstance(name, str | None):
+            raise SkillweaveError(f"a Reflex's name is {short(name)}; it must be text")
         self.condition, self.action = condition, action
         self.name = name or getattr(condition, "__name__", "reflex")
 
-    def apply(self, obs: Array, action: Array) -> tuple[Array, Array]:
-        """The actions with this reflex in force, and (N,) bool: where it acted."""
-        holds = checked(self.condition(obs), len(obs), bool, f"reflex {self.name!r}", "condition")
+    def check(self, space: Space[Any]) -> None:
+        """Raise a SkillweaveError where a fixed action is none of ``space``."""
+        if not callable(self.action):
+            self._actions(np.empty((1, 0)), space)
+
+    def apply(self, obs: Array, action: Array, space: Space[Any]) -> tuple[Array, Array]:
+        """The actions with this reflex in force, and (N,) bool: where it acted.
+
+        Raises:
+            SkillweaveError: what it answers is not what was asked for; the message names it.
+        """
+        holds = answer(self.condition, obs, len(obs), bool, self._who, "condition")
         if holds.any():
             action = action.copy()
-            action[holds] = self.action(obs[holds]) if callable(self.action) else self.action
+            action[holds] = self._actions(obs[holds], space)
         return action, holds
 
+    @property
+    def _who(self) -> str:
+        return f"reflex {self.name!r}"
 
-def apply_reflexes(reflexes: tuple[Reflex, ...], obs: Array, action: Array) -> Array:
-    """Every reflex in order; the last whose condition holds wins."""
+    def _actions(self, obs: Array, space: Space[Any]) -> Array:
+        """Its actions for observations (n, ...)."""
+        n, who = len(obs), f"{self._who}: action"
+        if not callable(self.action):
+            one = as_array(self.action, who)
+            # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
+            shape = space.shape or ()
+            value = np.full(shape, one) if one.shape == () else one
+            return np.repeat(checked_actions(value[None], 1, space, who), n, axis=0)
+        return checked_actions(called(self.action, obs, f"{who}()"), n, space, f"{who}()")
+
+
+def apply_reflexes(
+    reflexes: tuple[Reflex, ...], obs: Array, action: Array, space: Space[Any]
+) -> Array:
+    """The actions with every reflex in force; where several hold, the last one counts."""
     for reflex in reflexes:
-        action, _ = reflex.apply(obs, action)
+        action, _ = reflex.apply(obs, action, space)
     return action
+
+
+def asked(
+    skill: Skill, method: str, about: Step | Array, n: int, elapsed: Array | int | None = None
+) -> Array:
+    """What a method of a skill says about a step or observations: (n,) float32 or bool.
+
+    Raises:
+        SkillweaveError: as of ``answer``.
+    """
+    dtype = np.float32 if method == "reward" else bool
+    who = f"skill {skill.name!r}"
+    return answer(getattr(skill, method), about, n, dtype, who, method, elapsed)
+
+
+def answer(
+    function: Callable[[Any], Any],
+    about: Step | Array,
+    n: int,
+    dtype: type,
+    who: str,
+    method: str,
+    elapsed: Array | int | None = None,
+) -> Array:
+    """What a function of the user's returns, ``checked``.
+
+    Raises:
+        SkillweaveError: the function failed, or returned something else than was asked for.
+    """
+    if isinstance(about, np.ndarray):
+        about = read_only(about)
+    value = called(function, about, f"{who}: {method}()", elapsed)
+    return checked(value, n, dtype, who, method, elapsed)
 
 
 def checked(
@@ -130,21 +207,27 @@ def checked(
     """``value`` as an array (n,) of ``dtype``; ``elapsed`` (n,) or () says at which steps.
 
     Raises:
-        SkillweaveError: it has another shape, or is a NaN or an infinity; the message names the
-            skill, the method and the step.
+        SkillweaveError: it has another shape or kind, or is a NaN or an infinity; the message
+            names the skill, the method and the step.
     """
-    array = np.asarray(value)
+    array = as_array(value, f"{who}: {method}()")
     if array.shape != (n,):
-        when = "" if elapsed is None else f" at step {np.max(elapsed)}"
         raise SkillweaveError(
-            f"{who}: {method}() returned shape {array.shape}{when}, but ({n},) was expected: one "
-            f"number for each of the {n} environments"
+            f"{who}: {method}() returned shape {array.shape}{at_step(elapsed)}, but ({n},) was "
+            f"expected: one number for each of the {n} environments"
         )
     if dtype is bool:
-        return array if array.dtype == bool else array.astype(bool)
+        return (
+            array if array.dtype == bool else _flags(array, f"{who}: {method}()", at_step(elapsed))
+        )
+    if array.dtype.kind not in "fiub":
+        raise SkillweaveError(
+            f"{who}: {method}() returned {_kind(array)}{at_step(elapsed)}, but rewards are real "
+            "numbers"
+        )
     with np.errstate(over="ignore"):  # an overflow is an infinity, reported below
         array = array.astype(dtype, copy=False)
-    if not np.isfinite(array).all():
+    if not finite(array):
         row = int(np.flatnonzero(~np.isfinite(array))[0])
         when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
         raise SkillweaveError(
@@ -152,3 +235,23 @@ def checked(
             "rewards must be finite"
         )
     return array
+
+
+def _flags(array: Array, what: str, when: str) -> Array:
+    """Numbers that are all 0 or 1, as bool."""
+    if array.dtype.kind not in "fiu":
+        raise SkillweaveError(
+            f"{what} returned {_kind(array)}{when}, but yes or no (bool) is asked"
+        )
+    wrong = np.flatnonzero((array != 0) & (array != 1))
+    if len(wrong):
+        raise SkillweaveError(
+            f"{what} returned {array[wrong[0]]}{when} for environment {wrong[0]}, but yes or no "
+            "(bool) is asked: compare with something"
+        )
+    return array.astype(bool)
+
+
+def _kind(array: Array) -> str:
+    first = array.reshape(-1)[:1].tolist()  # as Python's own values, which read better
+    return f"{array.dtype} ({short(first[0])})" if first else str(array.dtype)

@@ -10,7 +10,7 @@ from typing import Any
 from skillweave.skills.base import Skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy, SkillweaveError, short
 
 
 def ready_policy(skill: Skill) -> Policy | None:
@@ -38,8 +38,8 @@ def ready_policy(skill: Skill) -> Policy | None:
     if callable(value):
         return from_function(value)
     raise SkillweaveError(
-        f"{where} {value!r}, which cannot act; give a function of observations, a torch module, "
-        "from_sb3(...), from_onnx(...), or a policy"
+        f"{where} {short(value)}, which cannot act; give a function of observations, a torch "
+        "module, from_sb3(...), from_onnx(...), or a policy"
     )
 
 

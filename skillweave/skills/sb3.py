@@ -15,7 +15,7 @@ from skillweave.reading import read_file
 from skillweave.skills.actions import checked_actions
 from skillweave.skills.foreign import Foreign, checksum
 from skillweave.skills.torch_module import weights_of, with_weights
-from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
+from skillweave.types import Array, Memory, MissingExtra, SkillweaveError, short
 
 ALGORITHMS = ("ppo", "a2c", "dqn", "sac", "td3", "ddpg")
 
@@ -109,7 +109,7 @@ def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = F
     if not isinstance(model, str | Path):
         if not (hasattr(model, "policy") and hasattr(model, "observation_space")):
             raise SkillweaveError(
-                f"{model!r} is neither a Stable-Baselines3 model nor the path of one"
+                f"{short(model)} is neither a Stable-Baselines3 model nor the path of one"
             )
         return SB3Policy(model)
     file = Path(model)

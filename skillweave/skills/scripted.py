@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.skills.actions import checked_actions
+from skillweave.skills.actions import as_array, called, checked_actions
 from skillweave.skills.foreign import Foreign, qualified
-from skillweave.types import Array, Memory, SkillweaveError
+from skillweave.types import Array, Memory, SkillweaveError, read_only, short
 
 
 class ScriptedPolicy(Foreign):
@@ -37,9 +37,9 @@ class ScriptedPolicy(Foreign):
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """The function's actions, checked where the action space is known."""
-        action = self.function(obs)
+        action = called(self.function, read_only(obs), self._who)
         if self.action_space is None:
-            return np.asarray(action), memory
+            return as_array(action, self._who), memory
         return checked_actions(action, len(obs), self.action_space, self._who), memory
 
     def source(self) -> dict[str, Any]:
@@ -59,5 +59,7 @@ def from_function(
         action_space: None: that of the environment it meets.
     """
     if not callable(function):
-        raise SkillweaveError(f"from_function takes a function of observations, not {function!r}")
+        raise SkillweaveError(
+            f"from_function takes a function of observations, not {short(function)}"
+        )
     return ScriptedPolicy(function, observation_space, action_space)

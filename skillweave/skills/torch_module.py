@@ -11,7 +11,7 @@ from gymnasium import Space
 
 from skillweave.skills.actions import decoded
 from skillweave.skills.foreign import Foreign, checksum, qualified
-from skillweave.types import Array, Memory, SkillweaveError
+from skillweave.types import Array, Memory, SkillweaveError, short
 
 if TYPE_CHECKING:
     from torch import nn
@@ -98,7 +98,7 @@ def from_torch(
         action_space: None: that of the environment it meets.
     """
     if isinstance(module, type) or not hasattr(module, "state_dict"):
-        raise SkillweaveError(f"from_torch takes a module made of its class, not {module!r}")
+        raise SkillweaveError(f"from_torch takes a module made of its class, not {short(module)}")
     return TorchPolicy(module, observation_space, action_space)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.spaces.packing import check_size
 from skillweave.types import Array, SkillweaveError
 
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary, Box (of floats)"
@@ -88,6 +90,9 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
     Raises:
         SkillweaveError: the space is not supported; the message says which are.
     """
+    check_size(space, "action", _width(space))
+    if not _width(space):
+        raise SkillweaveError(f"action space {space} holds nothing to choose")
     if isinstance(space, gym.spaces.Discrete):
         return ActionCodec(space, (int(space.n),), _first(space.start))
     if isinstance(space, gym.spaces.MultiDiscrete):
@@ -97,6 +102,15 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
     if isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating):
         return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
     raise SkillweaveError(f"action space {space} is not supported; supported are: {ACTIONS}.")
+
+
+def _width(space: gym.Space[Any]) -> int:
+    """Numbers that a policy's head has for a space."""
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.n)
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return int(space.nvec.sum(dtype=np.float64))  # a sum of integers may overflow
+    return math.prod(space.shape or ())
 
 
 def _first(start: Any) -> Array | None:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.spaces.packing import obs_dtype, obs_shape, parts
+from skillweave.spaces.packing import LARGEST, check_size, obs_dtype, obs_shape, parts
 from skillweave.types import Array
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
@@ -149,6 +149,9 @@ def obs_codec(space: gym.Space[Any]) -> ObsCodec:
     leaves = tuple(_leaves(space, dtype, None))
     vectors = [leaf for leaf in leaves if leaf.image is None]
     layouts = [leaf.image for leaf in leaves if leaf.image is not None]
+    check_size(space, "observation", sum(leaf.size for leaf in vectors))
+    pixels = sum(leaf.size for leaf in leaves) - sum(leaf.size for leaf in vectors)
+    check_size(space, "observation", pixels, 16 * LARGEST)
     return ObsCodec(
         space=space,
         size=sum(leaf.size for leaf in vectors),

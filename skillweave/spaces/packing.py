@@ -12,9 +12,28 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array, SkillweaveError, short
 
 OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these"
+
+
+LARGEST = 1_000_000
+"""Numbers in an observation or an action, as a network takes it; pixels may be 16 times as many."""
+
+
+def check_size(space: gym.Space[Any], what: str, numbers: int, largest: int = LARGEST) -> None:
+    """Raise a SkillweaveError where a network would need absurdly many numbers for a space.
+
+    The first layer alone has a weight for each number and each unit, and the optimiser keeps two
+    more numbers for each weight.
+    """
+    if numbers > largest:
+        gigabytes = numbers * 64 * 4 * 3 / 1e9
+        raise SkillweaveError(
+            f"{what} space {short(space)} is {numbers:,} numbers to a network, choices one-hot; at "
+            f"most {largest:,} are supported: 64 units that take them all in would need "
+            f"{gigabytes:,.1f} GB. Wrap the environment so that it says the same in fewer numbers"
+        )
 
 
 def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import replace as replaced
 from typing import Any
 
 import numpy as np
 
+from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.spaces import same_space
-from skillweave.types import Array, Policy, SkillweaveError, Step
+from skillweave.types import Array, Policy, SkillweaveError, Step, whole_number
 
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
@@ -26,6 +29,7 @@ class Evaluation:
     threshold: float | None  # the environment's reward_threshold
     skill_steps: dict[str, int]  # steps of each skill
     skill_calls: dict[str, int]  # calls of each skill
+    cut: int = 0  # episodes that nothing had ended when they were cut
 
     @property
     def mean(self) -> float:
@@ -58,6 +62,7 @@ class Evaluation:
             "threshold": self.threshold,
             "solved_fraction": self.solved_fraction,
             "length_mean": float(np.mean(self.lengths)),
+            "cut": self.cut,
             "skill_usage": {k: v / total for k, v in self.skill_steps.items()},
             "call_length_mean": {
                 k: v / self.skill_calls[k]
@@ -75,6 +80,8 @@ class Evaluation:
         if j["solved_fraction"] is not None:
             line += f", {j['solved_fraction']:.0%} at {self.threshold:g} or more"
         line += f", {j['length_mean']:.0f} steps an episode"
+        if self.cut:
+            line += f"; {self.cut} never ended and were cut after {max(self.lengths):,} steps"
         if self.skill_steps:
             shares = ", ".join(f"{k} {v:.0%}" for k, v in j["skill_usage"].items())
             line += f"; skills: {shares}"
@@ -98,6 +105,7 @@ def evaluate(
     seed: int = 0,
     deterministic: bool = True,
     num_envs: int = 100,
+    max_steps: int | None = None,
 ) -> Evaluation:
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
@@ -105,30 +113,36 @@ def evaluate(
         seed: picks the episodes; the same seed gives the same starts to every policy.
         deterministic: act greedily, else sample.
         num_envs: environments side by side; does not change the result of a greedy policy.
+        max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
+            as many as the environment's own time limit, or ``LONGEST_EPISODE``.
 
     Raises:
         SkillweaveError: the policy was made for other spaces.
     """
-    for name, value in (("episodes", episodes), ("num_envs", num_envs)):
-        if value < 1:
-            raise SkillweaveError(f"{name} is {value}; it must be at least 1")
-    if seed < 0:
-        raise SkillweaveError(f"seed is {seed}; it must be at least 0")
-    n = min(num_envs, episodes)
+    episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
+    limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
+    n = min(whole_number(num_envs, "num_envs", 1), episodes)
+    reference = env.make()
+    try:
+        limit = limit or time_limit(reference) or LONGEST_EPISODE
+        threshold = reference.spec.reward_threshold if reference.spec else None
+    finally:
+        reference.close()
     engine = make_engine(replaced(env, engine="sync"), n)
     try:
         _check_spaces(policy, engine.observation_space, engine.action_space, env.name)
-        return _play(policy, engine, env, episodes, seed, deterministic)
+        rng = np.random.default_rng([seed, 1])
+        act = functools.partial(policy.act, deterministic=deterministic, rng=rng)
+        seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+        return replaced(_play(policy, act, engine, seeds, limit), threshold=threshold)
     finally:
         engine.close()
 
 
 def _play(
-    policy: Policy, engine: Any, env: EnvSpec, episodes: int, seed: int, deterministic: bool
+    policy: Policy, act: Callable[..., Any], engine: Any, seeds: list[int], limit: int
 ) -> Evaluation:
-    n = engine.num_envs
-    rng = np.random.default_rng([seed, 1])
-    seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+    n, episodes, cut = engine.num_envs, len(seeds), 0
     episode = np.arange(n)  # which episode each environment plays
     upcoming = n
     engine.reset(0)
@@ -141,8 +155,7 @@ def _play(
     while len(rows):
         own = {k: v[rows] for k, v in memory.items()}
         here = obs[rows]
-        allowed = allowed_rows(engine.mask(), rows)
-        action, own = policy.act(own, here, allowed, deterministic=deterministic, rng=rng)
+        action, own = act(own, here, allowed_rows(engine.mask(), rows))
         raw = engine.step(action, rows)
         elapsed[rows] += 1
         acting = policy.acting(own)
@@ -160,7 +173,10 @@ def _play(
         obs[rows] = raw.next_obs
         returns[episode[rows]] += raw.reward
         lengths[episode[rows]] += 1
-        ended = rows[raw.terminated | raw.truncated]
+        over = raw.terminated | raw.truncated
+        late = ~over & (elapsed[rows] >= limit)
+        cut += int(late.sum())
+        ended = rows[over | late]
         if len(ended):
             fresh = ended[: max(0, episodes - upcoming)]
             given = seeds[upcoming : upcoming + len(fresh)] + [0] * (len(ended) - len(fresh))
@@ -171,17 +187,13 @@ def _play(
             for k, v in policy.start(n).items():
                 memory[k][ended] = v[ended]
             rows = np.setdiff1d(rows, ended[len(fresh) :])
-    threshold = None
-    if isinstance(env.env, str):
-        reference = env.make()
-        threshold = reference.spec.reward_threshold if reference.spec else None
-        reference.close()
     return Evaluation(
         tuple(returns.tolist()),
         tuple(lengths.tolist()),
-        threshold,
+        None,
         dict(zip(policy.labels, used.tolist(), strict=True)),
         dict(zip(policy.labels, calls.tolist(), strict=True)),
+        cut,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.seeding import Seeds
 from skillweave.training.members import passed
 from skillweave.types import Array, Policy, VecEnv
@@ -16,21 +17,28 @@ MakeEnv = Callable[[int, Any], VecEnv]
 
 
 def episode_returns(
-    policy: Policy, env: VecEnv, seeds: Seeds, *, deterministic: bool = True
+    policy: Policy,
+    env: VecEnv,
+    seeds: Seeds,
+    *,
+    deterministic: bool = True,
+    max_steps: int = LONGEST_EPISODE,
 ) -> Array:
     """The return of the first episode in each of N environments, (N,) float64, undiscounted.
 
-    Equal seeds give equal starts, whoever plays.
+    Equal seeds give equal starts, whoever plays. An episode that nothing has ended after
+    ``max_steps`` counts as it stands then.
     """
     n = env.num_envs
     rng = (seeds / "act").numpy()
     obs, memory, mask = env.reset(seeds / "start"), policy.start(n), env.mask()
-    returns, playing = np.zeros(n), np.ones(n, bool)
+    returns, lengths, playing = np.zeros(n), np.zeros(n, np.int64), np.ones(n, bool)
     while playing.any():
         action, memory = policy.act(memory, obs, mask, deterministic=deterministic, rng=rng)
         step = env.step(action)
         returns += playing * np.asarray(step.info.get("call_return", step.reward), np.float64)
-        playing &= ~step.ended
+        lengths += step.steps
+        playing &= ~step.ended & (lengths < max_steps)
         obs, mask = step.obs, step.mask
     return returns
 

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Text
 from skillweave import DQN, PPO, SAC, EnvSpec, Hierarchy, Reflex, Skill, SkillweaveError, recipes
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Run
+from skillweave.hierarchy.declaration import check_budgets
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import apply_settings, list_settings
 from skillweave.hierarchy.weights import read_weights, write_weights
@@ -499,3 +500,102 @@ def test_a_hierarchy_as_a_skill_needs_a_proper_name(tmp_path, name):
     inner = declare()
     with pytest.raises(SkillweaveError, match="name"):
         declare(Run(inner, tmp_path, trained(inner)).as_skill(name))
+
+
+# What cannot be learnt ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_a_budget_that_ends_before_learning_begins_is_refused(tmp_path, flat):
+    late = DQN(learning_starts=500)
+    h = Hierarchy("CartPole-v1", [Plain()], algorithm=late, skill_steps=500, flat_steps=500)
+    name = "flat" if flat else "plain"
+    says = f"phase '{name}': its budget is 500 steps, but it begins to learn only after 500"
+    with pytest.raises(SkillweaveError, match=says):
+        h.train(tmp_path / "run", flat=flat)
+    assert not (tmp_path / "run").exists()
+
+
+def test_each_members_budget_counts_not_the_populations(tmp_path):
+    phase = {"name": "x", "budget": 4_000, "algorithm": {"learning_starts": 1_000}}
+    check_budgets([phase])
+    says = "'x'.*1,000 steps for each member, but it begins to learn only after 1,000"
+    with pytest.raises(SkillweaveError, match=says):
+        check_budgets([phase | {"evolution": {"population": 4}}])
+    check_budgets([{"name": "x", "budget": 1, "algorithm": {}}])
+
+
+class Plain(Skill):
+    """The task itself."""
+
+
+@pytest.mark.parametrize(
+    ("space", "which"),
+    [
+        (gym.spaces.MultiBinary(10**9), "observation"),
+        (gym.spaces.Discrete(10**9), "observation"),
+        (gym.spaces.Dict(a=gym.spaces.MultiDiscrete([2**60, 2**62])), "observation"),
+        (gym.spaces.MultiBinary(10**9), "action"),
+        (gym.spaces.MultiDiscrete([2**60, 2**62]), "action"),
+    ],
+)
+def test_absurd_spaces_are_refused_with_their_size_before_anything_is_made(tmp_path, space, which):
+    class Absurd(gym.Env):
+        observation_space = space if which == "observation" else gym.spaces.Discrete(2)
+        action_space = space if which == "action" else gym.spaces.Discrete(2)
+
+    h = Hierarchy(Absurd, [Plain()])
+    with pytest.raises(SkillweaveError, match=rf"{which} space .* is \d.*,000 are supported.*GB"):
+        h.train(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_rollout_that_does_not_fit_into_memory_is_refused(tmp_path):
+    h = Hierarchy("CartPole-v1", [Plain()], algorithm=PPO(n_steps=10**12))
+    with pytest.raises(SkillweaveError, match=r"a rollout of .*lower num_envs or n_steps"):
+        h.train(tmp_path / "run")
+
+
+def test_a_fixed_action_of_a_reflex_is_checked_before_training(tmp_path):
+    h = Hierarchy("CartPole-v1", [Plain()], reflexes=[Reflex(lambda obs: obs[:, 0] > 9, 2, "far")])
+    with pytest.raises(SkillweaveError, match="reflex 'far': action returned 2, which is no"):
+        h.train(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"seed": None}, "seed is None; it must be a whole number"),
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": 1.5}, "seed is 1.5"),
+        ({"seed": True}, "seed is True"),
+        ({"run_dir": 5}, "run_dir is 5; it must be a path"),
+        ({"run_dir": None}, "run_dir is None"),
+        ({"track": "wandb"}, "track is 'wandb'; it must be a list"),
+        ({"track": 5}, "track is 5"),
+        ({"evolve": 3}, r"evolve is 3; it must be an Evolution\(\)"),
+    ],
+)
+def test_a_wrong_argument_of_train_is_told(tmp_path, wrong, says):
+    given = {"run_dir": tmp_path / "run", **wrong}
+    with pytest.raises(SkillweaveError, match=says):
+        Hierarchy("CartPole-v1", [Plain()]).train(given.pop("run_dir"), **given)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"skills": Plain}, "skills must be a list"),
+        ({"skills": 3}, "skills must be a list"),
+        ({"reflexes": 3}, "reflexes is 3; it must be a list"),
+        ({"reflexes": Reflex(max, 0)}, "reflexes is .*; it must be a list"),
+        ({"greedy_skills": "no"}, "greedy_skills is 'no'; it must be True or False"),
+        ({"skill_steps": 10.0}, "skill_steps is 10.0"),
+        ({"env": None}, "env is None"),
+        ({"skills": ["x" * 10_000]}, "skills holds 'xxx.{0,200} which is not a Skill"),
+    ],
+)
+def test_a_field_of_another_kind_is_told(wrong, says):
+    with pytest.raises(SkillweaveError, match=says):
+        Hierarchy(**{"env": "CartPole-v1", "skills": [Plain()], **wrong})

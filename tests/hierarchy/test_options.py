@@ -73,6 +73,26 @@ def walks():
     return make
 
 
+def test_a_call_that_nothing_ends_is_told_and_not_waited_for(options, monkeypatch):
+    monkeypatch.setattr("skillweave.hierarchy.options.LONGEST_EPISODE", 2)
+
+    class Eternal(Left):
+        max_steps = None
+
+        def termination(self, step):
+            return np.zeros(len(step.reward), bool)
+
+    def endless():
+        env = Walk()
+        env.step = lambda action: (*Walk.step(env, action)[:2], False, False, {})
+        return env
+
+    env = options(skill_set(Eternal, call_steps=None), env=endless, num_envs=2)
+    env.reset(seed=0)
+    with pytest.raises(SkillweaveError, match="skill 'eternal' has run for 2 steps in environ"):
+        env.step(np.zeros(2, np.int64))
+
+
 def agree(env: OptionsEnv, scalars: list[Scalar], calls: int, seed: int) -> dict[str, list]:
     """Play the same random allowed calls in both and compare everything."""
     rng, seen = np.random.default_rng(seed), {"steps": [], "terminated": [], "truncated": []}

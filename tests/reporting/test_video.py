@@ -296,7 +296,7 @@ def test_render_policy(tmp_path: Path) -> None:
 
     path = tmp_path / "a.gif"
     result = render_policy(EnvSpec(corridor), policy, path, episodes=2, seed=5, label=label)
-    episode = {"return": 7.0, "length": 7, "skills": {"walk": 3, "run": 4}}
+    episode = {"return": 7.0, "length": 7, "cut": False, "skills": {"walk": 3, "run": 4}}
     assert result == {"path": str(path), "frames": 10, "episodes": [episode, episode]}
     assert made[0].seeds == [5, 6]
     assert made[0].actions == [1] * 14
@@ -329,7 +329,7 @@ def test_the_policy_is_told_every_step(tmp_path: Path) -> None:
 def test_max_steps_fps_and_every(tmp_path: Path) -> None:
     path = tmp_path / "a.gif"
     result = render_policy(EnvSpec(Corridor), Walker(), path, max_steps=4, fps=10, every=3)
-    assert result["episodes"] == [{"return": 4.0, "length": 4, "skills": {}}]
+    assert result["episodes"] == [{"return": 4.0, "length": 4, "cut": True, "skills": {}}]
     assert decode(path)[1] == [300, 300, 1000]
     with pytest.raises(SkillweaveError, match="at least 1"):
         render_policy(EnvSpec(Corridor), Walker(), path, every=0)

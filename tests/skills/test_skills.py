@@ -1,8 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
 
-from skillweave.skills import Reflex, Skill, apply_reflexes, checked
-from skillweave.types import SkillweaveError, Step
+from skillweave.skills import Reflex, Skill, apply_reflexes, asked, checked, from_function
+from skillweave.types import SkillweaveError, Step, short, whole_number
 
 
 def step(n: int = 3) -> Step:
@@ -73,20 +76,20 @@ OBS = np.array([[0.0], [1.0], [2.0]])
 
 def test_a_reflex_overrides_the_action_where_it_holds_and_leaves_its_argument_alone():
     action = np.array([5, 5, 5])
-    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(OBS, action)
+    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(OBS, action, Discrete(6))
     assert (overridden.tolist(), holds.tolist()) == ([5, 0, 0], [False, True, True])
     assert action.tolist() == [5, 5, 5]
 
 
 def test_a_reflex_may_compute_its_actions_from_the_observations_where_it_holds():
     reflex = Reflex(lambda obs: obs[:, 0] > 0, lambda obs: 10 * obs)
-    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0))
+    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0), Box(-50, 50, (1,)))
     assert overridden.tolist() == [[5], [10], [20]]
 
 
 def test_the_last_reflex_wins():
     reflexes = (Reflex(lambda o: o[:, 0] > 0, 1), Reflex(lambda o: o[:, 0] > 1, 2))
-    assert apply_reflexes(reflexes, OBS, np.zeros(3, int)).tolist() == [0, 1, 2]
+    assert apply_reflexes(reflexes, OBS, np.zeros(3, int), Discrete(3)).tolist() == [0, 1, 2]
 
 
 def test_a_reflex_is_named_after_its_condition():
@@ -95,10 +98,11 @@ def test_a_reflex_is_named_after_its_condition():
 
     assert Reflex(leg_touches, 0).name == "leg_touches"
     assert Reflex(leg_touches, 0, name="off").name == "off"
+    reflex = Reflex(lambda obs: np.zeros(2, bool), 0, name="leg_touches")
     with pytest.raises(
         SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"
     ):
-        Reflex(lambda obs: np.zeros(2, bool), 0, name="leg_touches").apply(OBS, np.zeros(3))
+        reflex.apply(OBS, np.zeros(3, int), Discrete(2))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -124,3 +128,181 @@ def test_a_wrong_shape_is_named(bad):
 def test_numbers_are_cast():
     assert checked([1, 0], 2, np.float32, "", "").dtype == np.float32
     assert checked([1, 0], 2, bool, "", "").tolist() == [True, False]
+
+
+# What users return -----------------------------------------------------------------------------
+
+
+def step_of(n: int = 2) -> Step:
+    never = np.zeros(n, bool)
+    obs, action = np.zeros((n, 1)), np.zeros(n, int)
+    reward, elapsed = np.ones(n, np.float32), np.arange(1, n + 1)
+    return Step(obs, action, obs.copy(), reward, never, never, never, elapsed, {})
+
+
+@pytest.mark.parametrize(
+    ("bad", "says"),
+    [
+        ([[1.0], [1.0, 2.0]], "which is no array: ValueError"),
+        (["a", "b"], r"returned <U1 \('a'\) at step 2, but rewards are real numbers"),
+        ([1j, 1.0], r"returned complex128 \(1j\) at step 2, but rewards are real numbers"),
+        ([None, 1], "returned object .*real numbers"),
+        (np.zeros(2, "M8[s]"), "returned datetime64.*real numbers"),
+    ],
+)
+def test_a_reward_of_another_kind_is_told(bad, says):
+    skill = type("Odd", (Skill,), {"reward": lambda self, step: bad})()
+    with pytest.raises(SkillweaveError, match=rf"skill 'odd': reward\(\) {says}|{says}"):
+        asked(skill, "reward", step_of(), 2, np.array([2, 2]))
+
+
+@pytest.mark.parametrize("method", ["termination", "success", "initiation"])
+@pytest.mark.parametrize(
+    ("bad", "says"),
+    [
+        ([0, 7], "returned 7 at step 3 for environment 1, but yes or no"),
+        ([np.nan, 1.0], "returned nan at step 3 for environment 0, but yes or no"),
+        ([0.0, 0.5], "returned 0.5 .*compare with something"),
+        (["no", ""], r"returned <U2 \('no'\)"),
+        ([None, True], "returned object"),
+        ([1j, 0], "returned complex128"),
+    ],
+)
+def test_what_is_neither_yes_nor_no_is_told(method, bad, says):
+    skill = type("Odd", (Skill,), {method: lambda self, about: bad})()
+    with pytest.raises(SkillweaveError, match=rf"skill 'odd': {method}\(\) {says}"):
+        asked(skill, method, step_of(), 2, np.array([3, 3]))
+
+
+def test_zeros_and_ones_of_any_kind_are_yes_and_no():
+    for good in ([1, 0], [1.0, 0.0], np.array([True, False]), np.uint8([1, 0])):
+        skill = type("Fine", (Skill,), {"termination": lambda self, step, good=good: good})()
+        found = asked(skill, "termination", step_of(), 2)
+        assert (found.dtype, found.tolist()) == (bool, [True, False])
+
+
+def test_an_error_of_a_skill_is_told_with_its_step_and_line_and_is_its_cause():
+    class Divides(Skill):
+        def reward(self, step):
+            return 1 // int(step.action[0])
+
+    says = r"skill 'divides': reward\(\) raised ZeroDivisionError.*\(test_skills.py, line \d+\) at "
+    with pytest.raises(SkillweaveError, match=f"{says}step 4") as raised:
+        asked(Divides(), "reward", step_of(), 2, np.array([4, 4]))
+    assert isinstance(raised.value.__cause__, ZeroDivisionError)
+
+
+ARRAYS = [f.name for f in dataclasses.fields(Step) if f.name != "info"]
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_a_skill_cannot_change_what_others_see(name):
+    class Writes(Skill):
+        def reward(self, step):
+            getattr(step, name)[...] = 0
+            return step.reward
+
+    step = step_of()
+    with pytest.raises(SkillweaveError, match=r"reward\(\) raised ValueError.*change a copy"):
+        asked(Writes(), "reward", step, 2)
+
+
+def test_what_a_step_is_made_of_can_still_be_changed_by_its_owner():
+    elapsed = np.ones(2, np.int64)
+    step = dataclasses.replace(step_of(), elapsed=elapsed)
+    elapsed += 1
+    assert step.elapsed.tolist() == [2, 2]
+
+
+@pytest.mark.parametrize("function", ["initiation", "condition", "policy"])
+def test_observations_cannot_be_changed_either(function):
+    def write(obs):
+        obs[:] = 0
+        return np.zeros(len(obs), bool)
+
+    skill = type("Writes", (Skill,), {"initiation": lambda self, obs: write(obs)})()
+    call = {
+        "initiation": lambda obs: asked(skill, "initiation", obs, 3),
+        "condition": lambda obs: Reflex(write, 0).apply(obs, np.zeros(3, int), Discrete(2)),
+        "policy": lambda obs: from_function(write).act({}, obs),
+    }[function]
+    obs = OBS.copy()
+    with pytest.raises(SkillweaveError, match="change a copy"):
+        call(obs)
+    assert obs.tolist() == OBS.tolist()
+
+
+@pytest.mark.parametrize(
+    ("action", "space", "says"),
+    [
+        (
+            7,
+            Discrete(4),
+            r"action returned 7, which is no action of Discrete\(4\)",
+        ),
+        ("up", Discrete(4), "whole numbers"),
+        (0.5, Discrete(4), "float64, but actions of.*whole numbers"),
+        ([0.0, 1.0], Box(-1, 1, (3,)), r"shape \(1, 2\), but \(1, 3\)"),
+        ([[0], [1, 2]], Box(-1, 1, (2,)), "no array"),
+        (np.nan, Box(-1, 1, (1,)), "NaN"),
+        (lambda obs: np.full(len(obs), 9), Discrete(4), r"action\(\) returned 9"),
+        (lambda obs: np.zeros(1, int), Discrete(4), r"action\(\) returned shape \(1,\)"),
+        (lambda obs: obs["x"], Discrete(4), r"action\(\) raised IndexError"),
+    ],
+)
+def test_a_wrong_action_of_a_reflex_is_told(action, space, says):
+    reflex = Reflex(lambda obs: obs[:, 0] > 0, action, "tilted")
+    with pytest.raises(SkillweaveError, match=f"reflex 'tilted': .*{says}|{says}"):
+        reflex.apply(OBS, np.zeros((3, *space.shape), space.dtype), space)
+    if not callable(action):
+        with pytest.raises(SkillweaveError, match="reflex 'tilted'"):
+            reflex.check(space)
+
+
+@pytest.mark.parametrize(
+    ("condition", "name", "says"), [(3, None, "condition is 3"), (max, 5, "name is 5")]
+)
+def test_a_reflex_is_a_function_with_a_name(condition, name, says):
+    with pytest.raises(SkillweaveError, match=f"Reflex's {says}"):
+        Reflex(condition, 0, name)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "says"),
+    [
+        ("name", 5, "skill 5 .*name must be text"),
+        ("max_steps", True, "max_steps is True"),
+        ("steps", 1.0, "steps is 1.0"),
+        ("reward", 3, "reward is 3; it must be a method"),
+    ],
+)
+def test_attributes_of_another_kind_are_told(attribute, value, says):
+    skill = type("Odd", (Skill,), {attribute: value})()
+    with pytest.raises(SkillweaveError, match=says):
+        skill.validate()
+
+
+# Words of messages -----------------------------------------------------------------------------
+
+
+def test_long_values_are_shortened_and_what_cannot_be_shown_is_named():
+    assert short("x" * 10_000, 20) == "'xxxxxxxxx … xxxxxxxxx'"
+    assert short([1, 2]) == "[1, 2]"
+
+    class Shy:
+        def __repr__(self):
+            raise RuntimeError
+
+    assert short(Shy()) == "a Shy"
+
+
+@pytest.mark.parametrize("bad", [None, 1.5, "x", True, np.bool_(1), [1], np.nan])
+def test_what_is_no_whole_number_is_told(bad):
+    with pytest.raises(SkillweaveError, match=r"seed is .*; it must be a whole number"):
+        whole_number(bad, "seed", 0)
+
+
+def test_whole_numbers_become_ints():
+    assert type(whole_number(np.int64(3), "seed", 0)) is int
+    with pytest.raises(SkillweaveError, match="seed is -1; it must be at least 0"):
+        whole_number(-1, "seed", 0)

@@ -72,9 +72,7 @@ def hierarchy(**settings) -> sw.Hierarchy:
         {"algorithm": sw.DQN(**REPLAY, network=NET), "selector": sw.DQN(**REPLAY, network=NET)},
     ],
 )
-def test_the_search_for_a_start_is_reported_and_counts_against_the_budget(
-    settings, made, tmp_path
-):
+def test_the_search_for_a_start_is_reported_and_counts_against_the_budget(settings, made, tmp_path):
     run = hierarchy(**settings).train(tmp_path / "run", quiet=True)
     assert reported(run) == made[0]
     late, always, selector = run.info()["phases"]

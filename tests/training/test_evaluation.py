@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
+import skillweave.training.evaluation as evaluation_module
 from skillweave import PPO, EnvSpec, Evaluation, Skill, SkillweaveError, evaluate
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.hierarchy.calls import SkillSet
@@ -283,6 +284,64 @@ def test_without_a_threshold_nothing_is_solved_or_unsolved(env):
     assert found.solved_fraction is None
     assert found.to_json()["solved_fraction"] is None
     assert "or more" not in str(found)
+
+
+# Episodes that never end -----------------------------------------------------------------------
+
+
+class Endless(Line):
+    """Ends only where action 2 is taken; otherwise an action pays itself."""
+
+    def step(self, action):
+        obs, reward, *_, info = super().step(action)
+        return obs, reward, bool(action == 2), False, info
+
+
+def mixed(obs):
+    """Ends the episodes that began first, after three steps; the others go on."""
+    return np.where((np.arange(len(obs)) == 0) & (obs[:, 0] == 2), 2, 1)
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_an_episode_that_never_ends_is_cut_and_counted(num_envs):
+    found = evaluate(fixed(1), EnvSpec(Endless), episodes=3, num_envs=num_envs, max_steps=6)
+    assert (found.lengths, found.returns, found.cut) == ((6,) * 3, (6.0,) * 3, 3)
+    assert found.to_json()["cut"] == 3
+    assert "3 never ended and were cut after 6 steps" in str(found)
+
+
+def test_only_those_that_nothing_has_ended_count_as_cut():
+    policy = ScriptedPolicy(mixed, Line.observation_space, Line.action_space)
+    found = evaluate(policy, EnvSpec(Endless), episodes=2, num_envs=2, max_steps=5)
+    assert (found.lengths, found.cut) == ((3, 5), 1)
+    ends = evaluate(fixed(2), EnvSpec(Endless), episodes=2, max_steps=1)
+    assert (ends.lengths, ends.cut) == ((1, 1), 0), "an end on the last step is an end"
+    assert "cut" not in str(ends)
+
+
+def test_without_a_limit_the_environments_own_counts_or_the_longest_episode(monkeypatch):
+    monkeypatch.setattr(evaluation_module, "LONGEST_EPISODE", 9)
+    assert evaluate(fixed(1), EnvSpec(Endless), episodes=1).lengths == (9,)
+    limited = EnvSpec(lambda: gym.wrappers.TimeLimit(Endless(), 12))
+    found = evaluate(fixed(1), limited, episodes=1)
+    assert (found.lengths, found.cut) == ((12,), 0), "truncated by itself"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"episodes": "x"}, "episodes is 'x'; it must be a whole number"),
+        ({"episodes": 1.5}, "episodes is 1.5"),
+        ({"seed": None}, "seed is None"),
+        ({"seed": -1}, "seed is -1; it must be at least 0"),
+        ({"seed": 1.5}, "seed is 1.5"),
+        ({"max_steps": 0}, "max_steps is 0; it must be at least 1"),
+        ({"num_envs": True}, "num_envs is True"),
+    ],
+)
+def test_a_wrong_number_is_told(wrong, says):
+    with pytest.raises(SkillweaveError, match=says):
+        evaluate(fixed(0), EnvSpec(Line), **{"episodes": 1, **wrong})
 
 
 # What is wrong ---------------------------------------------------------------------------------

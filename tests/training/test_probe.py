@@ -12,7 +12,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.probe import Probe, episode_returns
-from tests.toys import Clockwork, Countdown, Identity
+from tests.toys import Calls, Clockwork, Countdown, Identity
 
 
 def played_by_hand(env: Any, seeds: Seeds) -> list[float]:
@@ -35,6 +35,26 @@ def test_only_first_episodes_count_though_they_differ_in_length():
     got = episode_returns(policy, env, Seeds(0))
     assert got.tolist() == played_by_hand(Clockwork(range(6)), Seeds(0))
     assert len(set(got.tolist())) > 1
+
+
+def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit():
+    class Forever(Countdown):
+        """Pays 1 a step; only the first environment ends, after 5 steps."""
+
+        def play(self, action: Any) -> Any:
+            obs, reward, terminated, truncated, steps = super().play(action)
+            return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated, steps
+
+    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
+    assert episode_returns(policy, Forever(2), Seeds(0), max_steps=8).tolist() == [5.0, 8.0]
+
+
+def test_the_limit_counts_environment_steps_not_decisions():
+    class Choice(ScriptedPolicy):
+        """Takes the call of 10 steps, which pays 3."""
+
+    policy = Choice(lambda obs: np.ones(len(obs), np.int64))
+    assert episode_returns(policy, Calls(1), Seeds(0), max_steps=25).tolist() == [9.0]
 
 
 def test_equal_seeds_give_equal_starts_and_others_other_ones():
