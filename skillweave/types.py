@@ -54,6 +54,11 @@ def short(value: object, longest: int = 100) -> str:
         text = repr(value)
     except Exception:
         text = f"a {type(value).__name__}"
+    return shortened(text, longest)
+
+
+def shortened(text: str, longest: int = 500) -> str:
+    """Text for a message, its middle left out where it is long."""
     half = longest // 2
     return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
 
@@ -64,7 +69,7 @@ def told(error: BaseException) -> str:
         message = str(error)
     except Exception:
         message = ""
-    text = type(error).__name__ + (f": {short(_Plain(message), 500)}" if message else "")
+    text = type(error).__name__ + (f": {shortened(message)}" if message else "")
     own, frames = str(Path(__file__).parent), traceback.extract_tb(error.__traceback__)
     theirs = [f for f in frames if not f.filename.startswith(own)]
     # The user's line, where there is one: not that of a library which it called.
@@ -72,15 +77,6 @@ def told(error: BaseException) -> str:
     if written:
         text += f" ({Path(written[-1].filename).name}, line {written[-1].lineno})"
     return text
-
-
-class _Plain(str):
-    """Text that ``repr`` leaves as it is."""
-
-    __slots__ = ()
-
-    def __repr__(self) -> str:
-        return str(self)
 
 
 def read_only(array: Array) -> Array:

@@ -13,7 +13,7 @@ import gymnasium as gym
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.types import MissingExtra, SkillweaveError, short, told
+from skillweave.types import MissingExtra, SkillweaveError, short, shortened, told
 
 MOST = 65_536
 """Environments in one engine."""
@@ -100,7 +100,9 @@ class EnvSpec:
         except (gym.error.Error, ImportError) as error:
             near = difflib.get_close_matches(env_id, list(gym.registry), n=4, cutoff=0.6)
             hint = f" Close matches: {', '.join(near)}." if near else ""
-            raise SkillweaveError(f"no environment {short(env_id)}: {error}.{hint}") from error
+            raise SkillweaveError(
+                f"no environment {short(env_id)}: {shortened(str(error))}.{hint}"
+            ) from error
 
     @property
     def name(self) -> str:
