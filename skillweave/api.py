@@ -18,6 +18,7 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, check_budgets
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import read_weights, write_weights
+from skillweave.messages import short, whole_number
 from skillweave.reporting.progress import Progress
 from skillweave.reporting.video import color_of, render_policy
 from skillweave.runs.directory import RunDirectory
@@ -25,7 +26,7 @@ from skillweave.runs.trackers import make_trackers
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.phase import check_replay
-from skillweave.types import Memory, Policy, SkillweaveError, short, whole_number
+from skillweave.types import Memory, Policy, SkillweaveError
 
 
 class Hierarchy(Declaration):

@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
+from skillweave.messages import short
 from skillweave.networks.config import Network
-from skillweave.types import SkillweaveError, short
+from skillweave.types import SkillweaveError
 
 Schedule = Literal["constant", "linear"]
 INFINITY = float("inf")

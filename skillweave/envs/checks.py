@@ -12,8 +12,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.messages import short, told
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.types import Array, SkillweaveError, finite, short, told
+from skillweave.types import Array, SkillweaveError, finite
 
 LONGEST_EPISODE = 100_000
 """Steps after which an episode is cut that nothing ends, wherever a policy is only watched."""

@@ -13,7 +13,8 @@ import gymnasium as gym
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.types import MissingExtra, SkillweaveError, short, shortened, told
+from skillweave.messages import short, shortened, told
+from skillweave.types import MissingExtra, SkillweaveError
 
 MOST = 65_536
 """Environments in one engine."""

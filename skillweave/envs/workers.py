@@ -26,7 +26,8 @@ from gymnasium.vector.utils import (
     create_empty_array,
 )
 
-from skillweave.types import SkillweaveError, told
+from skillweave.messages import told
+from skillweave.types import SkillweaveError
 
 PATIENCE = 1.0
 """Seconds that workers have to end by themselves when they are closed."""

@@ -10,10 +10,11 @@ from skillweave.algorithms.policy import AgentPolicy
 from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.phase import evolve_phase
+from skillweave.messages import short
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.phase import Listener, Phase, Trainer
-from skillweave.types import SkillweaveError, short
+from skillweave.types import SkillweaveError
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
 """A population for every phase, or for those named."""

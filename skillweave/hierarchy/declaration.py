@@ -13,10 +13,11 @@ from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
 from skillweave.buffers.memory import check_memory
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.calls import SkillSet
+from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.foreign import fitted
 from skillweave.spaces import action_codec, obs_codec, obs_dtype, obs_shape
-from skillweave.types import Policy, SkillweaveError, short
+from skillweave.types import Policy, SkillweaveError
 
 RESERVED = ("selector", "flat")
 """Names of phases that are not skills."""

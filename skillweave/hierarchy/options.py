@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from skillweave.envs.checks import LONGEST_EPISODE
-from skillweave.envs.engine import Engine, checksums
+from skillweave.envs.engine import Engine, RawStep, checksums
 from skillweave.envs.infos import allowed_rows
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.seeding import Seeds
@@ -149,14 +149,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             discount[rows] *= self._gamma[rows]
             steps[rows] += 1
             next_obs[rows] = raw.next_obs
-            seen = None
-            if self._watches:
-                never = np.zeros(len(rows), bool)
-                seen = Step(
-                    here, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-                    never, steps[rows], raw.info,
-                )  # fmt: skip
-            over = self.skills.observe(self._memory, rows, seen)
+            over = self._observe(rows, here, action, raw, steps[rows])
             ended = raw.terminated | raw.truncated
             if len(rows) == n:
                 obs = raw.next_obs.copy()
@@ -183,6 +176,19 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         }
         seen_obs = unpack(self.single_observation_space, obs)
         return seen_obs, reward.astype(np.float32), terminated, truncated, info
+
+    def _observe(
+        self, rows: Array, obs: Array, action: Array, raw: RawStep, elapsed: Array
+    ) -> Array:
+        """Show a step of environments ``rows`` (k,) to their skills; (k,) bool: the call is over."""
+        seen = None
+        if self._watches:
+            never = np.zeros(len(rows), bool)
+            seen = Step(
+                obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+                never, elapsed, raw.info,
+            )  # fmt: skip
+        return self.skills.observe(self._memory, rows, seen)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the engine."""

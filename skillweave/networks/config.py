@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from skillweave.types import SkillweaveError, short
+from skillweave.messages import short
+from skillweave.types import SkillweaveError
 
 WIDEST = 65_536
 """Units of a layer."""

@@ -16,11 +16,12 @@ import numpy as np
 from skillweave.envs.checks import LONGEST_FILM
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
+from skillweave.messages import whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds
-from skillweave.types import Array, Memory, Policy, SkillweaveError, Step, whole_number
+from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
 __all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
 
@@ -72,8 +73,7 @@ def render_policy(
     # Observations, infos and masks are those of an evaluation.
     engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
     try:
-        rate = (fps or env.metadata.get("render_fps") or 30) / every
-        with VideoWriter(path, rate) as video:
+        with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
             for i in range(episodes):
                 who, color, skills = "", BLACK, Counter[str]()
                 for now in _play(engine, policy, act, seed + i, limit):

@@ -8,7 +8,8 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
-from skillweave.types import Array, SkillweaveError, short, told
+from skillweave.messages import short, told
+from skillweave.types import Array, SkillweaveError
 
 
 def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:

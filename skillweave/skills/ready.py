@@ -7,10 +7,11 @@ import sys
 from types import MethodType
 from typing import Any
 
+from skillweave.messages import short
 from skillweave.skills.base import Skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
-from skillweave.types import Policy, SkillweaveError, short
+from skillweave.types import Policy, SkillweaveError
 
 
 def ready_policy(skill: Skill) -> Policy | None:

@@ -11,11 +11,12 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
 
+from skillweave.messages import short
 from skillweave.reading import read_file
 from skillweave.skills.actions import checked_actions
 from skillweave.skills.foreign import Foreign, checksum
 from skillweave.skills.torch_module import weights_of, with_weights
-from skillweave.types import Array, Memory, MissingExtra, SkillweaveError, short
+from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
 
 ALGORITHMS = ("ppo", "a2c", "dqn", "sac", "td3", "ddpg")
 

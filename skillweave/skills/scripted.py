@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.messages import short
 from skillweave.skills.actions import as_array, called, checked_actions
 from skillweave.skills.foreign import Foreign, qualified
-from skillweave.types import Array, Memory, SkillweaveError, read_only, short
+from skillweave.types import Array, Memory, SkillweaveError, read_only
 
 
 class ScriptedPolicy(Foreign):

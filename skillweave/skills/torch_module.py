@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from gymnasium import Space
 
+from skillweave.messages import short
 from skillweave.skills.actions import decoded
 from skillweave.skills.foreign import Foreign, checksum, qualified
-from skillweave.types import Array, Memory, SkillweaveError, short
+from skillweave.types import Array, Memory, SkillweaveError
 
 if TYPE_CHECKING:
     from torch import nn

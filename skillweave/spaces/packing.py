@@ -12,7 +12,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.types import Array, SkillweaveError, short
+from skillweave.messages import short
+from skillweave.types import Array, SkillweaveError
 
 OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these"
 

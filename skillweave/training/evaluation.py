@@ -13,8 +13,9 @@ import numpy as np
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.messages import whole_number
 from skillweave.spaces import same_space
-from skillweave.types import Array, Policy, SkillweaveError, Step, whole_number
+from skillweave.types import Array, Policy, SkillweaveError, Step
 
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""

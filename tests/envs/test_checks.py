@@ -239,7 +239,7 @@ def test_envpool_is_watched_too(monkeypatch):
     pytest.importorskip("envpool")
     engine = make_engine(EnvSpec("CartPole-v1", engine="envpool"), 2, threads=1)
     engine.reset(0)
-    step = engine._pool.step
+    step = engine._pools[0].step
 
     def broken(action, ids):
         obs, *rest = step(action, ids)
@@ -251,7 +251,7 @@ def test_envpool_is_watched_too(monkeypatch):
 
     pool = Pool()
     pool.step = broken
-    monkeypatch.setattr(engine, "_pool", pool)
+    monkeypatch.setattr(engine, "_pools", [pool])
     with pytest.raises(SkillweaveError, match=r"CartPole-v1: environment 1, step 1.*4 of 4"):
         engine.step(np.zeros(2, np.int64))
 

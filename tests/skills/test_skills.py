@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
+from skillweave.messages import short, whole_number
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked, checked, from_function
-from skillweave.types import SkillweaveError, Step, short, whole_number
+from skillweave.types import SkillweaveError, Step
 
 
 def step(n: int = 3) -> Step:

@@ -1,0 +1,55 @@
+"""Parts of sentences for people: values, errors and numbers as messages tell them."""
+
+from __future__ import annotations
+
+import traceback
+from pathlib import Path
+
+import numpy as np
+
+from skillweave.types import SkillweaveError
+
+
+def short(value: object, longest: int = 100) -> str:
+    """``repr(value)`` for a message, its middle left out where it is long."""
+    try:
+        text = repr(value)
+    except Exception:
+        text = f"a {type(value).__name__}"
+    return shortened(text, longest)
+
+
+def shortened(text: str, longest: int = 500) -> str:
+    """Text for a message, its middle left out where it is long."""
+    half = longest // 2
+    return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
+
+
+def told(error: BaseException) -> str:
+    """An error of somebody else's code as part of a sentence: its kind, its message, its line."""
+    try:
+        message = str(error)
+    except Exception:
+        message = ""
+    text = type(error).__name__ + (f": {shortened(message)}" if message else "")
+    own, frames = str(Path(__file__).parent), traceback.extract_tb(error.__traceback__)
+    theirs = [f for f in frames if not f.filename.startswith(own)]
+    # The user's line, where there is one: not that of a library which it called.
+    written = [f for f in theirs if "site-packages" not in f.filename] or theirs
+    if written:
+        text += f" ({Path(written[-1].filename).name}, line {written[-1].lineno})"
+    return text
+
+
+def whole_number(value: object, name: str, least: int) -> int:
+    """``value`` as an int.
+
+    Raises:
+        SkillweaveError: it is no whole number, or less than ``least``; the message begins with
+            ``name``.
+    """
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+        raise SkillweaveError(f"{name} is {short(value)}; it must be a whole number")
+    if value < least:
+        raise SkillweaveError(f"{name} is {short(value)}; it must be at least {least}")
+    return int(value)
