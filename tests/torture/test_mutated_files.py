@@ -219,3 +219,12 @@ def test_the_table_counts_and_failures_are_kept(tmp_path):
     assert rows == [
         ["as", "the", "original", "1"], ["TRACEBACK", "2"], ["cases", "3"], ["failures", "2"],
     ]  # fmt: skip
+
+
+def test_what_a_pickle_changes_of_its_reader_is_found_once_and_mended():
+    name, function = next(iter(files.functions().items()))
+    function.mine = 1
+    function.__defaults__ = (7,)
+    assert files.changed_functions() == [name]
+    assert files.changed_functions() == []
+    assert not hasattr(function, "mine")
