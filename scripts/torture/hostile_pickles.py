@@ -132,7 +132,18 @@ def _values(rng: random.Random, path: Path) -> tuple[str, str, bool]:
         }  # fmt: skip
         kind = rng.choice(sorted(kinds))
         part[name] = kinds[kind]
-        details, asks = name, kind in ("double", "other", "numpy", "list", "half")
+        details, asks = (
+            name,
+            kind
+            in (
+                "double",
+                "other",
+                "numpy",
+                "list",
+                "half",
+                "whole numbers",
+            ),
+        )
     try:
         torch.save(tree, path)
     except Exception:  # a value that no pickle holds

@@ -227,6 +227,9 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(f"{name}{tensors[name].dtype}{tuple(tensors[name].shape)}".encode())
+        flat = tensors[name].reshape(-1)
+        if len(flat) < 2:  # it may have the stride 0, which cannot be viewed as bytes
+            flat = flat.clone(memory_format=torch.contiguous_format)
         # As bytes, so that it may be of a type that NumPy does not know.
-        digest.update(tensors[name].reshape(-1).view(torch.uint8).numpy().data)
+        digest.update(flat.view(torch.uint8).numpy().data)
     return digest.hexdigest()

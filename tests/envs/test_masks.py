@@ -327,7 +327,7 @@ def test_what_a_policy_made_elsewhere_takes_is_for_the_environment_to_judge():
     found = evaluate(stubborn, EnvSpec("Taxi-v4"), episodes=2)
     assert found.lengths == (200, 200)
     stubborn = ScriptedPolicy(lambda obs: np.full(len(obs), 3), *_spaces(Gate))
-    with pytest.raises(SkillweaveError, match="step 1 of its episode.*3 is forbidden"):
+    with pytest.raises(SkillweaveError, match=r"step 1 of its episode.*3 is forbidden"):
         evaluate(stubborn, EnvSpec(Gate), episodes=1)
 
 

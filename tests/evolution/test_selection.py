@@ -107,7 +107,7 @@ def test_a_selection_of_ones_own_is_used_and_checked():
         (lambda: Mutations(ranges={"num_envs": Range(1, 9)}).ranges_of(PPO()), "num_envs"),
         (
             lambda: Mutations(ranges={"learning_rate": Range(0.1, 1)}).ranges_of(SAC()),
-            r"excludes the start value SAC.learning_rate = 0.0003",
+            r"excludes the start value SAC.learning_rate = 0.001",
         ),
         (lambda: Mutations(ranges={"target_kl": Range(0.1, 1)}).ranges_of(PPO()), "= None"),
     ],

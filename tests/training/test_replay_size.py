@@ -6,7 +6,7 @@ from skillweave import DQN, SAC, Evolution, Hierarchy, Network, train_agent
 from skillweave.skills import Skill
 from skillweave.types import SkillweaveError
 
-SMALL = {"num_envs": 4, "batch_size": 8, "network": Network((4,))}
+SMALL = {"num_envs": 4, "batch_size": 8, "learning_starts": 40, "network": Network((4,))}
 HUGE = {"buffer_size": 10**13, **SMALL}
 
 
