@@ -20,6 +20,7 @@ from skillweave.evolution.lineage import lineage_of, settings_of
 from skillweave.evolution.population import Population, score
 from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.phase import START, Listener, Phase, Record, train_phase
@@ -92,7 +93,8 @@ class _Evolving:
         self.listeners, entry = listeners, run.phase(phase.name)
         self.config = config_from_json(entry["algorithm"])
         self.horizon = int(entry["budget"]) // evolution.population
-        found = run.load_checkpoint(Nothing, phase.name)  # may be damaged: before there is an arena
+        # It may be damaged: before there is an arena.
+        found = run.load_checkpoint(Nothing, phase.name, schema=Generation)
         self.arena = phase.make_env(evolution.episodes, self.config.gamma)
         """Where fitness is measured."""
         self.spaces = self.arena.observation_space, self.arena.action_space
