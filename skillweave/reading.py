@@ -37,6 +37,8 @@ LONGEST_TEXT = 4096
 """Characters of a text in JSON: the longest path that a system takes."""
 LARGEST = 2**63
 """Whole numbers are smaller than this."""
+LARGEST_FLOAT = 3.4e38
+"""Other numbers are at most this: tensors of float32 must hold them."""
 _SHOWN = 60
 
 
@@ -184,12 +186,11 @@ def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
 
 
 def _plain(kind: Any, data: Any, file: str, path: str) -> Any:
-    number = type(data) in (int, float) and abs(data) < LARGEST
     if kind is float:
-        whole_float = type(data) is float and math.isfinite(data)
-        ok, asked = number or whole_float, "a finite number"
+        ok = type(data) in (int, float) and abs(data) <= LARGEST_FLOAT
+        asked = "a finite number, of float32's range"
     elif kind is int:
-        ok, asked = type(data) is int and number, "a whole number below 2^63"
+        ok, asked = type(data) is int and abs(data) < LARGEST, "a whole number below 2^63"
     elif kind is str:
         ok = isinstance(data, str) and len(data) <= LONGEST_TEXT
         asked = f"a text of at most {LONGEST_TEXT} characters"

@@ -74,6 +74,7 @@ GOOD: dict[str, Any] = {"parts": [{"status": "done"}], "limit": None}
         ({"made": {"pair": [1]}}, "made.pair is [1]; it must be a list of 2"),
         ({"made": {"rate": float("nan")}}, "made.rate is nan; it must be a finite number"),
         ({"made": {"rate": 10**400}}, "it must be a finite number"),
+        ({"made": {"rate": 1e39}}, "made.rate is 1e+39; it must be a finite number, of float32"),
         ({"made": {"size": 1}}, "x.json: made has no field size: made by a newer version?"),
         ({"names": {"a": 1}}, "names['a'] is 1; it must be a text"),
         ({"names": {"a": "b" * 5000}}, "it must be a text of at most 4096 characters"),

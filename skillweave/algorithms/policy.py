@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NotRequired, TypedDict, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.base import Algorithm, Family
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -171,14 +171,20 @@ def checked_tensor(
     return found
 
 
-def state_from(tensors: Mapping[str, Tensor], like: S, where: str) -> S:
+def state_from(
+    tensors: Mapping[str, Tensor], like: S, where: str, families: Sequence[Family] = ()
+) -> S:
     """The state that ``tensors`` hold by field, if it is of the shapes and types of ``like``.
 
     Raises:
         SkillweaveError: it is not; the tensor is named.
     """
+    shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
+    for family in families:  # after growth each parameter has an age of its own
+        if tensors.get(family.count, torch.empty(0)).ndim > 1:
+            shapes[family.count] = shapes[family.weights[0]]
     found = {
-        name: checked_tensor(tensors, name, tuple(value.shape), value.dtype, where)
+        name: checked_tensor(tensors, name, shapes[name], value.dtype, where)
         for name, value in vars(like).items()
     }
     return type(like)(**found)

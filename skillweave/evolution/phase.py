@@ -20,6 +20,7 @@ from skillweave.evolution.lineage import lineage_of, settings_of
 from skillweave.evolution.population import Population, score
 from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.phase import (
@@ -99,7 +100,8 @@ class _Evolving:
         self.listeners, entry = listeners, run.phase(phase.name)
         self.config = config_from_json(entry["algorithm"])
         self.budget = int(entry["budget"])
-        found = run.load_checkpoint(Nothing, phase.name)  # may be damaged: before there is an arena
+        # It may be damaged: before there is an arena.
+        found = run.load_checkpoint(Nothing, phase.name, schema=Generation)
         self.arena = phase.make_env(evolution.episodes, self.config.gamma)
         """Where fitness is measured."""
         self.spaces = self.arena.observation_space, self.arena.action_space
@@ -253,10 +255,12 @@ class _Evolving:
         members = []
         for i, told in enumerate(at["members"]):
             member = _member_from_json(told)
-            fresh = make_algorithm(member.config, *self.spaces).init([self.seeds])
-            member.state = state_from(
-                unprefixed(str(i), tensors), fresh, f"{self.run.path}: member {i}"
+            algorithm, own = (
+                make_algorithm(member.config, *self.spaces),
+                unprefixed(str(i), tensors),
             )
+            fresh, where = algorithm.init([self.seeds]), f"{self.run.path}: member {i}"
+            member.state = state_from(own, fresh, where, algorithm.families())
             members.append(member)
         self.population = Population(
             members, self.evolution, self.phase.make_env, self.spaces, self.seeds

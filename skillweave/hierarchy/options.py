@@ -180,7 +180,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     def _observe(
         self, rows: Array, obs: Array, action: Array, raw: RawStep, elapsed: Array
     ) -> Array:
-        """Show a step of environments ``rows`` (k,) to their skills; (k,) bool: the call is over."""
+        """Show a step of environments ``rows`` (k,) to their skills; (k,): the call is over."""
         seen = None
         if self._watches:
             never = np.zeros(len(rows), bool)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from skillweave.reading import fit
 from skillweave.runs.files import move, read_header, read_tensors, remove, write_tensors
-from skillweave.runs.manifest import Checkpoint
 from skillweave.types import SkillweaveError
 
 
@@ -41,11 +40,12 @@ class Checkpoints:
             raise
 
     def load(
-        self, phase: str, check: Callable[[dict[str, Any], Path], None]
+        self, phase: str, schema: Any, check: Callable[[dict[str, Any], Path], None]
     ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
         """Tensors and header of a phase's latest good one, and its file; None: there is none yet.
 
         Args:
+            schema: of its header.
             check: given a header and its file, raises where they do not belong here.
 
         Raises:
@@ -59,7 +59,7 @@ class Checkpoints:
                 tensors, header = read_tensors(path)
                 if header.get("phase") != phase:
                     continue
-                check(fit(Checkpoint, header, str(path)), path)
+                check(fit(schema, header, str(path)), path)
                 return tensors, header, path
             except SkillweaveError as error:
                 problems.append(str(error))

@@ -36,7 +36,7 @@ from skillweave.runs.files import (
 )
 from skillweave.runs.lines import JsonLines
 from skillweave.runs.lock import Lock
-from skillweave.runs.manifest import check_manifest, identity, versions
+from skillweave.runs.manifest import Checkpoint, check_manifest, identity, versions
 from skillweave.skills.foreign import Foreign, as_recorded
 from skillweave.types import Policy, SkillweaveError
 
@@ -156,17 +156,18 @@ class RunDirectory:
         self._checkpoints.drop()
 
     def load_checkpoint(
-        self, kind: type[S], phase: str, like: S | None = None
+        self, kind: type[S], phase: str, like: S | None = None, schema: Any = Checkpoint
     ) -> tuple[S, dict[str, Any], dict[str, Tensor]] | None:
         """State, header and extra of a phase's latest good clean cut; None: there is none yet.
 
         Args:
             like: a state of the shapes and types that it must have.
+            schema: of the header.
 
         Raises:
             SkillweaveError: checkpoints of this phase exist, but none is good.
         """
-        found = self._checkpoints.load(phase, self._must_be_ours)
+        found = self._checkpoints.load(phase, schema, self._must_be_ours)
         if found is None:
             return None
         tensors, header, path = found

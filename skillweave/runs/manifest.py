@@ -66,7 +66,7 @@ class Manifest(TypedDict):
     """``run.json``."""
 
     kind: Literal["hierarchy", "flat"]
-    env: str
+    env: Annotated[str, Asked("at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
     seed: Count
     cut_every: Positive
@@ -124,13 +124,18 @@ class Checkpoint(TypedDict):
     metrics_bytes: Count
     run: NotRequired[str]
     evaluation_steps: NotRequired[Count]
+
+
+class Generation(Checkpoint):
+    """The header of a population's checkpoint."""
+
     fitness_steps: NotRequired[Count]
-    lineage_bytes: NotRequired[Count]
-    generation: NotRequired[Count]
-    rounds: NotRequired[Count]
-    next_number: NotRequired[Count]
-    members: NotRequired[list[MemberEntry]]
-    best: NotRequired[BestEntry]
+    lineage_bytes: Count
+    generation: Count
+    rounds: Count
+    next_number: Count
+    members: Annotated[list[MemberEntry], Asked("at least one member", bool)]
+    best: BestEntry
 
 
 def check_manifest(data: Mapping[str, Any], file: str) -> None:

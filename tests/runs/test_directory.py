@@ -23,7 +23,7 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
-from skillweave.runs.manifest import versions
+from skillweave.runs.manifest import Generation, versions
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 
@@ -705,3 +705,21 @@ def test_a_checkpoint_that_cannot_be_renamed_is_an_error_for_people(
     assert found is not None
     assert_same(found[0], kept)
     assert not (run.path / "checkpoint.new.safetensors").exists()
+
+
+@pytest.mark.parametrize("field", ["members", "best", "generation"])
+def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
+    run: RunDirectory, field: str
+) -> None:
+    header: dict[str, Any] = {"phase": "landing", "update": 1, "steps": 1} | AT
+    origin = {"parent": None, "mutation": "start", "changes": {"gamma": [0.9, 0.99]}}
+    member = {"number": 0, "steps": 1, "config": ALGORITHM, "origin": origin}
+    best = {"fitness": 1.0, "number": 0, "generation": 0, "policy": {}}
+    header |= {"generation": 1, "rounds": 0, "next_number": 1, "lineage_bytes": 0}
+    header |= {"members": [member], "best": best}
+    run.save_checkpoint(learnt(1), header)
+    assert run.load_checkpoint(Learnt, "landing", schema=Generation) is not None
+    run.save_checkpoint(learnt(1), {k: v for k, v in header.items() if k != field})
+    (run.path / "checkpoint.previous.safetensors").unlink()
+    with pytest.raises(SkillweaveError, match=f"damaged: no field '{field}'"):
+        run.load_checkpoint(Learnt, "landing", schema=Generation)
