@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
-from compat.scripts import SHIM, TEXT, moved, scripts
+from compat.tutorial_scripts import SHIM, TEXT, moved, scripts
 
 ROOT = Path(__file__).parents[2]
 SEED = ROOT.parent / "shared/seed/000_99d5b8c7da342b8f.txt"

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from compat.scripts import CUT, scripts, short
+from compat.tutorial_scripts import CUT, scripts, short
 from PIL import Image
 
 ROOT = Path(__file__).parents[2]
