@@ -69,7 +69,9 @@ def parse() -> argparse.Namespace:
 
 def preload() -> None:
     """Import all that a case may need, so that a forked process has it."""
-    for name in ("envpool", "onnx", "onnxruntime", "rich.console", "skillweave.cli.actions"):
+    backends = [f"matplotlib.backends.backend_{kind}" for kind in ("agg", "svg")]
+    others = ("envpool", "onnx", "onnxruntime", "rich.console", "skillweave.cli.actions")
+    for name in ("matplotlib.font_manager", *backends, *others):
         try:
             importlib.import_module(name)
         except ImportError:

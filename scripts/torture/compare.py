@@ -82,8 +82,9 @@ def _manifest(run: Path, whole: Path) -> list[str]:
     mine, theirs = (paths(json.loads((r / "run.json").read_text())) for r in (run, whole))
     missing = object()
     other = {k for k in {*mine, *theirs} if mine.get(k, missing) != theirs.get(k, missing)}
-    # Sizes of files whose lines hold times.
-    return [f"run.json{k}" for k in sorted(other) if not k.endswith("metrics_bytes")]
+    # Sizes of files whose lines hold times, and the checksum of all of it.
+    timed = {k for k in other if k.endswith("metrics_bytes")} | {".sha256"}
+    return [f"run.json{k}" for k in sorted(other - timed)]
 
 
 def _names(run: Path, whole: Path) -> list[tuple[str, str]]:

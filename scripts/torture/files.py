@@ -27,6 +27,7 @@ from scripts.torture.mutations import Change, change
 from scripts.torture.processes import fork, limit_memory, note, wait
 from scripts.torture.report import (
     ASKED,
+    CHANGED,
     CODE,
     EQUAL,
     HANG,
@@ -117,8 +118,8 @@ class Files:
 
     def afterwards(self, name: str, outcome: Outcome) -> Outcome:
         """The outcome, unless the pickle has changed the reader itself."""
-        if touched := [n for n, f in vars(pickles).items() if _is_changed(f)]:
-            return Outcome(CODE, said=f"functions of the reader were changed: {touched}")
+        if touched := changed_functions():
+            return Outcome(CHANGED, said=f"functions of the reader were changed: {touched}")
         if SAMPLES[name].use(self.copy(name, "again"), "") != self.expected[name]:
             return Outcome(OTHERWISE, said="the original is read otherwise after this pickle")
         return outcome
@@ -155,6 +156,25 @@ def judge(sample: Sample, folder: Path, changed: Change, expected: Play) -> Outc
     if taken > MUCH_MEMORY and category != HANG:
         return Outcome(MEMORY, said=f"took {taken >> 20} MB, then: {category} {said[:300]}")
     return Outcome(category, said=said)
+
+
+def functions() -> dict[str, types.FunctionType]:
+    """What the reader of pickles is made of."""
+    return {n: f for n, f in vars(pickles).items() if isinstance(f, types.FunctionType)}
+
+
+DEFAULTS = {name: function.__defaults__ for name, function in functions().items()}
+
+
+def changed_functions() -> list[str]:
+    """Functions of the reader that have attributes or defaults of a pickle's; they are mended."""
+    found = []
+    for name, function in functions().items():
+        if vars(function) or function.__defaults__ != DEFAULTS.get(name):
+            found.append(name)
+            vars(function).clear()
+            function.__defaults__ = DEFAULTS.get(name)
+    return found
 
 
 def make_original(sample: Sample, folder: Path) -> None:
@@ -200,10 +220,6 @@ def shortened(text: str) -> str:
 
 def _too_slow(*_: Any) -> None:
     raise Slow
-
-
-def _is_changed(function: Any) -> bool:
-    return isinstance(function, types.FunctionType) and bool(vars(function))
 
 
 def _remove(folder: Path) -> None:

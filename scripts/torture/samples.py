@@ -113,11 +113,11 @@ def resumed(kind: Kind) -> Callable[[Path, str], Play]:
     def use(folder: Path, changed: str) -> Play:
         run = folder / "run"
         looked_at(run, changed)
+        before = set((run / "policies").glob("*"))
         played = play(kind.declare().resume(run, quiet=True))
-        policies = sorted((run / "policies").glob("*.safetensors"))
-        policies = [p for p in policies if p != folder / changed]  # which is not written anew
+        trained = sorted(set((run / "policies").glob("*.safetensors")) - before)
         return played | {
-            p.name: hashlib.sha256(tensors_and_header(p)[0]).hexdigest() for p in policies
+            p.name: hashlib.sha256(tensors_and_header(p)[0]).hexdigest() for p in trained
         }
 
     return use

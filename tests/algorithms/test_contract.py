@@ -45,7 +45,8 @@ ON = PPO(
     num_envs=8, n_steps=16, batch_size=32, learning_rate=1e-2, gamma=0.5, ent_coef=0.0,
     normalize_obs=False, network=Network((32,)),
 )  # fmt: skip
-SQUASHED, STATE_STD = replace(ON, squash_actions=True), replace(ON, action_std="state")
+SQUASHED = replace(ON, squash_actions=True)
+STATE_STD = replace(ON, action_std="state", learning_rate=5e-3)
 LSTM = replace(ON, network=Network((16,), rnn=RNN("lstm", 8)))
 GRU = replace(ON, network=Network((16,), rnn=RNN("gru", 8)))
 Q = DQN(**BUFFERED)
@@ -419,7 +420,7 @@ def test_a_forbidden_action_is_never_chosen_in_targets(name):
         algorithm.layout.views(state.params)["actor.0.weight"][0] = tempting
         for flat in (state.critic, state.critic_target):
             algorithm.critics.views(flat)["critic.0.weight"][:] = tempting
-    _, state = learn(config, env, 1600, state=state)
+    _, state = learn(config, env, 2000, state=state)
     inputs = algorithm.inputs(algorithm.actor(state), torch.arange(3)[None])
     if "dqn" in name:
         q = algorithm.net(algorithm.layout.views(state.params), inputs)[0, ..., 0]

@@ -37,6 +37,5 @@ def test_no_code_runs_nothing_crashes_and_no_weight_is_lost(done):
     assert not bad & found.keys(), done.stdout
 
 
-@pytest.mark.xfail(strict=True, reason="the readers are being mended: remove this mark with them")
 def test_nothing_fails(done):
     assert done.returncode == 0, done.stdout + done.stderr
