@@ -1,6 +1,6 @@
 """What each algorithm learns, with settings that are the same for all seeds.
 
-    python -m benchmarks.learning [dqn sac td3 ppo image recurrent feed-forward] [--seeds 0 1 2 3 4]
+    python -m benchmarks.learning [dqn sac td3 ppo default-ppo …] [--seeds 0 1 2 3 4]
 
 Scores are 100 greedy episodes of Gymnasium's environment with seeds that training never saw.
 Two seeds are trained side by side (``--processes``), so the seconds are those of a busy machine.
@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium as gym
 
 from benchmarks.common import median, report, table, workers
-from skillweave import DQN, PPO, RNN, SAC, TD3, EnvSpec, Network, train_agent
+from skillweave import DQN, PPO, RNN, SAC, TD3, EnvSpec, Network, recipes, train_agent
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,11 @@ FIGURES = {
         1_000_000,
         270.0,
         "rl-zoo3 PPO 271",
+    ),
+    "default-ppo": Figure(DISCRETE, PPO(), 1_000_000, 265.0, "nothing but the defaults"),
+    "default-sac": Figure(CONTINUOUS, SAC(), 300_000, 265.0, "nothing but the defaults"),
+    "recipe-flat": Figure(
+        DISCRETE, recipes.load("lunar-lander").flat, 1_000_000, 275.0, "in 25 seconds or less"
     ),
     "image": Figure(
         FREEWAY,
