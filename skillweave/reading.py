@@ -117,7 +117,7 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
     except RecursionError as error:
         raise SkillweaveError(f"{where} is damaged: it is nested too deep") from error
     except ValueError as error:
-        raise SkillweaveError(f"{where} is damaged: {error}") from error
+        raise SkillweaveError(f"{where} is damaged: {str(error)[:300]}") from error
     layer, depth = [data], 0
     while layer:
         if depth > DEEPEST:

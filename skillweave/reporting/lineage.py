@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any
 
-from skillweave.runs.lines import JsonLines
+from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
 
@@ -19,7 +18,7 @@ class Born:
     parent: int | None
     """Its number in the generation before; itself where it went on."""
     mutation: str
-    changes: dict[str, list[Any]]
+    changes: dict[str, Any]
     fitness: float | None
     best: bool
     """Whether it was the best so far."""
@@ -54,21 +53,30 @@ class Lineage:
         return found[::-1]
 
 
-def read_lineage(run: Path, phase: str) -> Lineage | None:
+def read_lineage(run: RunDirectory, phase: str) -> Lineage | None:
     """The lineage of a phase, or None where nothing evolved in it.
 
     Raises:
         SkillweaveError: the file is damaged.
     """
-    lines, born = JsonLines(run / "lineage.jsonl"), {}
-    names = [f.name for f in fields(Born)]
-    for number, told in enumerate(lines.read(), 1):
-        try:
-            if told["phase"] == phase:
-                each = Born(**{k: told[k] for k in names})
-                born[each.generation, each.member] = each
-        except KeyError as error:
-            raise SkillweaveError(
-                f"{lines.path} is damaged in line {number}: no {error}"
-            ) from error
+    names, born = [f.name for f in fields(Born)], {}
+    sorts: dict[str, str] = {}
+    for told in run.lineage.read():
+        if told["phase"] == phase:
+            each = Born(**{k: told[k] for k in names})
+            own = {k: _sort(v) for k, v in each.settings.items()}
+            sorts = sorts or own
+            if own != sorts:
+                raise SkillweaveError(
+                    f"{run.lineage.path} is damaged: the settings of member {each.member} in "
+                    f"generation {each.generation} are not of the sorts of those before"
+                )
+            born[each.generation, each.member] = each
     return Lineage(born) if any(b.best for b in born.values()) else None
+
+
+def _sort(value: Any) -> str:
+    """What a setting is: a number, a word, or whole numbers."""
+    if isinstance(value, list):
+        return "numbers" if all(type(x) is int for x in value) else "?"
+    return "number" if type(value) in (int, float) else type(value).__name__

@@ -36,7 +36,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     metrics = list(run.metrics())
     for i, phase in enumerate(run.manifest["phases"]):
         name, color = phase["name"], _hex(i)
-        if lineage := read_lineage(run.path, name):
+        if lineage := read_lineage(run, name):
             figure = draw_lineage(Figure, lineage, name, color)
         else:
             curve = [(m["steps"], m["return"]) for m in metrics if _tells(m, name)]
@@ -154,7 +154,7 @@ def _varies(born: Sequence[Born], setting: str) -> bool:
 
 
 def _tells(metrics: dict[str, Any], phase: str) -> bool:
-    return metrics.get("phase") == phase and "return" in metrics
+    return metrics.get("phase") == phase and {"return", "steps"} <= metrics.keys()
 
 
 def _change(setting: str, old: Any, new: Any) -> str:

@@ -27,7 +27,6 @@ from skillweave.reading import read_file, shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.files import (
     TEMPORARY,
-    read_json,
     read_signed,
     remove,
     write_bytes,
@@ -36,7 +35,14 @@ from skillweave.runs.files import (
 )
 from skillweave.runs.lines import JsonLines
 from skillweave.runs.lock import Lock
-from skillweave.runs.manifest import Checkpoint, check_manifest, identity, versions
+from skillweave.runs.manifest import (
+    Checkpoint,
+    LineageLine,
+    MetricsLine,
+    identity,
+    read_manifest,
+    versions,
+)
 from skillweave.skills.foreign import Foreign, as_recorded
 from skillweave.types import Policy, SkillweaveError
 
@@ -48,8 +54,8 @@ class RunDirectory:
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
         self.path, self.manifest = path, manifest
-        self._metrics = JsonLines(path / "metrics.jsonl")
-        self.lineage = JsonLines(path / "lineage.jsonl")
+        self._metrics = JsonLines(path / "metrics.jsonl", MetricsLine)
+        self.lineage = JsonLines(path / "lineage.jsonl", LineageLine)
         self._checkpoints = Checkpoints(path)
         self._lock: Lock | None = None
 
@@ -87,7 +93,7 @@ class RunDirectory:
         path = Path(path)
         if not os.path.lexists(path / "run.json"):
             raise SkillweaveError(f"{path} holds no run: there is no {path / 'run.json'}")
-        return cls(path, _manifest(path))
+        return cls(path, read_manifest(path))
 
     def begin(self) -> None:
         """Take the run for training: lock it, and clear away what a killed process left.
@@ -99,7 +105,9 @@ class RunDirectory:
             return
         self._lock = Lock(self.path)
         try:
-            self.manifest.update(_manifest(self.path))  # another process may have gone on with it
+            self.manifest.update(
+                read_manifest(self.path)
+            )  # another process may have gone on with it
             self._clear()
         except BaseException:
             self.close()
@@ -285,12 +293,6 @@ class RunDirectory:
     def metrics_size(self) -> int:
         """Bytes in ``metrics.jsonl``."""
         return self._metrics.size
-
-
-def _manifest(path: Path) -> dict[str, Any]:
-    """The content of a run's ``run.json``, checked."""
-    file = path / "run.json"
-    return read_json(file, lambda data: check_manifest(data, str(file)))
 
 
 def _now() -> str:

@@ -204,9 +204,9 @@ def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, T
             names = file.keys() if with_tensors else ()
             tensors = {k: file.get_tensor(k) for k in names}
     except (OSError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise SkillweaveError(f"{path} is damaged (truncated?): {error}") from error
+        raise SkillweaveError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
     except safetensors.SafetensorError as error:
-        raise SkillweaveError(f"{path} is damaged (truncated?): {error}") from error
+        raise SkillweaveError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
     if "skillweave" not in metadata:
         raise SkillweaveError(f"{path} was not written by Skillweave")
     header = parse_json(metadata["skillweave"], path)

@@ -9,15 +9,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from skillweave.reading import check_file, shown
+from skillweave.reading import check_file, fit, shown
 from skillweave.types import SkillweaveError
 
 
 class JsonLines:
-    """One such file; it is made when the first line comes."""
+    """One such file; it is made when the first line comes.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    ``schema`` is what each line must fit when it is read (see ``reading.fit``); None: anything.
+    """
+
+    def __init__(self, path: Path, schema: Any = None) -> None:
+        self.path, self._schema = path, schema
         self._file: Any = None
 
     @property
@@ -80,6 +83,8 @@ class JsonLines:
                     raise SkillweaveError(
                         f"{self.path} is damaged in line {number}: {shown(record)} is no object"
                     )
+                if self._schema is not None:
+                    fit(self._schema, record, f"{self.path}, line {number}")
                 yield record
 
     def close(self) -> None:

@@ -10,10 +10,12 @@ import json
 import platform
 from collections.abc import Mapping
 from importlib import metadata
+from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
+from skillweave.runs.files import read_json
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign import Source
 from skillweave.types import SkillweaveError
@@ -113,6 +115,33 @@ class BestEntry(TypedDict):
     policy: dict[str, Any]
 
 
+class LineageLine(TypedDict):
+    """A line of ``lineage.jsonl``: a member in a generation."""
+
+    phase: Name
+    generation: Count
+    member: Count
+    parent: Count | None
+    mutation: str
+    changes: dict[str, tuple[Any, Any]]
+    fitness: float | None
+    best: bool
+    settings: dict[str, Any]
+
+
+MetricsLine = TypedDict(
+    "MetricsLine",
+    {
+        "phase": NotRequired[Name],
+        "update": NotRequired[Count],
+        "steps": NotRequired[Count],
+        "seconds": NotRequired[Seconds],
+        "return": NotRequired[float],
+    },
+)
+"""A line of ``metrics.jsonl``: an update, with numbers of its algorithm's own."""
+
+
 class Checkpoint(TypedDict):
     """A checkpoint's header."""
 
@@ -153,6 +182,12 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
             raise SkillweaveError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
     if "id" in data and "sha256" not in data:
         raise SkillweaveError(f"{file} is damaged: no field 'sha256', the checksum of it all")
+
+
+def read_manifest(run: Path) -> dict[str, Any]:
+    """The content of a run's ``run.json``, checked."""
+    file = run / "run.json"
+    return read_json(file, lambda data: check_manifest(data, str(file)))
 
 
 def identity(manifest: Mapping[str, Any]) -> str:

@@ -119,7 +119,7 @@ def space_from_json(data: Any) -> gym.Space[Any]:
         return _made(data)
     # Gymnasium's own checks of values are assertions, partly.
     except (TypeError, ValueError, ArithmeticError, AssertionError, AttributeError) as error:
-        raise SkillweaveError(f"not a space: {shown(data)} ({error})") from error
+        raise SkillweaveError(f"not a space: {shown(data)} ({str(error)[:300]})") from error
 
 
 def _made(data: dict[str, Any]) -> gym.Space[Any]:

@@ -103,14 +103,14 @@ def test_a_recipe_evolves_and_says_how_it_went(run: Path):
         "left": 3 * 128, "right": 2 * 128, "selector": 3 * 128,
     }  # fmt: skip
     for name, phase in phases.items():
-        lineage = read_lineage(run, name)
+        lineage = read_lineage(RunDirectory.open(run), name)
         assert lineage is not None
         assert lineage.winner.member == phase["winner"]["member"]
         assert lineage.winner.generation == phase["winner"]["generation"]
 
 
 def test_the_winners_family_tree_reaches_back_to_the_start(run: Path):
-    lineage = read_lineage(run, "left")
+    lineage = read_lineage(RunDirectory.open(run), "left")
     assert lineage is not None
     for born in lineage.born.values():
         path = lineage.path(born)
@@ -150,7 +150,7 @@ def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):
     with pytest.raises(SkillweaveError, match="nothing to draw yet"):
         plot_run(empty)
     (empty.path / "lineage.jsonl").write_text('{"phase": "left"}\n')
-    with pytest.raises(SkillweaveError, match=r"lineage.jsonl is damaged in line 1"):
+    with pytest.raises(SkillweaveError, match=r"lineage.jsonl, line 1 is damaged"):
         plot_run(empty)
 
 

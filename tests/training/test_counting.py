@@ -130,3 +130,18 @@ def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
     updates = sum(1 for _ in RunDirectory.open(run.path).metrics())
     assert updates >= 150 / 20
     assert run.info()["phases"][0]["steps"] <= declared.selector_steps + 64 * 64 + 64 * 40
+
+
+@pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
+@pytest.mark.parametrize("evolve", [None, sw.Evolution(population=2, generations=10, episodes=1)])
+def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_to_their_ends(
+    algorithm, evolve, tmp_path
+):
+    # Episodes of 20 steps; cuts every 5 to 16 steps of an environment, generations as short.
+    spec, task = sw.EnvSpec(Walk, engine="sync"), Always()
+    declared = sw.Hierarchy(spec, [task], algorithm=algorithm, flat_steps=640, cut_every=20)
+    run = declared.train(tmp_path / "run", flat=True, quiet=True, evolve=evolve)
+    lines = list(RunDirectory.open(run.path).metrics())
+    ended = [line for line in lines if "length" in line]
+    assert len(ended) > len(lines) / 2
+    assert {line["length"] for line in ended} == {20.0}
