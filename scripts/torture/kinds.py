@@ -12,7 +12,19 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 
-from skillweave import DQN, PPO, RNN, SAC, EnvSpec, Evolution, Hierarchy, Mutations, Network, Skill
+from skillweave import (
+    DQN,
+    PPO,
+    RNN,
+    SAC,
+    EnvSpec,
+    Evolution,
+    Hierarchy,
+    Mutations,
+    Network,
+    Reflex,
+    Skill,
+)
 from skillweave.api import Run, Task
 
 SEED = 3
@@ -62,6 +74,21 @@ class Left(Skill):
 
 class Balance(Skill):
     """CartPole's own task."""
+
+
+class Leaning(Skill):
+    """May start only where the pole leans to the right, which has to be looked for."""
+
+    max_steps = 9
+
+    def initiation(self, obs: Any) -> Any:
+        """Where it leans."""
+        return obs[:, 2] > 0.01
+
+
+def leans_left(obs: Any) -> Any:
+    """Where the pole is about to fall to the left."""
+    return obs[:, 2] < -0.15
 
 
 @dataclass(frozen=True)
@@ -139,6 +166,26 @@ KINDS: dict[str, Kind] = {
     "population": Kind(
         lambda: alone(EnvSpec(CART, engine="sync"), PPO(**LEARNS, network=NET), 800),
         evolve=Evolution(**EVOLVES),
+    ),
+    "search for a start": Kind(
+        lambda: Hierarchy(
+            EnvSpec(CART, engine="sync"), [Leaning(), Balance()], call_steps=4, skill_steps=600,
+            algorithm=PPO(**LEARNS, network=NET), selector=DQN(**REPLAYS | {"update_ratio": 0.02}),
+            selector_steps=600, cut_every=150, eval_every=200, eval_episodes=2,
+            reflexes=[Reflex(leans_left, 0)],
+        ),
+        flat=False,
+    ),
+    "populations of skills and selector": Kind(
+        lambda: Hierarchy(
+            EnvSpec(CART, engine="sync"), [Leaning(), Balance()], call_steps=4, skill_steps=300,
+            algorithm=PPO(
+                **LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))
+            ),
+            selector=DQN(**REPLAYS), selector_steps=300,
+        ),
+        flat=False,
+        evolve=Evolution(**EVOLVES | {"population": 2, "generations": 2}),
     ),
     "population, replay": Kind(
         lambda: alone(EnvSpec(CART, engine="sync"), DQN(**REPLAYS), 300),

@@ -97,7 +97,7 @@ class OffPolicy:
     buffer_size: int = 1_000_000
     """Transitions that the replay buffer holds."""
     learning_starts: int = 5_000
-    """Transitions collected by acting at random before the first gradient step."""
+    """Environment steps taken by acting at random before the first gradient step."""
     batch_size: int = 256
     """Samples of one gradient step."""
     n_step: int = 1
@@ -143,6 +143,7 @@ class OffPolicy:
         if self.max_grad_norm is not None:
             positive(self, "max_grad_norm")
         number(self, "learning_starts")
+        check(self, "learning_starts", type(self.learning_starts) is int, "a whole number")
         one_of(self, "learning_rate_schedule", ("constant", "linear"))
         check(self, "batch_size", self.batch_size <= 1_000_000, "at most 1,000,000")
         least = self.num_envs * (self.n_step + 1)
@@ -176,7 +177,7 @@ class DQN(OffPolicy):
     max_grad_norm: float | None = 10.0
     """Gradients are scaled down to this norm; None: they are not."""
     learning_starts: int = 1_000
-    """Transitions collected by acting at random before the first gradient step."""
+    """Environment steps taken by acting at random before the first gradient step."""
     exploration_fraction: float = 0.1
     """Share of the budget over which ε falls."""
     exploration_initial_eps: float = 1.0

@@ -69,10 +69,14 @@ class Engine(Protocol):
         """Seeds, and what was done since: all that ``restore`` needs."""
         ...
 
-    def restore(self, state: dict[str, Array]) -> Array:
-        """Play everything in ``state`` again; the observations (N, *obs_shape) that this led to.
+    def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
+        """Play everything in ``state`` again.
 
         The steps are not counted: they were when they were made first.
+
+        Returns:
+            The observations (N, *obs_shape) that this led to, and (k,) environments whose episodes
+            ended before they did the first time: they must be reset.
         """
         ...
 
@@ -166,22 +170,21 @@ class GymnasiumEngine:
         own = {"root": np.array([self._root]), "episode": self._episode, "seed": self._seed}
         return {k: v.copy() for k, v in own.items()} | self._history.state()
 
-    def restore(self, state: dict[str, Array]) -> Array:
-        """Play the open episodes again; the observations (N, *obs_shape) that this led to."""
+    def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
+        """Play the open episodes again; observations (N, *obs_shape), and who ended early."""
         self._root = int(state["root"][0])
         self._episode, self._seed = state["episode"].copy(), state["seed"].copy()
         self._history.load(state)
-        obs = self._begin(self._all)
-        going = np.ones(self.num_envs, bool)
+        obs, early = self._begin(self._all), [np.zeros(0, np.int64)]
         for _, ids, action in self._history.play():
-            # What ends before its time is no longer the episode that it was.
-            acts = going[ids]
-            if not acts.any():
-                continue
-            raw = self._act(action[acts], ids[acts])
-            obs[ids[acts]] = raw.next_obs
-            going[ids[acts]] = ~(raw.terminated | raw.truncated)
-        return obs
+            if len(ids):
+                raw = self._act(action, ids)
+                obs[ids] = raw.next_obs
+                ended = ids[raw.terminated | raw.truncated]
+                if len(ended):  # nothing can be stepped beside an episode that is over
+                    obs[ended] = self.reset_some(ended)
+                    early.append(ended)
+        return obs, np.unique(np.concatenate(early))
 
     def mask(self) -> Array | None:
         """(N, A) bool, the actions allowed in the latest observations; None: all always are."""

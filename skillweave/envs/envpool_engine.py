@@ -121,8 +121,8 @@ class EnvPoolEngine:
         own = {"seeds": np.array(self._seeds), "place": self._place.copy()}
         return own | self._history.state()
 
-    def restore(self, state: dict[str, Array]) -> Array:
-        """Play everything again; the observations (N, *obs_shape) that this led to."""
+    def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
+        """Play everything again; observations (N, *obs_shape), and who ended early."""
         self._seeds = [int(seed) for seed in state["seeds"]]
         self._place = state["place"].copy()
         wrong = self._place.shape != (self.num_envs,) or not 0 < len(self._seeds) < 3
@@ -131,12 +131,16 @@ class EnvPoolEngine:
         self._history.load(state)
         self._pools = [self.make_pool(seed) for seed in self._seeds]
         obs = np.array(self._begin(self._all))
+        over, early = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
         for begins, ids, action in self._history.play():
             if len(begins):
                 obs[begins] = self._begin(begins)
+                over[begins] = False
+            early |= over
             if len(ids):
-                obs[ids] = self._act(action, ids).next_obs
-        return obs
+                raw = self._act(action, ids)
+                obs[ids], over[ids] = raw.next_obs, raw.terminated | raw.truncated
+        return obs, np.flatnonzero(early | over)
 
     def mask(self) -> Array | None:
         """(N, A) bool, the actions allowed in the latest observations; None: all always are."""

@@ -57,9 +57,10 @@ class SkillEnv:
 
     def renew(self, seeds: Seeds) -> Array:
         """Take new seeds; environments whose episodes are too long to be kept begin anew."""
-        self._search_from((seeds / "start").integer())
         self.engine.renew((seeds / "env").integer())
-        return self._begin(np.flatnonzero(self._elapsed > LONGEST_EPISODE))
+        begun = self._begin(np.flatnonzero(self._elapsed > LONGEST_EPISODE))
+        self._search_from((seeds / "start").integer())
+        return begun
 
     def state(self) -> dict[str, Array]:
         """All that ``restore`` needs, right after ``renew``."""
@@ -71,8 +72,9 @@ class SkillEnv:
         """Play the open episodes again; the environments that did not repeat themselves."""
         self._search_from(int(state["seed"][0]))
         self._elapsed = state["elapsed"].copy()
-        self.obs = self.engine.restore(unprefixed("engine", state))
-        return self._begin(np.flatnonzero(checksums(self.obs) != state["obs"]))
+        self.obs, early = self.engine.restore(unprefixed("engine", state))
+        other = np.flatnonzero(checksums(self.obs) != state["obs"])
+        return self._begin(np.union1d(early, other))
 
     def set_gamma(self, gamma: Array) -> None:
         """Nothing to do: every action lasts one step."""

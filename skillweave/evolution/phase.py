@@ -146,10 +146,10 @@ class _Evolving:
 
         seeds = self.seeds / "generation" / self.done
         self.population.train(*self._until(before), seeds, on_tick)
-        before = self.arena.steps_made
+        measured = self.arena.steps_made
         fitness = self.population.fitness(self.arena, seeds / "fitness")
         self._keep_best(fitness, seeds / "fitness")
-        self.fitness_steps = self.arena.steps_made - before
+        self.fitness_steps = self.arena.steps_made - measured
         self.record.at["steps"] += self.fitness_steps
         self._note(fitness)
         self.done += 1
@@ -160,6 +160,12 @@ class _Evolving:
     def finish(self) -> AgentPolicy:
         """The phase is over."""
         assert self.best is not None
+        asked, target = self.evolution.generations, self.evolution.target
+        if self.done < asked and (target is None or self.best.fitness < target):
+            self._tell(
+                f"its budget of {self.budget:,} steps is spent after {self.done} of {asked} "
+                "generations: measuring fitness counts, too. Give it more steps, or fewer episodes"
+            )
         entry = self.record.entry
         entry["winner"] = {"member": self.best.number, "fitness": self.best.fitness}
         entry["winner"] |= {"generation": self.best.generation, "generations": self.done}
@@ -266,7 +272,7 @@ class _Evolving:
             members, self.evolution, self.phase.make_env, self.spaces, self.seeds
         )
         self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
-        self.done, self.fitness_steps = at["generation"], at.get("fitness_steps", 0)
+        self.done, self.fitness_steps = at["generation"], at["fitness_steps"]
         if best := at.get("best"):
             weights, where = unprefixed("best", tensors), str(self.run.path)
             policy = AgentPolicy.from_file(weights, best["policy"], where)

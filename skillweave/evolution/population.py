@@ -108,9 +108,14 @@ class Population:
         seeds: Seeds,
         on_tick: OnTick,
     ) -> None:
-        """On-policy: a stack's rollouts are its own, so stacks learn one after another."""
-        spent = first = 0
+        """On-policy: a stack's rollouts are its own, so stacks learn one after another.
+
+        A recurrent member begins a generation without memory: another network made what there was.
+        """
+        first = 0
         self.collector.start(self.seeds / "start")
+        spent = self.collector.spent()  # in search of a start; what follows, its parts count
+        _count(self.members, spent)
         for i, group in enumerate(groups):
             algorithm: Any
             algorithm, state = join(group, self.spaces, self._made)
@@ -124,6 +129,7 @@ class Population:
             split(algorithm, state, group, self.spaces)
             spent, first = spent + clock.taken, first + count
             _count(group, clock.taken)
+        self.collector.spent()
 
     def _train_side_by_side(
         self,

@@ -101,8 +101,9 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._calls = 0
         self._age = state["age"].copy()
         self._memory = {k: v.copy() for k, v in unprefixed("memory", state).items()}
-        self._obs = self.engine.restore(unprefixed("engine", state))
-        return self._begin(np.flatnonzero(checksums(self._obs) != state["obs"]))
+        self._obs, early = self.engine.restore(unprefixed("engine", state))
+        other = np.flatnonzero(checksums(self._obs) != state["obs"])
+        return self._begin(np.union1d(early, other))
 
     def set_gamma(self, gamma: Array) -> None:
         """γ of one primitive step in each environment, (N,), from now on."""

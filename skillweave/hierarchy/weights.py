@@ -81,10 +81,10 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors, header = read_tensors(path)
     if header.get("kind") == "agent" and "algorithm" in header:
         fit(AgentHeader, header, str(path))
-        if header.get("phase") == "selector":
+        if (phase := header.get("phase", "flat")) != "flat":
             raise SkillweaveError(
-                f"{path} holds a selector alone, which chooses skills and no actions; write the "
-                "whole hierarchy's weights: skillweave weights RUN"
+                f"{path} holds the policy of phase {shown(phase)} alone; write the whole "
+                "hierarchy's weights: skillweave weights RUN"
             )
         return tensors, header
     if header.get("kind") != "hierarchy":
@@ -102,6 +102,10 @@ def read_weights(declaration: Declaration, path: Path) -> Policy:
     tensors, header = open_weights(path)
     names = [s.name for s in declaration.skills]
     if header["kind"] == "agent":
+        if (env := header.get("env", declaration.spec.name)) != declaration.spec.name:
+            raise SkillweaveError(
+                f"{path} is of an agent on {shown(env)}, but this is on {declaration.spec.name}"
+            )
         return AgentPolicy.from_file(tensors, header, str(path))
     if header["skills"] != names or header["env"] != declaration.spec.name:
         theirs = ", ".join(header["skills"])

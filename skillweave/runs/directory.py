@@ -44,7 +44,7 @@ from skillweave.runs.manifest import (
     versions,
 )
 from skillweave.skills.foreign import Foreign, as_recorded
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy, SkillweaveError, unprefixed
 
 S = TypeVar("S")
 
@@ -179,11 +179,12 @@ class RunDirectory:
         if found is None:
             return None
         tensors, header, path = found
-        cut = len("extra.")
-        extra = {k[cut:]: tensors.pop(k) for k in list(tensors) if k.startswith("extra.")}
+        extra = unprefixed("extra", tensors)
+        tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
         names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
         if names != set(tensors):
-            raise SkillweaveError(f"{path} does not hold a {kind.__name__} of this Skillweave")
+            what = "finish the run with the version that began it, or delete the file to begin anew"
+            raise SkillweaveError(f"{path} does not hold what this Skillweave resumes from: {what}")
         state = kind(**tensors) if like is None else state_from(tensors, like, str(path))
         return state, header, extra
 

@@ -148,17 +148,17 @@ class Checkpoint(TypedDict):
     phase: Name
     update: Count
     steps: Count
+    evaluation_steps: Count
     seconds: Seconds
     metrics: dict[str, float | None]
     metrics_bytes: Count
     run: NotRequired[str]
-    evaluation_steps: NotRequired[Count]
 
 
 class Generation(Checkpoint):
     """The header of a population's checkpoint."""
 
-    fitness_steps: NotRequired[Count]
+    fitness_steps: Count
     lineage_bytes: Count
     generation: Count
     rounds: Count

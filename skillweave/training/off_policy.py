@@ -142,8 +142,10 @@ def train_stacks(
             update, steps = update + 1, steps + taken
             # The last checkpoint needs no more: there is nothing left to learn.
             extra = loop.cut(update) if cut and not over else None
+            steps += collector.spent()  # where an environment had to begin anew
             if tick and on_tick is not None:
                 metrics = to_numbers(loop.metrics, update, tolerant=tolerant)
+                loop.metrics = {}  # a line tells what was learnt since the one before
                 seconds = time.perf_counter() - started
                 metrics |= collector.episodes.summary()
                 on_tick(Tick(update, steps, seconds, metrics, stacks, cut, extra))

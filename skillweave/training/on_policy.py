@@ -71,7 +71,8 @@ def train_on_policy(
             update, steps = update + 1, steps + taken
             if cut or not algorithm.config.overlap:
                 extra = loop.cut(update) if cut and not over else None
-                actor = learner.wait(actor, cut, extra)
+                steps += collector.spent()  # where an environment had to begin anew
+                actor = learner.wait(actor, cut, extra, steps)
     finally:
         learner.close()
         torch.set_num_threads(threads)
@@ -106,16 +107,27 @@ class _Learner:
         self._pending = self._worker.submit(self._learn, rollout, update, before / self.horizon)
 
     def wait(
-        self, actor: Actor, cut: bool = False, extra: dict[str, Tensor] | None = None
+        self,
+        actor: Actor,
+        cut: bool = False,
+        extra: dict[str, Tensor] | None = None,
+        steps: int | None = None,
     ) -> Actor:
-        """Let a pending update end, report it, and return what acts from now on."""
+        """Let a pending update end, report it, and return what acts from now on.
+
+        Args:
+            cut, extra: of the ``Tick``.
+            steps: taken so far; None: as many as when its rollout was complete.
+        """
         if self._pending is None:
             return actor
         metrics, self._pending = self._pending.result(), None
         if self.on_tick is not None:
             metrics |= self._told
             elapsed = time.perf_counter() - self.started
-            self.on_tick(Tick(*self._at, elapsed, metrics, self.state, cut, extra))
+            update, before = self._at
+            steps = before if steps is None else steps
+            self.on_tick(Tick(update, steps, elapsed, metrics, self.state, cut, extra))
         return self.algorithm.actor(self.state)
 
     def close(self) -> None:

@@ -101,7 +101,6 @@ class Record:
         self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: dict[str, Any]
     ) -> None:
         self.run, self.listeners, self.entry, self.at = run, listeners, run.phase(name), at
-        at.setdefault("evaluation_steps", 0)  # a checkpoint from before these were counted
         run.rewind_metrics(at.get("metrics_bytes", self.entry.get("metrics_bytes")))
         self.entry.setdefault("metrics_bytes", run.metrics_size())
         self.entry["status"] = "training"
@@ -158,9 +157,9 @@ def resume_episodes(
         ) from error
     if count := len(collector.begun_anew):
         record.tell(
-            f"{count} of {collector.num_envs} episodes in flight begin anew, so the end may differ "
-            "from that of an undisturbed run: the environment does not repeat itself when it is "
-            "given the same seed and the same actions"
+            f"{count} of {collector.num_envs} open episodes begin anew, so the end may differ from "
+            "that of an undisturbed run: given the same seed and the same actions, the environment "
+            "does not repeat itself"
         )
 
 

@@ -81,7 +81,8 @@ def test_an_engine_that_is_restored_goes_on_as_if_nothing_had_happened(engine, e
         run(first, 333, 0, renew=50)
         state = first.state()
         made = first.steps_made
-        obs = second.restore(state)
+        obs, early = second.restore(state)
+        assert early.tolist() == []
         assert second.steps_made == 0, "played again, not made"
         again = second.state()
         assert all(np.array_equal(again[k], v) for k, v in state.items())
@@ -106,6 +107,38 @@ def test_old_pools_are_left_one_episode_at_a_time_and_histories_stay_short(monke
         longest, pools = max(longest, engine.state()["length"].sum()), pools | {len(engine._pools)}
     assert pools == {1, 2}
     assert longest < 400, "a hundred steps, and the episodes that were open"
+
+
+class Hasty(gym.Env):
+    """Ends after two steps in every second process that plays it; it shows nothing of that."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    hurry = False
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(1), 1.0, bool(Hasty.hurry and action and self.t == 2), False, {}
+
+
+def test_an_episode_that_ends_early_when_it_is_played_again_begins_anew(monkeypatch):
+    spec = EnvSpec(Hasty, engine="sync")
+    first, second = (SkillEnv(make_engine(spec, 3)) for _ in range(2))
+    first.reset(Seeds(0))
+    for _ in range(5):
+        first.step(np.array([0, 1, 0]))
+    first.renew(Seeds(1))
+    monkeypatch.setattr(Hasty, "hurry", True)
+    assert second.restore(first.state()).tolist() == [1]
+    monkeypatch.setattr(Hasty, "hurry", False)
+    assert second.step(np.zeros(3, np.int64)).terminated.tolist() == [False] * 3
+    assert second.renew(Seeds(2)).tolist() == []
+    assert second.state()["elapsed"].tolist() == [6, 1, 6]
 
 
 class Moody(gym.Env):
@@ -198,3 +231,17 @@ def test_joined_environments_are_those_of_their_parts():
     assert again.restore(joined.state()).tolist() == []
     np.testing.assert_array_equal(again.obs, joined.obs)
     np.testing.assert_array_equal(again.step(action).obs, joined.step(action).obs)
+
+
+def test_what_begins_anew_at_a_cut_begins_so_after_a_resume_too(monkeypatch):
+    monkeypatch.setattr("skillweave.envs.skill_env.LONGEST_EPISODE", 3)
+    spec = EnvSpec("CartPole-v1", engine="sync")
+    env, again = (SkillEnv(make_engine(spec, 3), Second()) for _ in range(2))
+    env.reset(Seeds(5))
+    for _ in range(5):
+        env.step(np.zeros(3, np.int64))
+    assert len(env.renew(Seeds(6)))
+    assert again.restore(env.state()).tolist() == []
+    for t in range(60):
+        one, other = env.step(np.full(3, t % 2)), again.step(np.full(3, t % 2))
+        np.testing.assert_array_equal(one.obs, other.obs)

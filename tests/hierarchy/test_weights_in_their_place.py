@@ -77,7 +77,7 @@ def test_of_an_older_run_a_selector_in_the_place_of_a_skill_is_refused(run: Path
 
 
 def test_a_selector_alone_is_no_flat_agent(run: Path) -> None:
-    with pytest.raises(SkillweaveError, match="holds a selector alone"):
+    with pytest.raises(SkillweaveError, match="holds the policy of phase 'selector' alone"):
         declare(("left", "right")).load_weights(policy(run, "selector"))
 
 

@@ -32,7 +32,7 @@ PHASES = [
     {"name": "landing", "status": "training", "budget": 10, "algorithm": ALGORITHM},
     {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM},
 ]
-AT = {"seconds": 1.0, "metrics": {}}
+AT = {"seconds": 1.0, "evaluation_steps": 0, "metrics": {}}
 
 
 def manifest() -> dict[str, Any]:
@@ -239,7 +239,7 @@ def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None
 
     at = {"phase": "landing", "update": 1, "steps": 1} | AT
     run.save_checkpoint(Other(torch.zeros(1)), at)
-    with pytest.raises(SkillweaveError, match="does not hold a Learnt"):
+    with pytest.raises(SkillweaveError, match="does not hold what this Skillweave resumes from"):
         run.load_checkpoint(Learnt, "landing")
 
 
@@ -715,7 +715,13 @@ def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     origin = {"parent": None, "mutation": "start", "changes": {"gamma": [0.9, 0.99]}}
     member = {"number": 0, "steps": 1, "config": ALGORITHM, "origin": origin}
     best = {"fitness": 1.0, "number": 0, "generation": 0, "policy": {}}
-    header |= {"generation": 1, "rounds": 0, "next_number": 1, "lineage_bytes": 0}
+    header |= {
+        "generation": 1,
+        "rounds": 0,
+        "fitness_steps": 0,
+        "next_number": 1,
+        "lineage_bytes": 0,
+    }
     header |= {"members": [member], "best": best}
     run.save_checkpoint(learnt(1), header)
     assert run.load_checkpoint(Learnt, "landing", schema=Generation) is not None

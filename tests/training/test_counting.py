@@ -145,3 +145,19 @@ def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_t
     ended = [line for line in lines if "length" in line]
     assert len(ended) > len(lines) / 2
     assert {line["length"] for line in ended} == {20.0}
+
+
+@pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
+def test_a_population_reports_its_search_for_a_start(algorithm, made, tmp_path):
+    declared = hierarchy(algorithm=algorithm, selector_steps=300)
+    search = {"late": sw.Evolution(population=2, generations=3, episodes=2)}
+    run = declared.train(tmp_path / "run", quiet=True, evolve=search)
+    assert reported(run) == made[0]
+
+
+def test_a_population_whose_budget_ends_it_early_says_so(tmp_path, capsys):
+    search = sw.Evolution(population=2, generations=5, episodes=20)
+    spec = sw.EnvSpec(Walk, engine="sync")
+    run = sw.train_agent(spec, SMALL, 300, tmp_path / "run", evolve=search)
+    assert run.info()["phases"][0]["winner"]["generations"] < 5
+    assert "of 5 generations: measuring fitness counts, too" in capsys.readouterr().err
