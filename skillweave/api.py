@@ -54,7 +54,7 @@ class Hierarchy(Declaration):
             quiet: no progress.
             track: "tensorboard", "wandb".
             evolve: a population for every agent, or by phase (a skill's name, "selector", "flat")
-                for some. Each member is trained for the phase's budget.
+                for some. Its budget is the phase's for each member, measuring fitness included.
 
         Raises:
             SkillweaveError: the declaration does not fit the environment, or training diverged.

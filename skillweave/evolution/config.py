@@ -202,7 +202,7 @@ class Evolution:
     population: int = 8
     """Members."""
     generations: int = 20
-    """How often they are compared; each trains the budget's equal part in between."""
+    """How often they are compared; what is left of the budget is shared evenly between them."""
     episodes: int = 10
     """Episodes that a member's fitness is the mean return of; the same starts for all."""
     target: float | None = None
