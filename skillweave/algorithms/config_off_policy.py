@@ -196,9 +196,10 @@ class DQN(OffPolicy):
         number(self, *exploration, high=1.0)
         whole(self, "target_update_interval", "n_atoms")
         check(self, "n_atoms", self.n_atoms >= 2, "at least 2")
-        for name, other in (("v_min", self.v_max), ("v_max", self.v_min)):
-            if other is not None:
-                number(self, name, low=-INFINITY)
+        bounds = {"v_min": self.v_min, "v_max": self.v_max}
+        number(self, *(name for name, value in bounds.items() if value is not None), low=-INFINITY)
+        if self.v_min is not None or self.v_max is not None:  # they are given together
+            number(self, *bounds, low=-INFINITY)
         if self.v_min is not None and self.v_max is not None:
             check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
         one_of(self, "loss", ("huber", "mse"))
