@@ -65,6 +65,8 @@ REPLAY: dict[str, Any] = {
     "tau": 0.01, "compile": True,
 }  # fmt: skip
 RECURRENT = PPO(
+    gamma=0.99,
+    gae_lambda=0.95,
     num_envs=16,
     n_steps=64,
     batch_size=256,
@@ -151,7 +153,7 @@ FIGURES = {
     ),
     "image": Figure(
         FREEWAY,
-        PPO(n_steps=128, batch_size=1024, network=small(64)),
+        PPO(n_steps=128, batch_size=1024, gamma=0.99, gae_lambda=0.95, network=small(64)),
         2_000_000,  # after 1M: 45.6 (40.0 at worst)
         50.0,
         "Young & Tian 2019, DQN after 5M frames: about 50 (fig. 3)",

@@ -47,9 +47,9 @@ class PPO:
     """constant; linear: falls to 0 over the budget; kl: follows target_kl."""
     adam_eps: float = 1e-5
     """Adam's ε."""
-    gamma: float = 0.99
+    gamma: float = 0.995
     """Discount γ of one step."""
-    gae_lambda: float = 0.95
+    gae_lambda: float = 0.98
     """λ of generalised advantage estimation."""
     clip_coef: float = 0.2
     """ε of the clipped surrogate."""

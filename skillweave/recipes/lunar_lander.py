@@ -69,6 +69,7 @@ RELU = Network(activation="relu")  # tanh costs more than all the rest of so sma
 HOLDING = PPO(
     learning_rate=1e-3,
     gamma=0.98,
+    gae_lambda=0.95,
     batch_size=512,
     update_epochs=6,
     network=RELU,
@@ -79,6 +80,7 @@ HOLDING = PPO(
 LANDING = PPO(
     learning_rate=2e-3,
     gamma=0.98,
+    gae_lambda=0.95,
     batch_size=1024,
     ent_coef=0.05,
     ent_coef_final=0.002,
