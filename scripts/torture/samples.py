@@ -85,7 +85,7 @@ def looked_at(run: Path, changed: str) -> None:
     if changed.endswith(".jsonl"):
         list(found.metrics())
         for phase in found.manifest["phases"]:
-            read_lineage(run, phase["name"])
+            read_lineage(found, phase["name"])
         plot_run(found, run / "plots")
 
 

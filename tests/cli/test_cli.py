@@ -245,7 +245,7 @@ def test_scale_and_set_change_budgets_and_settings(
     left, balance, selector = answer.json["phases"]
     assert (left["budget"], balance["budget"], selector["budget"]) == (65, 128, 256)
     assert selector["algorithm"]["gamma"] == 0.9
-    assert left["algorithm"]["gamma"] == 0.99
+    assert left["algorithm"]["gamma"] == 0.995
 
 
 def test_settings_that_only_fit_together_may_be_given_in_any_order(
