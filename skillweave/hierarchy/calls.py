@@ -72,8 +72,14 @@ class SkillSet:
     def start(self, n: int) -> Memory:
         """Memory of n environments in which no call has begun."""
         memory: Memory = {"skill": np.full(n, -1), "elapsed": np.zeros(n, np.int64)}
-        for i, policy in enumerate(self.policies):
-            memory |= {f"{i}.{k}": v for k, v in policy.start(n).items()}
+        for i, (skill, policy) in enumerate(zip(self.skills, self.policies, strict=True)):
+            for k, v in policy.start(n).items():
+                if v.dtype.kind not in "biuf":  # a checkpoint could not hold it
+                    raise SkillweaveError(
+                        f"skill {skill.name!r}: its policy remembers {k!r} as {v.dtype}; a memory "
+                        "is an array of numbers whose first axis is the environment"
+                    )
+                memory[f"{i}.{k}"] = v
         return memory
 
     def begin(self, memory: Memory, rows: Array, skill: Array) -> None:

@@ -786,3 +786,13 @@ def test_where_gammas_differ_the_reward_of_every_step_of_a_call_is_told(options)
     alone = options(skill_set(*ALL, call_steps=6), gamma=0.9)
     alone.reset(seed=0)
     assert "rewards" not in alone.step(np.zeros(N, int))[-1]
+
+
+def test_a_memory_that_no_checkpoint_could_hold_is_refused_by_the_skills_name():
+    class Wordy(type(Counter.policy)):
+        def start(self, n):
+            return {"said": np.array(["nothing"] * n, object)}
+
+    skills = SkillSet((Left(),), (Wordy(),), (), 5)
+    with pytest.raises(SkillweaveError, match="skill 'left': its policy remembers 'said' as obj"):
+        skills.start(3)
