@@ -9,7 +9,14 @@ from skillweave.envs.joined import JoinedEnvs
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes
-from skillweave.types import Array, VecEnv, VecStep, prefixed, unprefixed
+from skillweave.types import (
+    Array,
+    SkillweaveError,
+    VecEnv,
+    VecStep,
+    prefixed,
+    unprefixed,
+)
 
 
 class Collector:
@@ -41,8 +48,18 @@ class Collector:
         return self.env.mask()
 
     def carry(self, name: str, like: Array) -> Array:
-        """What is kept under this name; zeros shaped as ``like`` (N, …) the first time."""
-        return self.carried.setdefault(name, np.zeros_like(like))
+        """What is kept under this name; zeros shaped as ``like`` (N, …) the first time.
+
+        Raises:
+            SkillweaveError: a checkpoint holds something of another shape or type under this name.
+        """
+        kept = self.carried.setdefault(name, np.zeros_like(like))
+        if kept.shape != like.shape or kept.dtype != like.dtype:
+            raise SkillweaveError(
+                f"the checkpoint's {name!r} of open episodes is {kept.dtype} {kept.shape}, where "
+                f"{like.dtype} {like.shape} belongs: it is not of this phase, or damaged"
+            )
+        return kept
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment anew, unless they are under way."""
@@ -75,7 +92,9 @@ class Collector:
     def restore(self, state: dict[str, torch.Tensor], seeds: Seeds) -> None:
         """Stand where ``state`` says; ``begun_anew`` are those that could not be brought back."""
         arrays = {k: v.numpy() for k, v in state.items()}
+        sums = self.carried["sums"]
         self.carried = {k: v.copy() for k, v in unprefixed("carried", arrays).items()}
+        self.carry("sums", sums)
         self.episodes.load(unprefixed("episodes", arrays))
         if env := unprefixed("env", arrays):
             self.begun_anew = self.env.restore(env)

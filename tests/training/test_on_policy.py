@@ -293,3 +293,11 @@ def test_the_callback_may_stop_the_run_and_threads_are_given_back():
     with pytest.raises(Stop):
         train(Identity(16), 5, replace(CONFIG, threads=2), on_tick=stop)
     assert torch.get_num_threads() == 1
+
+
+def test_a_checkpoint_of_other_environments_is_refused():
+    one, other = Collector(Identity(16)), Collector(Identity(16))
+    one.start(Seeds(0))
+    state = one.state() | {"carried.sums": torch.zeros(3)}
+    with pytest.raises(SkillweaveError, match=r"'sums' of open episodes is float32 \(3,\)"):
+        other.restore(state, Seeds(0))
