@@ -198,8 +198,10 @@ class DQN(OffPolicy):
         check(self, "n_atoms", self.n_atoms >= 2, "at least 2")
         bounds = {"v_min": self.v_min, "v_max": self.v_max}
         number(self, *(name for name, value in bounds.items() if value is not None), low=-INFINITY)
-        if self.v_min is not None or self.v_max is not None:  # they are given together
-            number(self, *bounds, low=-INFINITY)
+        together = self.v_min is not None or self.v_max is None
+        check(self, "v_min", together, f"a finite number where v_max is one ({self.v_max})")
+        if self.v_min is not None:
+            number(self, "v_max", low=-INFINITY)
         if self.v_min is not None and self.v_max is not None:
             check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
         one_of(self, "loss", ("huber", "mse"))
