@@ -9,6 +9,9 @@ import numpy as np
 
 from skillweave.types import SkillweaveError
 
+MOST = 10**12
+"""The largest whole number that an argument may be: a million times it fits into 64 bits."""
+
 
 def short(value: object, longest: int = 100) -> str:
     """``repr(value)`` for a message, its middle left out where it is long."""
@@ -45,11 +48,13 @@ def whole_number(value: object, name: str, least: int) -> int:
     """``value`` as an int.
 
     Raises:
-        SkillweaveError: it is no whole number, or less than ``least``; the message begins with
-            ``name``.
+        SkillweaveError: it is no whole number, less than ``least``, or more than ``MOST``; the
+            message begins with ``name``.
     """
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise SkillweaveError(f"{name} is {short(value)}; it must be a whole number")
     if value < least:
         raise SkillweaveError(f"{name} is {short(value)}; it must be at least {least}")
+    if value > MOST:
+        raise SkillweaveError(f"{name} is {short(value)}; it must be at most {MOST:,}")
     return int(value)

@@ -317,3 +317,8 @@ def test_spaces_of_pixels_are_the_same_if_pixels_mean_the_same():
     assert same_space(pixels, Box(0, 255, (8, 8, 3), np.uint8))
     assert not same_space(pixels, Box(0, 1, (8, 8, 3), np.float32))
     assert not same_space(pixels, Box(-np.inf, np.inf, (8, 8, 3)))  # a vector
+
+
+def test_a_space_that_holds_no_number_is_refused():
+    with pytest.raises(SkillweaveError, match=r"the observation space Box.* holds no number"):
+        obs_codec(gym.spaces.Box(0.0, 1.0, (0,), np.float32))

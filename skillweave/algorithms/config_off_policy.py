@@ -200,8 +200,10 @@ class DQN(OffPolicy):
         number(self, *(name for name, value in bounds.items() if value is not None), low=-INFINITY)
         together = self.v_min is not None or self.v_max is None
         check(self, "v_min", together, f"a finite number where v_max is one ({self.v_max})")
-        if self.v_min is not None:
-            number(self, "v_max", low=-INFINITY)
+        if self.v_min is not None and self.v_max is None:
+            raise SkillweaveError(
+                f"DQN.v_max is None where v_min is {self.v_min}; it must be a finite number"
+            )
         if self.v_min is not None and self.v_max is not None:
             check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
         one_of(self, "loss", ("huber", "mse"))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from skillweave.spaces.packing import LARGEST, check_size, obs_dtype, obs_shape, parts
-from skillweave.types import Array
+from skillweave.types import Array, SkillweaveError
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
 
@@ -149,6 +149,8 @@ def obs_codec(space: gym.Space[Any]) -> ObsCodec:
     leaves = tuple(_leaves(space, dtype, None))
     vectors = [leaf for leaf in leaves if leaf.image is None]
     layouts = [leaf.image for leaf in leaves if leaf.image is not None]
+    if not any(leaf.size for leaf in leaves):
+        raise SkillweaveError(f"the observation space {space} holds no number: nothing can be seen")
     check_size(space, "observation", sum(leaf.size for leaf in vectors))
     pixels = sum(leaf.size for leaf in leaves) - sum(leaf.size for leaf in vectors)
     check_size(space, "observation", pixels, 16 * LARGEST)
