@@ -220,10 +220,7 @@ class DQN(OffPolicy):
 
 @dataclass(frozen=True)
 class ActorCritic(OffPolicy):
-    """What TD3 and SAC have in common, and where they do not begin as DQN does.
-
-    At half a gradient step per transition they take about two minutes per 100,000 steps.
-    """
+    """What TD3 and SAC have in common, and where their defaults are not DQN's."""
 
     update_ratio: float = 0.5
     """Gradient steps per transition collected (the update-to-data ratio)."""
