@@ -21,6 +21,7 @@ from skillweave.evolution.config import Evolution
 from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.selection import select
 from skillweave.evolution.stacks import Member, Origin, copy, grouped, join, split
+from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
@@ -228,12 +229,8 @@ def _count(members: list[Member], steps: int) -> None:
 
 def score(policy: Policy, env: VecEnv, seeds: Seeds) -> float:
     """Mean return of an episode in each environment; −inf if it is not finite."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # several wait for each other, for ever on a busy machine
-    try:
+    with torch_threads(1):  # several wait for each other, for ever on a busy machine
         returns = episode_returns(policy, env, seeds)
-    finally:
-        torch.set_num_threads(threads)
     return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
 
 

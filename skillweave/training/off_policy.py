@@ -20,6 +20,7 @@ from torch import Tensor
 from skillweave.algorithms.config import OffPolicy
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.buffers.replay import ReplayBuffer
+from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick, to_numbers
@@ -128,9 +129,7 @@ def train_stacks(
     started = time.perf_counter() - seconds
     config = stacks[0].algorithm.config
     loop = _Loop(stacks, collector, seeds, horizon or budget, buffer, steps)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(config.threads)
-    try:
+    with torch_threads(config.threads):
         collector.start(seeds / "start")
         while steps < budget:
             loop.collect(update, steps)
@@ -149,8 +148,6 @@ def train_stacks(
                 seconds = time.perf_counter() - started
                 metrics |= collector.episodes.summary()
                 on_tick(Tick(update, steps, seconds, metrics, stacks, cut, extra))
-    finally:
-        torch.set_num_threads(threads)
 
 
 class _Loop:

@@ -18,6 +18,7 @@ from torch import Tensor
 from skillweave.algorithms.base import Actor
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.buffers.rollout import RolloutBuffer
+from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick, to_numbers
@@ -25,6 +26,7 @@ from skillweave.training.members import by_member, member_seeds, passed
 from skillweave.types import prefixed
 
 
+@torch_threads(1)
 def train_on_policy(
     algorithm: PPOAlgorithm,
     collector: Collector,
@@ -56,8 +58,6 @@ def train_on_policy(
     loop = _Loop(algorithm, collector, seeds, members=len(state.params))
     started = time.perf_counter() - seconds
     learner = _Learner(algorithm, state, loop, horizon or budget, tolerant, on_tick, started)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     try:
         actor = algorithm.actor(state)
         collector.start(seeds / "start")
@@ -75,7 +75,6 @@ def train_on_policy(
                 actor = learner.wait(actor, cut, extra, steps)
     finally:
         learner.close()
-        torch.set_num_threads(threads)
     return state
 
 
