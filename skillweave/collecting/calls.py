@@ -1,6 +1,6 @@
 """Calls: skills acting under a selector, from the decision that starts one until it stops.
 
-``OptionsEnv`` (training) and ``HierarchyPolicy`` (everything else) both run skills through
+Collectors (training) and ``HierarchyPolicy`` (everything else) both run skills through
 ``SkillSet``, so a skill behaves the same wherever it acts.
 """
 

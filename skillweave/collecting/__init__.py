@@ -1,0 +1,1 @@
+"""Who steps environments: collectors, and the calls of skills in them."""

@@ -1,0 +1,155 @@
+"""Learners as they act: members of stacks, side by side in N environments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import ActingParams, Algorithm
+from skillweave.seeding import Seeds
+from skillweave.spaces import to_tensor
+from skillweave.types import Array
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a collector is asked for: so many rows, by these parameters.
+
+    Everything that is random while they are collected follows from ``seeds``.
+    """
+
+    rows: int  # T, environment steps of each environment
+    params: tuple[ActingParams, ...]  # of each stack
+    gamma: Array  # (P,), the discount of one step, of each member
+    seeds: Seeds
+    at_random: bool = False  # act at random instead
+
+    def of_collector(self, number: int) -> Request:
+        """The same for one of several collectors."""
+        return Request(
+            self.rows, self.params, self.gamma, self.seeds / number, self.at_random
+        )
+
+
+@dataclass
+class Acted:
+    """What n environments are to do, and what the learner keeps of it."""
+
+    action: Array  # (n, …) in policy units
+    head: Array | None  # (n, H), of learners from rollouts
+    memory: Array | None  # (n, M) afterwards, of learners with a memory
+
+
+class Acting:
+    """P members act in N = P·B environments; member 0 in the first B, and so on.
+
+    Args:
+        stacks: each an algorithm and its number of members.
+    """
+
+    def __init__(self, stacks: Sequence[tuple[Algorithm, int]], num_envs: int) -> None:
+        self.stacks, self.num_envs = tuple(stacks), num_envs
+        self.members = sum(count for _, count in stacks)
+        self.each = num_envs // self.members  # B
+        first = stacks[0][0]
+        self.codec, self.to_env, self.memory_size = first.codec, first.to_env, first.memory_size
+        self.keeps_head = first.store == "rollout"
+
+    def begin(self, request: Request, every_step: bool = True) -> None:
+        """Act by this request from now on.
+
+        Args:
+            every_step: all act in each of its steps, so what they need of chance is drawn at once.
+        """
+        self._request, self._noises = request, [[] for _ in self.stacks]  # type: list[list[Any]]
+        self._generators = [
+            [s.torch() for s in self._seeds(i)] for i in range(len(self.stacks))
+        ]
+        if every_step and not request.at_random:
+            self._noises = [
+                algorithm.noise(generators, request.rows, self.each)
+                for (algorithm, _), generators in zip(self.stacks, self._generators, strict=True)
+            ]
+
+    @torch.inference_mode()
+    def all(self, at: int, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        """Act in all environments in step ``at`` of the request; obs (N, …), mask (N, A)."""
+        return self._act(lambda stack: self._noises[stack][at], obs, mask, memory)
+
+    @torch.inference_mode()
+    def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        """Act in environments ``rows`` (n,) only; all arguments are of all N."""
+        if self.members > 1:  # rows of several members: all act, and some of it counts
+            acted = self._act(lambda stack: self._draw(stack, self.each), obs, mask, memory)
+            head, after = acted.head, acted.memory
+            return Acted(
+                acted.action[rows],
+                None if head is None else head[rows],
+                None if after is None else after[rows],
+            )
+        allowed = None if mask is None else mask[rows]
+        own = None if memory is None else memory[rows]
+        return self._act(lambda stack: self._draw(stack, len(rows)), obs[rows], allowed, own)
+
+    def _draw(self, stack: int, each: int) -> Any:
+        return self.stacks[stack][0].noise(self._generators[stack], 1, each)[0]
+
+    def _act(self, noise: Any, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        """Act stack by stack, in equal numbers of rows of each member."""
+        found, first, each = [], 0, len(obs) // self.members
+        for stack, (_, count) in enumerate(self.stacks):
+            part = slice(first * each, (first + count) * each)
+            found.append(self._stack(stack, noise, *(_part(x, part) for x in (obs, mask, memory))))
+            first += count
+        if len(found) == 1:
+            return found[0]
+        return Acted(
+            np.concatenate([f.action for f in found]),
+            _joined([f.head for f in found]),
+            _joined([f.memory for f in found]),
+        )
+
+    def _stack(
+        self, stack: int, noise: Any, obs: Any, mask: Array | None, memory: Array | None
+    ) -> Acted:
+        algorithm, count = self.stacks[stack]
+        allowed = None if mask is None else by_member(mask, count)
+        if self._request.at_random:
+            generators = self._generators[stack]
+            drawn: Any = algorithm
+            action = drawn.random_actions(generators, len(obs) // count, allowed)
+            return Acted(action.flatten(0, 1).numpy(), None, None)
+        before = None if memory is None else by_member(memory, count)
+        params = self._request.params[stack]
+        action, head, after = algorithm.act(
+            params, by_member(obs, count), allowed, noise(stack), before
+        )
+        # A member that has diverged must not spoil what all learn from.
+        if not self.keeps_head:
+            action, head = action.nan_to_num(), None
+        return Acted(*(None if x is None else x.flatten(0, 1).numpy() for x in (action, head, after)))  # type: ignore[arg-type]
+
+    def _seeds(self, stack: int) -> list[Seeds]:
+        first = sum(count for _, count in self.stacks[:stack])
+        count = self.stacks[stack][1]
+        return [self._request.seeds / "act" / (first + member) for member in range(count)]
+
+
+def by_member(rows: Array, members: int) -> Tensor:
+    """Rows of environments (P·B, …) to (P, B, …), member 0's first."""
+    tensor = to_tensor(rows)
+    return tensor.view(members, -1, *tensor.shape[1:])
+
+
+def _part(x: Array | None, part: slice) -> Array | None:
+    return None if x is None else x[part]
+
+
+def _joined(parts: list[Array | None]) -> Array | None:
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known) if known else None

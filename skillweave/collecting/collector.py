@@ -1,0 +1,207 @@
+"""What all collectors share: environments under way, from one rollout and process to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from skillweave.collecting.acting import Acting, Request
+from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.engine import Engine, checksums
+from skillweave.experience import Experience
+from skillweave.seeding import Seeds
+from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
+
+RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
+"""The columns of ``Collected.episodes``."""
+
+
+@dataclass
+class Collected:
+    """What a learner is to learn from, and what people want to know of it."""
+
+    experience: Experience
+    episodes: Array  # (K, 4) float64, those that ended; NaN where there is no such number
+
+
+class Collector:
+    """N environments, and who acts in them. A function of requests, seeds and ``state``.
+
+    A clean cut does not end episodes: ``state`` holds what is needed to play them again.
+
+    Args:
+        engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
+        acting: the learners.
+    """
+
+    def __init__(self, engine: Engine, acting: Acting) -> None:
+        self.engine, self.acting, self.num_envs = engine, acting, engine.num_envs
+        n, size = self.num_envs, acting.memory_size
+        self.obs: Array = np.empty(0)
+        """(N, *obs_shape), what to act on next."""
+        self.kept: dict[str, Array] = {
+            "age": np.zeros(n, np.int64),  # steps of the open episode
+            "sums": np.zeros((n, 3)),  # of it: return, return of the task, length as the skill's
+            "memory": np.zeros((n, size), np.float32),  # the learner's
+        }
+        """What is kept of each environment, (N, …) each; changed in place."""
+        self.begun = False
+        self._all = np.arange(n)
+        self._ended: list[Array] = []
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment anew, unless they are under way."""
+        if not self.begun:
+            self.obs = np.array(self.engine.reset((seeds / "env").integer()))
+            self._forget(self._all)
+            self.begun = True
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        before, self._ended = self.engine.steps_made, []
+        experience = self._collect(request)
+        experience.spent = self.engine.steps_made - before
+        empty = np.zeros((0, 4))
+        return Collected(experience, np.concatenate([empty, *self._ended]))
+
+    def cut(self, seeds: Seeds) -> Array:
+        """Make ready for ``state``: take new seeds, so that the past need not be kept.
+
+        Returns:
+            (k,) environments that begin anew, as their episodes are too long to be kept.
+        """
+        self.engine.renew((seeds / "env").integer())
+        return self._begin_anew(np.flatnonzero(self.kept["age"] > LONGEST_EPISODE))
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs, right after ``cut``."""
+        kept = {k: v.copy() for k, v in self.kept.items()} | {"obs": checksums(self.obs)}
+        return prefixed("kept", kept) | prefixed("engine", self.engine.state())
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Stand where ``state`` says: play the open episodes again.
+
+        Returns:
+            (k,) environments that begin anew, as they did not repeat themselves.
+
+        Raises:
+            SkillweaveError: the state is another collector's.
+        """
+        kept = unprefixed("kept", state)
+        for name, own in self.kept.items():
+            found = kept[name]
+            if found.shape != own.shape or found.dtype != own.dtype:
+                raise SkillweaveError(
+                    f"the checkpoint's {name!r} of open episodes is {found.dtype} {found.shape}, "
+                    f"where {own.dtype} {own.shape} belongs: it is not of this stage, or damaged"
+                )
+            own[:] = found
+        obs, early = self.engine.restore(unprefixed("engine", state))
+        self.obs, self.begun = np.array(obs), True
+        other = np.flatnonzero(checksums(self.obs) != kept["obs"])
+        return self._begin_anew(np.union1d(early, other))
+
+    def close(self) -> None:
+        """Release the environments."""
+        self.engine.close()
+
+    def _collect(self, request: Request) -> Experience:
+        raise NotImplementedError
+
+    def _forget(self, ids: Array) -> None:
+        """Episodes of environments ``ids`` (k,) have just begun."""
+        for kept in self.kept.values():
+            kept[ids] = 0
+
+    def _begin_anew(self, ids: Array) -> Array:
+        if len(ids):
+            self.obs = self.obs.copy()
+            self.obs[ids] = self.engine.reset_some(ids)
+            self._forget(ids)
+        return ids
+
+    def _tell(self, ids: Array, success: Array | None = None, *, task: bool = False) -> None:
+        """The episodes of environments ``ids`` (k,) are over."""
+        told = np.full((len(ids), 4), np.nan)
+        told[:, :3] = self.kept["sums"][ids]
+        if not task:
+            told[:, TASK_RETURN] = np.nan
+        if success is not None:
+            told[:, SUCCESS] = success
+        self._ended.append(told)
+
+    @property
+    def memory(self) -> Array | None:
+        """(N, M), what the learners remember; None: nothing."""
+        return self.kept["memory"] if self.acting.memory_size else None
+
+
+def together(collectors: Sequence[Any], engine: Engine, acting: Acting) -> Any:
+    """Several collectors of one kind as one, over an engine of all their environments."""
+    found = collectors[0].like(engine, acting)
+    for name, rows in found.kept.items():
+        rows[:] = np.concatenate([c.kept[name] for c in collectors])
+    found.obs, found.begun = np.concatenate([c.obs for c in collectors]), True
+    return found
+
+
+def apart(joined: Collector, collectors: Sequence[Collector]) -> None:
+    """The inverse of ``together``: each stands where its part of ``joined`` does."""
+    first = 0
+    for collector in collectors:
+        part = slice(first, first + collector.num_envs)
+        for name, rows in collector.kept.items():
+            rows[:] = joined.kept[name][part]
+        collector.obs, first = joined.obs[part].copy(), part.stop
+
+
+def side_by_side(parts: Sequence[Collected], members: int) -> Collected:
+    """What several collectors found as one: each member's environments stand side by side."""
+    if len(parts) == 1:
+        return parts[0]
+    experiences = [p.experience for p in parts]
+    height = max(e.reward.shape[0] for e in experiences)
+    if any(e.reward.shape[0] < height for e in experiences):
+        experiences = [_higher(e, height) for e in experiences]
+    names = [k for k in Experience.__dataclass_fields__ if k != "spent"]
+    found = {k: _beside([getattr(e, k) for e in experiences], members, k) for k in names}
+    spent = sum(e.spent for e in experiences)
+    return Collected(
+        Experience(**found, spent=spent), np.concatenate([p.episodes for p in parts])
+    )
+
+
+def _higher(experience: Experience, height: int) -> Experience:
+    """The same with empty rows at the end."""
+    rows, columns = experience.reward.shape
+    valid = experience.valid
+    full = replace(experience, valid=np.ones((rows, columns), bool) if valid is None else valid)
+
+    def padded(name: str) -> Any:
+        value = getattr(full, name)
+        if value is None or name in ("memory", "spent"):
+            return value
+        return np.concatenate([value, np.zeros((height - rows, *value.shape[1:]), value.dtype)])
+
+    return Experience(**{k: padded(k) for k in Experience.__dataclass_fields__})
+
+
+_FREE = {"obs_mask", "next_obs_mask", "valid"}  # where a part says nothing, it is all True
+
+
+def _beside(values: list[Any], members: int, name: str) -> Any:
+    known = next((v for v in values if v is not None), None)
+    if known is None:
+        return None
+    if name in _FREE:
+        values = [np.ones((*known.shape[:2], *known.shape[2:]), bool) if v is None else v for v in values]
+    if name == "rewards":
+        longest = max(v.shape[2] for v in values)
+        values = [np.pad(v, ((0, 0), (0, 0), (0, longest - v.shape[2]))) for v in values]
+    axis = 0 if name == "memory" else 1
+    split = [v.reshape(*v.shape[:axis], members, -1, *v.shape[axis + 1 :]) for v in values]
+    joined = np.concatenate(split, axis + 1)
+    return joined.reshape(*joined.shape[:axis], -1, *joined.shape[axis + 2 :])

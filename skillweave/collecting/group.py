@@ -1,0 +1,121 @@
+"""Several collectors that fill one experience: in this thread, or each in a process of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from skillweave.collecting.acting import Request
+from skillweave.collecting.collector import Collected, Collector, side_by_side
+from skillweave.seeding import Seeds
+from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
+
+
+class Collectors:
+    """W collectors of as many environments each, whose experience stands side by side.
+
+    Each has a part of the environments of every member. What they find depends on how many they
+    are, and not on where they run.
+
+    Args:
+        parts: the collectors, in this thread.
+        members: P.
+    """
+
+    def __init__(self, parts: Sequence[Collector], members: int = 1) -> None:
+        self.parts, self.members = list(parts), members
+        self.num_envs = sum(part.num_envs for part in parts)
+        self.steps_made = 0
+        """Environment steps that were made together."""
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment anew, unless they are under way."""
+        for i, part in enumerate(self.parts):
+            part.start(seeds / i)
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        found = [
+            part.collect(request.of_collector(i)) for i, part in enumerate(self.parts)
+        ]
+        return self._joined(found)
+
+    def cut(self, seeds: Seeds) -> Array:
+        """Make ready for ``state``; (k,) environments that begin anew."""
+        return self._columns([part.cut(seeds / i) for i, part in enumerate(self.parts)])
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs, right after ``cut``."""
+        return _joined_states([part.state() for part in self.parts])
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Stand where ``state`` says; (k,) environments that begin anew."""
+        states = split_states(state, len(self.parts))
+        return self._columns([p.restore(s) for p, s in zip(self.parts, states, strict=True)])
+
+    def close(self) -> None:
+        """Release the environments."""
+        for part in self.parts:
+            part.close()
+
+    def _joined(self, found: Sequence[Collected]) -> Collected:
+        collected = side_by_side(found, self.members)
+        self.steps_made += collected.experience.spent
+        return collected
+
+    def _columns(self, ids: Sequence[Array]) -> Array:
+        """Environments of each collector as columns of the experience."""
+        count = len(ids)
+        each = self.num_envs // self.members  # of a member
+        own = each // count  # of a member, in one collector
+        found = [
+            part // own * each + number * own + part % own for number, part in enumerate(ids)
+        ]
+        return np.sort(np.concatenate(found))
+
+
+def _joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:
+    found: dict[str, Array] = {"collectors": np.array([len(states)])}
+    for i, state in enumerate(states):
+        found |= prefixed(str(i), state)
+    return found
+
+
+def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
+    """The states of each of ``count`` collectors.
+
+    Raises:
+        SkillweaveError: it is that of another number of collectors.
+    """
+    saved = int(state["collectors"][0])
+    if saved != count:
+        raise SkillweaveError(
+            f"the checkpoint is of {saved} collectors, but there are {count}: a run goes on with "
+            "as many as it began with"
+        )
+    return [unprefixed(str(i), state) for i in range(count)]
+
+
+def make_collectors(
+    make: Callable[[int, int], Collector], num_envs: int, workers: int, members: int, name: str
+) -> Collectors:
+    """Collectors of ``num_envs`` environments: one in this thread, or ``workers`` processes.
+
+    Args:
+        make: given how many environments and the number of the first one, makes a collector.
+        workers: 0 and 1: in this thread.
+
+    Raises:
+        SkillweaveError: the environments cannot be shared out equally.
+    """
+    if workers <= 1:
+        return Collectors([make(num_envs, 0)], members)
+    if num_envs % (workers * members):
+        raise SkillweaveError(
+            f"{name}: num_envs is {num_envs // members}; it must be a multiple of workers, "
+            f"{workers}, so that each has as many environments"
+        )
+    from skillweave.collecting.processes import ProcessCollectors
+
+    return ProcessCollectors(make, num_envs // workers, workers, members, name)

@@ -1,0 +1,196 @@
+"""The collector of a plain agent, or of a skill that learns by itself: a row is a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.columns import Columns
+from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.infos import allowed_rows, info_rows, random_actions
+from skillweave.experience import Experience
+from skillweave.skills import Reflex, Skill, apply_reflexes, asked
+from skillweave.types import Array, SkillweaveError, Step
+
+PATIENCE = 5_000
+"""Steps of an environment in search of a state where the skill may start, if none is ever found."""
+
+
+@dataclass
+class Judged:
+    """What a step was to the skill."""
+
+    reward: Array  # (n,) float32
+    terminated: Array  # (n,) bool
+    truncated: Array  # (n,) bool, never where terminated
+    success: Array | None  # (n,) bool
+
+
+class SkillCollector(Collector):
+    """Environments seen through a skill: its reward, its ends; after each end a real reset.
+
+    A skill's ``termination`` terminates the episode (nothing is worth anything after it), its
+    ``max_steps`` truncates it (its value goes on). Where the skill may not start, the environment
+    takes random actions until it may, while the others go on; these rows are not valid.
+
+    Args:
+        engine: the environments.
+        acting: the learners.
+        skill: None for the task itself: the environment's own reward and ends.
+        reflexes: in force while the skill acts.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        acting: Acting,
+        skill: Skill | None = None,
+        reflexes: tuple[Reflex, ...] = (),
+    ) -> None:
+        super().__init__(engine, acting)
+        self.skill, self.reflexes = skill, reflexes
+        n = self.num_envs
+        self._never = np.zeros(n, bool)
+        self.kept["elapsed"] = np.zeros(n, np.int64)  # the skill's steps in the open episode
+        self._searches = skill is not None and skill.defines("initiation")
+        if self._searches:
+            self.kept["searching"] = np.zeros(n, bool)  # the skill may not start yet
+            self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
+            self._found = False
+
+    def like(self, engine: Engine, acting: Acting) -> SkillCollector:
+        """The same over other environments."""
+        return SkillCollector(engine, acting, self.skill, self.reflexes)
+
+    def _collect(self, request: Request) -> Experience:
+        self.acting.begin(request)
+        rng = (request.seeds / "search").numpy()
+        out = Columns(self, request.rows)
+        for at in range(request.rows):
+            self._step(at, out, rng)
+        return out.experience()
+
+    def _step(self, at: int, out: Columns, rng: np.random.Generator) -> None:
+        """One step of every environment."""
+        obs, mask, memory = self.obs, self.engine.mask(), self.memory
+        playing = ~self.kept["searching"] if self._searches else None
+        if playing is not None and playing.all():
+            playing = None
+        acted = self.acting.all(at, obs, mask, memory)
+        action = self.acting.to_env(acted.action)
+        if self.reflexes:
+            action = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
+        if playing is not None:
+            action = self._search(action, ~playing, mask, rng)
+        raw = self.engine.step(action)
+        self.kept["age"] += 1
+        judged = self._judge(obs, action, raw, playing)
+        ended = judged.terminated | judged.truncated
+        out.put(at, obs, mask, acted, judged, raw.next_obs, self.engine.mask(), playing)
+        self._count(raw, judged, playing)
+        if memory is not None and acted.memory is not None:
+            memory[:] = acted.memory
+            if playing is not None:
+                memory[~playing] = 0
+        self.obs = raw.next_obs
+        over = ended if playing is None else np.where(playing, ended, raw.terminated | raw.truncated)
+        ids = np.flatnonzero(over)
+        if len(ids):
+            told = ids if playing is None else np.flatnonzero(playing & ended)
+            success = None if judged.success is None else judged.success[told]
+            self._tell(told, success, task=self.skill is not None)
+            self._begin_anew(ids)
+        if playing is not None:
+            self._look(np.flatnonzero(~playing & ~over))
+
+    def _forget(self, ids: Array) -> None:
+        searched = self.kept["searched"][ids] if self._searches else None
+        super()._forget(ids)
+        if searched is not None:
+            self.kept["searched"][ids] = searched  # it counts on from episode to episode
+            self.kept["searching"][ids] = True
+            self._look(ids)
+
+    def _look(self, ids: Array) -> None:
+        """Whether the skill may start now in environments ``ids`` (k,) that search."""
+        if not len(ids):
+            return
+        assert self.skill is not None
+        holds = asked(self.skill, "initiation", self.obs[ids], len(ids))
+        found, waiting = ids[holds], ids[~holds]
+        self.kept["searching"][found] = False
+        self.kept["searched"][found] = 0
+        self._found |= len(found) > 0
+        self.kept["searched"][waiting] += 1
+        if not self._found and self.kept["searched"].max() > PATIENCE:
+            raise SkillweaveError(
+                f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps of "
+                "random acting, so there is nothing to train on; widen it, or give an environment "
+                "that starts where it holds"
+            )
+
+    def _search(
+        self, action: Array, searching: Array, mask: Array | None, rng: np.random.Generator
+    ) -> Array:
+        """The actions, where environments are ``searching`` (N,) random ones."""
+        ids, action = np.flatnonzero(searching), action.copy()
+        allowed = allowed_rows(mask, ids)
+        action[ids] = random_actions(self.engine.action_space, len(ids), rng, allowed)
+        return action
+
+    def _judge(self, obs: Array, action: Array, raw: RawStep, playing: Array | None) -> Judged:
+        """What a step was to the skill; anything where it did not play."""
+        skill = self.skill
+        self.kept["elapsed"] += 1
+        if skill is None:
+            return Judged(raw.reward, raw.terminated, raw.truncated, None)
+        elapsed = self.kept["elapsed"]
+        if playing is None:
+            return self._of_skill(skill, obs, action, raw, elapsed)
+        rows = np.flatnonzero(playing)
+        elapsed[~playing] = 0
+        found = Judged(
+            np.zeros(self.num_envs, np.float32), self._never.copy(), self._never.copy(),
+            self._never.copy() if skill.defines("success") else None,
+        )  # fmt: skip
+        if len(rows):
+            part = RawStep(
+                raw.next_obs[rows], raw.reward[rows], raw.terminated[rows], raw.truncated[rows],
+                info_rows(raw.info, rows, self.num_envs),
+            )  # fmt: skip
+            judged = self._of_skill(skill, obs[rows], action[rows], part, elapsed[rows])
+            found.reward[rows], found.terminated[rows] = judged.reward, judged.terminated
+            found.truncated[rows] = judged.truncated
+            if found.success is not None:
+                found.success[rows] = judged.success
+        return found
+
+    def _of_skill(
+        self, skill: Skill, obs: Array, action: Array, raw: RawStep, elapsed: Array
+    ) -> Judged:
+        n = len(obs)
+        timed_out = self._never[:n]
+        if skill.max_steps is not None:
+            timed_out = (elapsed >= skill.max_steps) & ~raw.terminated
+        step = Step(
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            timed_out, elapsed, raw.info,
+        )  # fmt: skip
+        reward = asked(skill, "reward", step, n, elapsed)
+        terminated = raw.terminated
+        if skill.defines("termination"):
+            terminated = terminated | asked(skill, "termination", step, n, elapsed)
+        truncated = (raw.truncated | timed_out) & ~terminated
+        success = asked(skill, "success", step, n, elapsed) if skill.defines("success") else None
+        return Judged(reward, terminated, truncated, success)
+
+    def _count(self, raw: RawStep, judged: Judged, playing: Array | None) -> None:
+        """Keep the sums of the open episodes."""
+        sums: Any = self.kept["sums"]
+        sums[:, 0] += judged.reward
+        sums[:, 1] += raw.reward if playing is None else raw.reward * playing
+        sums[:, 2] += 1 if playing is None else playing
