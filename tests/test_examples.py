@@ -68,7 +68,7 @@ def test_stable_baselines3_is_told_final_observations_and_time_limits():
 
     from skillweave import EnvSpec, OptionsEnv
     from skillweave.envs.make import make_engine
-    from skillweave.hierarchy.calls import SkillSet
+    from skillweave.collecting.calls import SkillSet
 
     module = adapter()
     skills = (module.DriftLeft(), module.DriftRight())

@@ -140,13 +140,13 @@ def violations(source: str, module: str, package: bool = False) -> list[str]:
         ("envs.make", "from skillweave import PPO"),
         ("envs.make", "from skillweave import recipes"),
         ("envs.make", "importlib.import_module('skillweave.runs')"),
-        ("evolution.tournament", "from skillweave.hierarchy.calls import SkillSet"),
+        ("evolution.tournament", "from skillweave.collecting.calls import SkillSet"),
         ("hierarchy.calls", "from skillweave.evolution import tournament"),
         ("algorithms.config", "from skillweave.networks.stacked import mlp"),
         ("networks.config", "from skillweave.networks.stacked import mlp"),
         ("seeding", "from skillweave.types import Step"),
         ("reporting.plots", "from skillweave.compat import x"),
-        ("recipes.x", "from skillweave.hierarchy.calls import SkillSet"),
+        ("recipes.x", "from skillweave.collecting.calls import SkillSet"),
     ],
 )
 def test_the_search_finds_an_import_against_the_order(module: str, source: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,11 @@ class Request:
     gamma: Array  # (P,), the discount of one step, of each member
     seeds: Seeds
     at_random: bool = False  # act at random instead
+    greedy: bool = False  # do not explore
 
     def of_collector(self, number: int) -> Request:
         """The same for one of several collectors."""
-        return Request(
-            self.rows, self.params, self.gamma, self.seeds / number, self.at_random
-        )
+        return replace(self, seeds=self.seeds / number)
 
 
 @dataclass
@@ -66,19 +65,21 @@ class Acting:
         Args:
             every_step: all act in each of its steps, so what they need of chance is drawn at once.
         """
-        self._request, self._noises = request, [[] for _ in self.stacks]  # type: list[list[Any]]
+        self._request, self._at = request, 0
+        self._noises: list[Any] = []
         self._generators = [
             [s.torch() for s in self._seeds(i)] for i in range(len(self.stacks))
         ]
-        if every_step and not request.at_random:
+        if every_step and not (request.at_random or request.greedy):
             self._noises = [
                 algorithm.noise(generators, request.rows, self.each)
                 for (algorithm, _), generators in zip(self.stacks, self._generators, strict=True)
             ]
 
     @torch.inference_mode()
-    def all(self, at: int, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """Act in all environments in step ``at`` of the request; obs (N, …), mask (N, A)."""
+    def all(self, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        """Act in all environments, in the request's next step; obs (N, …), mask (N, A)."""
+        at, self._at = self._at, self._at + 1
         return self._act(lambda stack: self._noises[stack][at], obs, mask, memory)
 
     @torch.inference_mode()
@@ -126,9 +127,8 @@ class Acting:
             return Acted(action.flatten(0, 1).numpy(), None, None)
         before = None if memory is None else by_member(memory, count)
         params = self._request.params[stack]
-        action, head, after = algorithm.act(
-            params, by_member(obs, count), allowed, noise(stack), before
-        )
+        chance = None if self._request.greedy else noise(stack)
+        action, head, after = algorithm.act(params, by_member(obs, count), allowed, chance, before)
         # A member that has diverged must not spoil what all learn from.
         if not self.keeps_head:
             action, head = action.nan_to_num(), None

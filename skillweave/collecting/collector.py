@@ -50,7 +50,8 @@ class Collector:
         """What is kept of each environment, (N, …) each; changed in place."""
         self.begun = False
         self._all = np.arange(n)
-        self._ended: list[Array] = []
+        self._ended: list[Array] = []  # what is told of episodes, and in which environments
+        self._who: list[Array] = []
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment anew, unless they are under way."""
@@ -61,11 +62,37 @@ class Collector:
 
     def collect(self, request: Request) -> Collected:
         """``request.rows`` steps of each environment."""
-        before, self._ended = self.engine.steps_made, []
+        before, self._ended, self._who = self.engine.steps_made, [], []
         experience = self._collect(request)
         experience.spent = self.engine.steps_made - before
         empty = np.zeros((0, 4))
         return Collected(experience, np.concatenate([empty, *self._ended]))
+
+    def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
+        """Play one episode in each environment, from its start.
+
+        Args:
+            request: who acts; ``rows`` does not count.
+            limit: steps after which an episode is cut.
+
+        Returns:
+            (N, 4), as ``Collected.episodes``.
+        """
+        self.begun = False
+        self.start(seeds)
+        found = np.full((self.num_envs, 4), np.nan)
+        playing = np.ones(self.num_envs, bool)
+        self._prepare(request)
+        for _ in range(limit):
+            self._ended, self._who = [], []
+            self._step()
+            for ids, told in zip(self._who, self._ended, strict=True):
+                first = playing[ids]
+                found[ids[first]], playing[ids[first]] = told[first], False
+            if not playing.any():
+                return found
+        found[playing, :3] = self.kept["sums"][playing]
+        return found
 
     def cut(self, seeds: Seeds) -> Array:
         """Make ready for ``state``: take new seeds, so that the past need not be kept.
@@ -108,6 +135,18 @@ class Collector:
         """Release the environments."""
         self.engine.close()
 
+    def like(self, engine: Engine, acting: Acting) -> Any:
+        """The same over other environments."""
+        raise NotImplementedError
+
+    def _prepare(self, request: Request) -> None:
+        """Act by this request from now on."""
+        raise NotImplementedError
+
+    def _step(self, out: Any = None) -> None:
+        """One step of every environment; ``out`` is told what is to be learnt from."""
+        raise NotImplementedError
+
     def _collect(self, request: Request) -> Experience:
         raise NotImplementedError
 
@@ -132,6 +171,7 @@ class Collector:
         if success is not None:
             told[:, SUCCESS] = success
         self._ended.append(told)
+        self._who.append(ids)
 
     @property
     def memory(self) -> Array | None:
@@ -139,7 +179,7 @@ class Collector:
         return self.kept["memory"] if self.acting.memory_size else None
 
 
-def together(collectors: Sequence[Any], engine: Engine, acting: Acting) -> Any:
+def together(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Any:
     """Several collectors of one kind as one, over an engine of all their environments."""
     found = collectors[0].like(engine, acting)
     for name, rows in found.kept.items():

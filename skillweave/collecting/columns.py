@@ -20,7 +20,7 @@ class Columns:
 
     def __init__(self, collector: Collector, rows: int) -> None:
         n, obs = collector.num_envs, collector.obs
-        lead = rows, n
+        lead, self._at = (rows, n), 0
         self._obs = np.empty((rows, *obs.shape), obs.dtype)
         self._next_obs = np.empty_like(self._obs)
         self._reward = np.empty(lead, np.float32)
@@ -36,7 +36,6 @@ class Columns:
 
     def put(
         self,
-        at: int,
         obs: Array,
         mask: Array | None,
         acted: Acted,
@@ -46,6 +45,7 @@ class Columns:
         valid: Array | None,
     ) -> None:
         """Write a row: what was acted on, what was done, and what came of it."""
+        at, self._at = self._at, self._at + 1
         self._obs[at], self._next_obs[at], self._reward[at] = obs, next_obs, judged.reward
         self._terminated[at], self._truncated[at] = judged.terminated, judged.truncated
         self._action.append(acted.action)

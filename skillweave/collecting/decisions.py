@@ -78,21 +78,25 @@ class DecisionCollector(Collector):
         self.kept["first"][ids] = True
 
     def _collect(self, request: Request) -> Experience:
-        self.acting.begin(request, every_step=False)
-        self._gamma = request.gamma.astype(np.float64).repeat(self.acting.each)
-        rng, out = (request.seeds / "skills").numpy(), Decisions(self.num_envs)
+        self._prepare(request)
+        out = Decisions(self.num_envs)
         for _ in range(request.rows):
-            self._step(out, rng)
+            self._step(out)
         self._check_lengths()
         return out.experience(self)
 
-    def _step(self, out: Decisions, rng: np.random.Generator) -> None:
+    def _prepare(self, request: Request) -> None:
+        self.acting.begin(request, every_step=False)
+        self._gamma = request.gamma.astype(np.float64).repeat(self.acting.each)
+        self._rng = (request.seeds / "skills").numpy()
+
+    def _step(self, out: Decisions | None = None) -> None:
         """One step of every environment."""
         rows = np.flatnonzero(self.kept["over"])
         if len(rows):
             self._decide(rows)
         obs = self.obs
-        action = self.skills.act(self._calls, self._all, obs, rng, self.engine.mask())
+        action = self.skills.act(self._calls, self._all, obs, self._rng, self.engine.mask())
         raw = self.engine.step(action)
         self._count(raw)
         seen = None
@@ -107,7 +111,8 @@ class DecisionCollector(Collector):
         ids = np.flatnonzero(over)
         if len(ids):
             self.kept["over"][ids] = True
-            out.put(ids, self, raw)
+            if out is not None:
+                out.put(ids, self, raw)
             self.kept["first"][ids] = False
             if ended.any():
                 ids = np.flatnonzero(ended)

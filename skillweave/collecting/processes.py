@@ -171,7 +171,7 @@ class ProcessCollectors(Collectors):
         self._receive(worker)
         tasks = [worker.start] if worker.start is not None else []
         tasks += worker.since
-        if not tasks or tasks[-1] != (what, task):
+        if not tasks or tasks[-1][0] != what or tasks[-1][1] is not task:
             tasks.append((what, task))
         answer = None
         for own in tasks:

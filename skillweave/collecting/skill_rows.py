@@ -67,30 +67,34 @@ class SkillCollector(Collector):
         return SkillCollector(engine, acting, self.skill, self.reflexes)
 
     def _collect(self, request: Request) -> Experience:
-        self.acting.begin(request)
-        rng = (request.seeds / "search").numpy()
+        self._prepare(request)
         out = Columns(self, request.rows)
-        for at in range(request.rows):
-            self._step(at, out, rng)
+        for _ in range(request.rows):
+            self._step(out)
         return out.experience()
 
-    def _step(self, at: int, out: Columns, rng: np.random.Generator) -> None:
+    def _prepare(self, request: Request) -> None:
+        self.acting.begin(request)
+        self._rng = (request.seeds / "search").numpy()
+
+    def _step(self, out: Columns | None = None) -> None:
         """One step of every environment."""
         obs, mask, memory = self.obs, self.engine.mask(), self.memory
         playing = ~self.kept["searching"] if self._searches else None
         if playing is not None and playing.all():
             playing = None
-        acted = self.acting.all(at, obs, mask, memory)
+        acted = self.acting.all(obs, mask, memory)
         action = self.acting.to_env(acted.action)
         if self.reflexes:
             action = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
         if playing is not None:
-            action = self._search(action, ~playing, mask, rng)
+            action = self._search(action, ~playing, mask)
         raw = self.engine.step(action)
         self.kept["age"] += 1
         judged = self._judge(obs, action, raw, playing)
         ended = judged.terminated | judged.truncated
-        out.put(at, obs, mask, acted, judged, raw.next_obs, self.engine.mask(), playing)
+        if out is not None:
+            out.put(obs, mask, acted, judged, raw.next_obs, self.engine.mask(), playing)
         self._count(raw, judged, playing)
         if memory is not None and acted.memory is not None:
             memory[:] = acted.memory
@@ -133,13 +137,11 @@ class SkillCollector(Collector):
                 "that starts where it holds"
             )
 
-    def _search(
-        self, action: Array, searching: Array, mask: Array | None, rng: np.random.Generator
-    ) -> Array:
+    def _search(self, action: Array, searching: Array, mask: Array | None) -> Array:
         """The actions, where environments are ``searching`` (N,) random ones."""
         ids, action = np.flatnonzero(searching), action.copy()
         allowed = allowed_rows(mask, ids)
-        action[ids] = random_actions(self.engine.action_space, len(ids), rng, allowed)
+        action[ids] = random_actions(self.engine.action_space, len(ids), self._rng, allowed)
         return action
 
     def _judge(self, obs: Array, action: Array, raw: RawStep, playing: Array | None) -> Judged:

@@ -12,7 +12,7 @@ import gymnasium as gym
 from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
 from skillweave.buffers.memory import check_memory
 from skillweave.envs.make import EnvSpec
-from skillweave.hierarchy.calls import SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.foreign import fitted

@@ -10,12 +10,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from skillweave.envs.checks import LONGEST_EPISODE
-from skillweave.envs.engine import Engine, RawStep, checksums
+from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import allowed_rows
-from skillweave.hierarchy.calls import SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.seeding import Seeds
 from skillweave.spaces import unpack
-from skillweave.types import Array, SkillweaveError, Step, prefixed, unprefixed
+from skillweave.types import Array, SkillweaveError, Step
 
 
 class OptionsEnv(VectorEnv[Any, Any, Any]):
@@ -28,15 +28,14 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
 
     ``info`` of a step, arrays over N environments: ``steps`` (τ), ``discount`` (γ^τ, or 0 where
     terminated), ``call_return`` (Σ rₖ), ``next_obs`` (the true successors, one array whatever the
-    space: see ``spaces.pack``), and Gymnasium's ``final_obs``. Where each environment has its own
-    γ: ``rewards`` (N, longest), of each step of a call, then zeros. Where initiation sets exist:
+    space: see ``spaces.pack``), and Gymnasium's ``final_obs``. Where initiation sets exist:
     ``action_mask`` (N, S), and ``next_action_mask``, that of ``next_obs`` (all True where the
     episode terminated, or no skill may start).
 
     Args:
         engine: the environments; stepped in part where calls differ in length.
         skills: what the actions mean.
-        gamma: γ of one primitive step; a number, or one for each environment (N,).
+        gamma: γ of one primitive step.
         seed: of the skills' own sampling, where they are not greedy. What a call draws follows
             from it and from the number of calls before, so no generator's state must be kept.
     """
@@ -44,7 +43,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
-        self, engine: Engine, skills: SkillSet, gamma: float | Array, seed: int = 0
+        self, engine: Engine, skills: SkillSet, gamma: float, seed: int = 0
     ) -> None:
         self.engine, self.skills = engine, skills
         self.num_envs = engine.num_envs
@@ -52,7 +51,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = gym.spaces.Discrete(len(skills.skills))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.set_gamma(np.asarray(gamma))
+        self._gamma = float(gamma)
         self._watches = skills.watches
         self._seed = seed
         self._obs: Array = np.empty(0)
@@ -69,56 +68,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._memory = self.skills.start(self.num_envs)
         self._obs = self.engine.reset(self._seed)
         self._mask = self.skills.mask(self._obs)
-        self._age = np.zeros(self.num_envs, np.int64)
-        return self.present()
-
-    def present(self) -> tuple[Any, dict[str, Any]]:
-        """What to act on next, and the info that belongs to it."""
         info = {} if self._mask is None else {"action_mask": self._mask}
         return unpack(self.single_observation_space, self._obs), info
-
-    @property
-    def steps_made(self) -> int:
-        """Primitive steps that all environments have made."""
-        return self.engine.steps_made
-
-    def renew(self, seeds: Seeds) -> Array:
-        """Take new seeds; environments whose episodes are too long to be kept begin anew."""
-        self._seed = (seeds / "skills").integer()
-        self._calls = 0
-        self.engine.renew((seeds / "env").integer())
-        return self._begin(np.flatnonzero(self._age > LONGEST_EPISODE))
-
-    def state(self) -> dict[str, Array]:
-        """All that ``restore`` needs, right after ``renew``; no call is open between steps."""
-        own = {"age": self._age.copy(), "obs": checksums(self._obs), "seed": np.array([self._seed])}
-        own |= prefixed("memory", {k: v.copy() for k, v in self._memory.items()})
-        return own | prefixed("engine", self.engine.state())
-
-    def restore(self, state: dict[str, Array]) -> Array:
-        """Play the open episodes again; the environments that did not repeat themselves."""
-        self._seed = int(state["seed"][0])
-        self._calls = 0
-        self._age = state["age"].copy()
-        self._memory = {k: v.copy() for k, v in unprefixed("memory", state).items()}
-        self._obs, early = self.engine.restore(unprefixed("engine", state))
-        other = np.flatnonzero(checksums(self._obs) != state["obs"])
-        return self._begin(np.union1d(early, other))
-
-    def set_gamma(self, gamma: Array) -> None:
-        """γ of one primitive step in each environment, (N,), from now on."""
-        self._keeps_rewards = np.ndim(gamma) > 0  # others may learn from it, with a γ of their own
-        self._gamma = np.broadcast_to(np.asarray(gamma, np.float64), (self.num_envs,))
-
-    def _begin(self, ids: Array) -> Array:
-        """Start environments ``ids`` (n,) anew; the same ids."""
-        if len(ids):
-            self._obs = self._obs.copy()
-            self._obs[ids] = self.engine.reset_some(ids)
-            self._age[ids] = 0
-            self.skills.forget(self._memory, ids)
-        self._mask = self.skills.mask(self._obs)
-        return ids
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Run one call in each environment, whichever skills and however long."""
@@ -133,7 +84,6 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         reward, plain, discount = np.zeros(n), np.zeros(n), np.ones(n)
         steps = np.zeros(n, np.int64)
         terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
-        each: list[Array] = []
         rows = np.arange(n)
         turns = 0
         while len(rows):
@@ -142,12 +92,9 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             allowed = allowed_rows(self.engine.mask(), rows)
             action = self.skills.act(self._memory, rows, here, rng, allowed)
             raw = self.engine.step(action, None if len(rows) == n else rows)
-            if self._keeps_rewards:
-                each.append(np.zeros(n, np.float32))
-                each[-1][rows] = raw.reward
             reward[rows] += discount[rows] * raw.reward
             plain[rows] += raw.reward
-            discount[rows] *= self._gamma[rows]
+            discount[rows] *= self._gamma
             steps[rows] += 1
             next_obs[rows] = raw.next_obs
             over = self._observe(rows, here, action, raw, steps[rows])
@@ -163,7 +110,6 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 over = over | ended
             if over.any():
                 rows = rows[~over]
-        self._age = np.where(terminated | truncated, 0, self._age + steps)
         self._obs, self._mask = obs, self.skills.mask(obs)
         info = {
             "steps": steps,
@@ -171,7 +117,6 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             "call_return": plain,
             "next_obs": next_obs,
             "skill": skill,
-            **({"rewards": np.stack(each, 1)} if each else {}),
             **self._masks(next_obs, terminated, truncated),
             **self._final(next_obs, terminated | truncated),
         }

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.hierarchy.calls import SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign import checksum, source_of
 from skillweave.types import Array, Memory, Policy, Step

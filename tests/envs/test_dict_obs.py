@@ -10,7 +10,7 @@ from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.foreign import FromVectorEnv
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.envs.skill_env import SkillEnv
-from skillweave.hierarchy.calls import SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill

@@ -14,7 +14,7 @@ from skillweave.envs.foreign import FromVectorEnv
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.envs.skill_env import SkillEnv
-from skillweave.hierarchy.calls import SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds

@@ -29,7 +29,7 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.envs.foreign import FromVectorEnv
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.envs.skill_env import SkillEnv
-from skillweave.hierarchy.calls import SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill

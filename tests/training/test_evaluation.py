@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Discrete
 import skillweave.training.evaluation as evaluation_module
 from skillweave import PPO, EnvSpec, Evaluation, Skill, SkillweaveError, evaluate
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.hierarchy.calls import SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy

@@ -1,0 +1,284 @@
+"""Learners: what they keep of experience, and when they learn from it.
+
+A loop knows of one interface: ``request`` says what collectors are to do next, ``take`` keeps what
+they found, ``learn`` turns it into new parameters.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.buffers.replay import ReplayStore
+from skillweave.buffers.rollout import RolloutStore
+from skillweave.collecting.acting import Request
+from skillweave.experience import Experience
+from skillweave.seeding import Seeds
+from skillweave.spaces import to_tensor
+from skillweave.types import Array, prefixed, unprefixed
+
+TOGETHER = 8
+"""Gradient steps whose samples are drawn at once."""
+
+
+@dataclass
+class Stack:
+    """Members of one architecture, and the algorithm that they learn by."""
+
+    algorithm: Any
+    state: Any  # of P members
+
+    @property
+    def members(self) -> int:
+        """P."""
+        return len(self.state.params)
+
+
+class Learner(Protocol):
+    """Stacks that learn from what they did."""
+
+    stacks: Sequence[Stack]
+    overlap: bool
+    """It may learn on a thread of its own, while the next experience is collected."""
+    report_every: int
+    """Environment steps between reports; 0: after every update."""
+    threads: int
+
+    def request(self, update: int, steps: int, progress: float) -> Request:
+        """What collectors are to do next."""
+        ...
+
+    def take(self, experience: Experience, update: int, progress: float) -> None:
+        """Keep it, and what must be known of it at once."""
+        ...
+
+    def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
+        """Learn what is due; metrics (P,), none where nothing was."""
+        ...
+
+    def cut(self, columns: Array) -> None:
+        """The environments of ``columns`` (k,) begin anew."""
+        ...
+
+    def kept(self) -> dict[str, Tensor]:
+        """What going on exactly needs beside the states of the stacks, at a clean cut."""
+        ...
+
+    def load(self, kept: dict[str, Tensor]) -> None:
+        """The inverse of ``kept``."""
+        ...
+
+
+class RolloutLearner:
+    """One stack that learns from its latest rollout, then forgets it."""
+
+    report_every = 0
+
+    def __init__(self, stack: Stack, seeds: Seeds) -> None:
+        self.stacks, self._stack, self._seeds = (stack,), stack, seeds
+        config = stack.algorithm.config
+        self.overlap, self.threads = bool(config.overlap), int(config.threads)
+        self._store = RolloutStore(stack.members, device=stack.algorithm.device)
+        self._log_std: Tensor | None = None
+
+    def request(self, update: int, steps: int, progress: float) -> Request:
+        """A rollout of ``n_steps`` environment steps of each environment."""
+        algorithm, state = self._stack.algorithm, self._stack.state
+        params = algorithm.acting_params(state, progress)
+        seeds = self._seeds / "collect" / update
+        self._acted_by = params
+        return Request(algorithm.config.n_steps, (params,), state.gamma.cpu().numpy(), seeds)
+
+    def take(self, experience: Experience, update: int, progress: float) -> None:
+        """Keep a rollout, and the deviations it was collected with."""
+        log_std = self._acted_by.views.get("actor.log_std")
+        self._log_std = None if log_std is None else log_std[:, None]
+        self._store.add(experience)
+
+    def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
+        """An update, where there was something to learn from."""
+        stack = self._stack
+        rollout = self._store.rollout(stack.state.gamma, self._log_std, progress)
+        if rollout is None:
+            return {}
+        seeds = member_seeds(self._seeds, "learn", stack.members, update)
+        generators = [s.torch() for s in seeds]
+        stack.state, report = stack.algorithm.update(stack.state, rollout, generators)
+        metrics: dict[str, Tensor] = report.metrics
+        return metrics
+
+    def cut(self, columns: Array) -> None:
+        """Nothing is kept from one update to the next."""
+
+    def kept(self) -> dict[str, Tensor]:
+        """Nothing."""
+        return {}
+
+    def load(self, kept: dict[str, Tensor]) -> None:
+        """Nothing to do."""
+
+
+class ReplayLearner:
+    """Stacks side by side that learn from one store of what all did, or each from its own rows.
+
+    What shapes the experience (``num_envs``, ``train_freq``, ``n_step``, the store's settings) is
+    that of the first stack. Budgets and ``learning_starts`` count environment steps; the update
+    ratio counts transitions, which a selector has one of for each decision.
+
+    Args:
+        store: made by ``replay_store``.
+        row_steps: environment steps of a row, about; a selector's calls have several.
+        goes_on_at: environment steps of the stage so far.
+    """
+
+    overlap = False
+    report_every = 1_000
+
+    def __init__(
+        self,
+        stacks: Sequence[Stack],
+        store: ReplayStore,
+        seeds: Seeds,
+        *,
+        row_steps: int = 1,
+        goes_on_at: int = 0,
+    ) -> None:
+        self.stacks, self._seeds, self._row_steps = stacks, seeds, row_steps
+        self.store, self.config = store, stacks[0].algorithm.config
+        self.threads = int(self.config.threads)
+        self.members = sum(s.members for s in stacks)
+        self._first = [0, *itertools.accumulate(s.members for s in stacks)]
+        self._random_until = int(self.config.learning_starts) * self.members
+        # A resumed stage whose store was not saved fills it by what it has learnt already.
+        self._learns_from = self._random_until + (0 if len(store) else goes_on_at)
+        self._transitions = np.zeros(2)  # of a member, all so far: when last learnt, and now
+        self._returns: Array | None = None  # (N,), the open episodes' discounted returns
+
+    def request(self, update: int, steps: int, progress: float) -> Request:
+        """``train_freq`` rows of every environment."""
+        params = tuple(s.algorithm.acting_params(s.state, progress) for s in self.stacks)
+        gamma = np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks])
+        rows = int(self.config.train_freq) * self._row_steps
+        at_random = steps < self._random_until
+        return Request(rows, params, gamma, self._seeds / "collect" / update, at_random)
+
+    def take(self, experience: Experience, update: int, progress: float) -> None:
+        """Put rows into the store, and keep the running scales of observations and returns."""
+        self.store.add(experience)
+        valid = experience.valid
+        count = experience.reward.size if valid is None else int(valid.sum())
+        self._transitions[1] += count / self.members
+        for i, stack in enumerate(self.stacks):
+            columns = self._columns(i, experience)
+            rows = to_tensor(np.ascontiguousarray(experience.obs[:, columns]))
+            stack.algorithm.update_obs_stats(
+                stack.state, _flat(rows, stack.members), _flat_valid(valid, columns, stack.members)
+            )
+        if any(s.algorithm.scales_rewards for s in self.stacks):
+            self._scale_returns(experience)
+
+    def _scale_returns(self, experience: Experience) -> None:
+        """Keep the running scale of discounted returns, row by row."""
+        n = experience.reward.shape[1]
+        each = n // self.members
+        if self._returns is None:
+            self._returns = np.zeros(n, np.float32)
+        gamma = np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks]).repeat(each)
+        for at, ended in enumerate(experience.ended):
+            valid = None if experience.valid is None else experience.valid[at]
+            now = self._returns * gamma ** experience.steps[at] + experience.reward[at]
+            self._returns = now if valid is None else np.where(valid, now, self._returns)
+            for i, stack in enumerate(self.stacks):
+                columns = self._columns(i, experience)
+                returns = torch.from_numpy(self._returns[columns]).view(stack.members, -1)
+                seen = None if valid is None else _flat_valid(valid[None], columns, stack.members)
+                stack.algorithm.update_return_stats(stack.state, returns, seen)
+            self._returns[ended if valid is None else ended & valid] = 0.0
+
+    def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
+        """Make the gradient steps that are due; the metrics of the last one, if there were any."""
+        if steps <= self._learns_from:
+            self._transitions[0] = self._transitions[1]
+            return {}
+        found = [self._learn(i, update, progress) for i in range(len(self.stacks))]
+        self._transitions[0] = self._transitions[1]
+        if not all(found):
+            return {}
+        return {k: torch.cat([m[k] for m in found]) for k in found[0]}
+
+    def _learn(self, at: int, update: int, progress: float) -> dict[str, Tensor]:
+        """A stack's gradient steps."""
+        stack, first = self.stacks[at], self._first[at]
+        cfg = stack.algorithm.config
+        before, after = (int(t * cfg.update_ratio) for t in self._transitions)
+        due, metrics = after - before, {}
+        beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)
+        seeds = member_seeds(self._seeds, "learn", stack.members, update, first)
+        rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
+        # Several draws at once cost little more than one, but priorities change in between.
+        together = 1 if cfg.prioritized else TOGETHER
+        for done in range(0, due, together):
+            size = cfg.batch_size * min(together, due - done)
+            drawn = self.store.sample(size, stack.state.gamma, rngs, beta, first)
+            for sample in drawn.split(cfg.batch_size):
+                sample.progress = progress
+                stack.state, report = stack.algorithm.update(stack.state, sample, generators)
+                metrics = report.metrics
+                if cfg.prioritized:
+                    self.store.update_priorities(sample.index, report.error, first)
+        return metrics
+
+    def cut(self, columns: Array) -> None:
+        """The open trajectories of ``columns`` (k,) end here."""
+        self.store.cut(columns)
+        if self._returns is not None:
+            self._returns[columns] = 0.0
+
+    def kept(self) -> dict[str, Tensor]:
+        """The store, if it is to be saved, and what is counted."""
+        found = {"transitions": torch.from_numpy(self._transitions.copy())}
+        if self._returns is not None:
+            found["returns"] = torch.from_numpy(self._returns.copy())
+        return found | (prefixed("store", self.store.state()) if self.config.save_buffer else {})
+
+    def load(self, kept: dict[str, Tensor]) -> None:
+        """Go on from what a checkpoint kept."""
+        self._transitions = kept["transitions"].numpy().copy()
+        if "returns" in kept:
+            self._returns = kept["returns"].numpy().copy()
+        if saved := unprefixed("store", kept):
+            self.store.load(saved)
+            self._learns_from = self._random_until
+
+    def _columns(self, stack: int, experience: Experience) -> slice:
+        """The columns of a stack's members."""
+        each = experience.reward.shape[1] // self.members
+        return slice(self._first[stack] * each, self._first[stack + 1] * each)
+
+
+def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int = 0) -> list[Seeds]:
+    """A node of the seed tree for each member from ``first`` on."""
+    return [seeds / name / (first + member) / update for member in range(members)]
+
+
+def crossed(every: int, before: int, after: int) -> bool:
+    """Whether a multiple of ``every`` lies between ``before`` and ``after``, or is ``after``."""
+    return after // every > before // every
+
+
+def _flat(rows: Tensor, members: int) -> Tensor:
+    """(T, P·B, …) to (P, T·B, …)."""
+    split = rows.unflatten(1, (members, -1)).transpose(0, 1)
+    return split.flatten(1, 2)
+
+
+def _flat_valid(valid: Array | None, columns: slice, members: int) -> Tensor | None:
+    if valid is None:
+        return None
+    return _flat(torch.from_numpy(np.ascontiguousarray(valid[:, columns])), members)
