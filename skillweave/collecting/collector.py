@@ -34,12 +34,14 @@ class Collector:
 
     Args:
         engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
-        acting: the learners.
+        acting: the learners; None where only ``like`` is to act.
     """
 
-    def __init__(self, engine: Engine, acting: Acting) -> None:
-        self.engine, self.acting, self.num_envs = engine, acting, engine.num_envs
-        n, size = self.num_envs, acting.memory_size
+    def __init__(self, engine: Engine, acting: Acting | None) -> None:
+        self.engine, self.num_envs = engine, engine.num_envs
+        n, size = self.num_envs, 0 if acting is None else acting.memory_size
+        if acting is not None:
+            self.acting = acting
         self.obs: Array = np.empty(0)
         """(N, *obs_shape), what to act on next."""
         self.kept: dict[str, Array] = {
@@ -48,6 +50,8 @@ class Collector:
             "memory": np.zeros((n, size), np.float32),  # the learner's
         }
         """What is kept of each environment, (N, …) each; changed in place."""
+        self.open: dict[str, Array] = {}
+        """The same of what has a shape that is known only when it begins."""
         self.begun = False
         self._all = np.arange(n)
         self._ended: list[Array] = []  # what is told of episodes, and in which environments
@@ -106,7 +110,9 @@ class Collector:
     def state(self) -> dict[str, Array]:
         """All that ``restore`` needs, right after ``cut``."""
         kept = {k: v.copy() for k, v in self.kept.items()} | {"obs": checksums(self.obs)}
-        return prefixed("kept", kept) | prefixed("engine", self.engine.state())
+        opened = {k: v.copy() for k, v in self.open.items()}
+        found = prefixed("kept", kept) | prefixed("open", opened)
+        return found | prefixed("engine", self.engine.state())
 
     def restore(self, state: dict[str, Array]) -> Array:
         """Stand where ``state`` says: play the open episodes again.
@@ -128,6 +134,9 @@ class Collector:
             own[:] = found
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs, self.begun = np.array(obs), True
+        self.open = {k: v.copy() for k, v in unprefixed("open", state).items()}
+        if "obs" in self.open:  # files hold it as bytes where it is structured
+            self.open["obs"] = self.open["obs"].view(self.obs.dtype).reshape(self.obs.shape)
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         return self._begin_anew(np.union1d(early, other))
 
@@ -176,14 +185,22 @@ class Collector:
     @property
     def memory(self) -> Array | None:
         """(N, M), what the learners remember; None: nothing."""
-        return self.kept["memory"] if self.acting.memory_size else None
+        return self.kept["memory"] if self.kept["memory"].shape[1] else None
 
 
-def together(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Any:
+_OF_LEARNERS = {"memory", "before"}
+"""What is kept of the learners' memory: others begin without."""
+
+
+def together(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
     """Several collectors of one kind as one, over an engine of all their environments."""
-    found = collectors[0].like(engine, acting)
+    found: Collector = collectors[0].like(engine, acting)
     for name, rows in found.kept.items():
-        rows[:] = np.concatenate([c.kept[name] for c in collectors])
+        if name not in _OF_LEARNERS:
+            rows[:] = np.concatenate([c.kept[name] for c in collectors])
+    for name, example in collectors[0].open.items():
+        parts = [c.open.get(name, np.zeros_like(example)) for c in collectors]
+        found.open[name] = np.concatenate(parts)
     found.obs, found.begun = np.concatenate([c.obs for c in collectors]), True
     return found
 
@@ -194,7 +211,9 @@ def apart(joined: Collector, collectors: Sequence[Collector]) -> None:
     for collector in collectors:
         part = slice(first, first + collector.num_envs)
         for name, rows in collector.kept.items():
-            rows[:] = joined.kept[name][part]
+            if name not in _OF_LEARNERS:
+                rows[:] = joined.kept[name][part]
+        collector.open = {k: v[part].copy() for k, v in joined.open.items()}
         collector.obs, first = joined.obs[part].copy(), part.stop
 
 

@@ -14,7 +14,7 @@ from skillweave.collecting.collector import Collector
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.experience import Experience
-from skillweave.types import Array, Memory, SkillweaveError, Step, prefixed, unprefixed
+from skillweave.types import Array, Memory, SkillweaveError, Step, prefixed
 
 
 class DecisionCollector(Collector):
@@ -32,7 +32,7 @@ class DecisionCollector(Collector):
     """
 
     def __init__(
-        self, engine: Engine, acting: Acting, skills: SkillSet, keep_rewards: bool = False
+        self, engine: Engine, acting: Acting | None, skills: SkillSet, keep_rewards: bool = False
     ) -> None:
         super().__init__(engine, acting)
         n, count = self.num_envs, len(skills.skills)
@@ -52,24 +52,10 @@ class DecisionCollector(Collector):
         self._restricts = any(s.defines("initiation") for s in skills.skills)
         if self._restricts:
             self.kept["allowed"] = np.ones((n, count), bool)  # when it decided
-        self.open: dict[str, Array] = {}
-        """Of the open calls, what has a shape that is known only when they begin."""
 
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:
         """The same over other environments."""
         return DecisionCollector(engine, acting, self.skills, self.keep_rewards)
-
-    def state(self) -> dict[str, Array]:
-        """All that ``restore`` needs, right after ``cut``."""
-        return super().state() | prefixed("open", {k: v.copy() for k, v in self.open.items()})
-
-    def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says; the environments that begin anew."""
-        begun = super().restore(state)
-        self.open = {k: v.copy() for k, v in unprefixed("open", state).items()}
-        if "obs" in self.open:  # as bytes where it is structured
-            self.open["obs"] = self.open["obs"].view(self.obs.dtype).reshape(self.obs.shape)
-        return begun
 
     def _forget(self, ids: Array) -> None:
         super()._forget(ids)

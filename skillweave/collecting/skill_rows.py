@@ -47,7 +47,7 @@ class SkillCollector(Collector):
     def __init__(
         self,
         engine: Engine,
-        acting: Acting,
+        acting: Acting | None,
         skill: Skill | None = None,
         reflexes: tuple[Reflex, ...] = (),
     ) -> None:

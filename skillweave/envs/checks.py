@@ -147,10 +147,13 @@ class Watch:
         name: what messages call the environment.
         space: of one observation.
         num_envs: N.
+        first: the number of the first environment, for messages.
     """
 
-    def __init__(self, name: str, space: gym.Space[Any], num_envs: int) -> None:
-        self._name, self._num_envs = name, num_envs
+    def __init__(
+        self, name: str, space: gym.Space[Any], num_envs: int, first: int = 0
+    ) -> None:
+        self._name, self._num_envs, self._first = name, num_envs, first
         self._places = tuple(_real(obs_dtype(space)))
         self._elapsed = np.zeros(num_envs, np.int64)
 
@@ -206,7 +209,7 @@ class Watch:
         number = row if ids is None else int(ids[row])
         step = int(self._elapsed[number])
         return SkillweaveError(
-            f"{self._name}: environment {number}, step {step} of its episode: {what}"
+            f"{self._name}: environment {number + self._first}, step {step} of its episode: {what}"
         )
 
 

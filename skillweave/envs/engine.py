@@ -24,7 +24,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from skillweave.envs.checks import Watch
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks, info_rows
-from skillweave.envs.workers import WorkerVector
 from skillweave.spaces import pack
 from skillweave.types import Array, SkillweaveError
 
@@ -118,20 +117,23 @@ class Pausable(gym.Wrapper[Any, Any, Any, Any]):
 
 
 class GymnasiumEngine:
-    """Gymnasium environments, in this process or in processes of their own.
+    """Gymnasium environments, one after another in this process.
 
     Every episode begins from a seed of its own, so that it can be played again.
+
+    Args:
+        first: the number of the first environment, for messages.
     """
 
-    def __init__(self, make: Any, num_envs: int, name: str, processes: bool = False) -> None:
-        makers = [functools.partial(_pausable, make, i) for i in range(num_envs)]
-        self._vector: Any = WorkerVector(makers, name) if processes else _vector_here(makers, name)
+    def __init__(self, make: Any, num_envs: int, name: str, first: int = 0) -> None:
+        makers = [functools.partial(_pausable, make, first + i) for i in range(num_envs)]
+        self._vector: Any = _vector_here(makers, name)
         self.num_envs, self.steps_made = num_envs, 0
         self.observation_space: gym.Space[Any] = self._vector.single_observation_space
         go_and_action: Any = self._vector.single_action_space
         self.action_space: gym.Space[Any] = go_and_action[1]
         self._masks = ActionMasks(self.action_space, num_envs)
-        self._watch = Watch(name, self.observation_space, num_envs)
+        self._watch = Watch(name, self.observation_space, num_envs, first)
         # A full-size action, overwritten row by row: paused rows keep whatever stands there.
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._actions: Array = np.asarray(empty)

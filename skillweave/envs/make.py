@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -13,12 +14,16 @@ import gymnasium as gym
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.messages import short, shortened, told
+from skillweave.messages import short, shortened, told, whole_number
 from skillweave.types import MissingExtra, SkillweaveError
 
 MOST = 65_536
 """Environments in one engine."""
-EngineName = Literal["auto", "envpool", "sync", "async"]
+SLOW = 50e-6
+"""Seconds of a step above which environments are stepped in several processes."""
+PIECES, STEPS = 5, 50
+"""Steps that are timed to find out."""
+EngineName = Literal["auto", "envpool", "sync"]
 
 
 @dataclass(frozen=True)
@@ -29,14 +34,18 @@ class EnvSpec:
         env: a Gymnasium id, or a function that makes one environment.
         kwargs: passed to ``gymnasium.make``.
         wrappers: applied to each environment, first one first.
-        engine: envpool; sync (one process); async (a process each, for slow environments);
-            auto takes EnvPool where it has the environment as Gymnasium defines it, else sync.
+        engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
+            environment as Gymnasium defines it, else sync.
+        workers: processes in which sync environments are stepped, and acted in, while they are
+            trained in. None: measured when a run begins, one for each core if a step takes long
+            enough to be worth it; the run keeps the choice, as results depend on it.
     """
 
     env: str | Callable[[], gym.Env[Any, Any]]
     kwargs: dict[str, Any] = field(default_factory=dict)
     wrappers: tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...] = ()
     engine: EngineName = "auto"
+    workers: int | None = None
 
     def __post_init__(self) -> None:
         made = isinstance(self.env, gym.Env)
@@ -55,6 +64,8 @@ class EnvSpec:
                 f"{self.name}: wrappers is {short(wrappers)}; it must be a tuple of functions that "
                 "take an environment and return one"
             )
+        if self.workers is not None:
+            whole_number(self.workers, f"{self.name}: workers", 1)
         if self.engine not in get_args(EngineName):
             known = ", ".join(get_args(EngineName))
             raise SkillweaveError(
@@ -118,19 +129,24 @@ class EnvSpec:
         return isinstance(self.env, str) and ":" not in self.env and not self.wrappers
 
 
-def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None) -> Engine:
-    """The engine for ``num_envs`` environments of this kind; ``threads`` for EnvPool's pool."""
+def make_engine(
+    spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0
+) -> Engine:
+    """The engine for ``num_envs`` environments of this kind.
+
+    Args:
+        threads: of EnvPool's pool; None: one for each core.
+        first: the number of the first environment, for messages.
+    """
     if num_envs > MOST:
         raise SkillweaveError(
             f"{num_envs:,} environments of {spec.name}: at most {MOST:,} are made"
         )
-    cores = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0, 1])
     if spec.engine in ("auto", "envpool"):
         reference = spec.make()
         try:
-            plain = isinstance(spec.env, str) and not spec.kwargs and not spec.wrappers
-            if plain and EnvPoolEngine.supports(str(spec.env), reference):
-                return EnvPoolEngine(str(spec.env), num_envs, cores, reference)
+            if _in_envpool(spec, reference):
+                return EnvPoolEngine(str(spec.env), num_envs, threads or cores(), reference)
         finally:
             reference.close()
         if spec.engine == "envpool":
@@ -138,4 +154,49 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None) -> Eng
                 f"EnvPool cannot run {spec.name}: it is not installed (extra 'envpool'), or "
                 "lacks the environment with these spaces, settings and wrappers; use engine='auto'"
             )
-    return GymnasiumEngine(spec.make, num_envs, spec.name, spec.engine == "async")
+    return GymnasiumEngine(spec.make, num_envs, spec.name, first)
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def workers_for(spec: EnvSpec) -> int:
+    """How many processes are to step the environments: as the spec says, else by measuring.
+
+    A step of one environment is timed, some hundred times. If it is slow, there is one for each
+    core, else all stay in this process.
+    """
+    if spec.workers is not None:
+        return spec.workers
+    if cores() < 2:
+        return 1
+    env = spec.make()
+    try:
+        if spec.engine != "sync" and _in_envpool(spec, env):
+            return 1
+        return cores() if _step_seconds(env) > SLOW else 1
+    finally:
+        env.close()
+
+
+def _in_envpool(spec: EnvSpec, reference: gym.Env[Any, Any]) -> bool:
+    plain = isinstance(spec.env, str) and not spec.kwargs and not spec.wrappers
+    return plain and EnvPoolEngine.supports(str(spec.env), reference)
+
+
+def _step_seconds(env: gym.Env[Any, Any]) -> float:
+    """Seconds of a step with random actions: the least of several means, so load does not count."""
+    env.action_space.seed(0)
+    means = []
+    env.reset(seed=0)
+    for _ in range(PIECES):
+        actions = [env.action_space.sample() for _ in range(STEPS)]
+        began = time.perf_counter()
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        means.append((time.perf_counter() - began) / STEPS)
+    return min(means)

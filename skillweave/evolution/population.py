@@ -5,31 +5,33 @@ Between generations a member is a thing of its own; see ``stacks`` for how they 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.buffers.replay import ReplayBuffer
-from skillweave.envs.joined import JoinedEnvs
+from skillweave.buffers.replay import ReplayStore, replay_store
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.collector import Collector, apart, together
+from skillweave.collecting.group import Collectors
+from skillweave.envs.joined import JoinedEngines
 from skillweave.evolution.config import Evolution
 from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.selection import select
 from skillweave.evolution.stacks import Member, Origin, copy, grouped, join, split
-from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
-from skillweave.training.episodes import Tick
-from skillweave.training.members import Stack
-from skillweave.training.off_policy import make_buffer, train_stacks
-from skillweave.training.on_policy import train_on_policy
-from skillweave.training.probe import MakeEnv, episode_returns
-from skillweave.types import Array, Policy, VecEnv
+from skillweave.spaces import to_tensor
+from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.learner import ReplayLearner, RolloutLearner, Stack
+from skillweave.training.loop import Progress, train
+from skillweave.training.playing import MakeCollector, returns_of
+from skillweave.types import Array, prefixed, unprefixed
 
 NEVER = 2**62
 """Steps between cuts: a generation is one piece."""
@@ -41,25 +43,33 @@ class Population:
     """Members, what they learn in, and how they evolve.
 
     Members of one stack stand side by side in ``members``.
+
+    Args:
+        make: makes the collector of a place, given its number of environments.
+        row_steps: environment steps of a row of experience, about.
     """
 
     def __init__(
         self,
         members: list[Member],
         evolution: Evolution,
-        make_env: MakeEnv,
+        make: MakeCollector,
         spaces: Any,
         seeds: Seeds,
+        row_steps: int = 1,
     ) -> None:
         self.members, self.evolution, self.seeds = members, evolution, seeds
-        self.spaces = spaces
+        self.spaces, self.row_steps = spaces, row_steps
         self.next_number = len(members)
-        each, gamma = members[0].config.num_envs, members[0].config.gamma
-        self.collector = Collector(JoinedEnvs([make_env(each, gamma) for _ in members]))
-        """What they act in, place by place: an heir goes on with its place's open episodes."""
+        each = members[0].config.num_envs
+        self.replays = members[0].algorithm(spaces).store == "replay"
+        self.places = [make(each, None, i * each, self.replays) for i in range(len(members))]
+        """Where they act: an heir goes on with its place's open episodes."""
+        self.episodes = Episodes()
         self.rounds = 0
-        """Of the off-policy loop, in which all members go side by side."""
-        self.buffer: ReplayBuffer | None = None
+        """Of the loop in which all members learn from one store."""
+        self.store: ReplayStore | None = None
+        self._kept: dict[str, Tensor] = {}  # what its learner counts
         self._made: dict[AlgorithmConfig, Algorithm] = {}
 
     @classmethod
@@ -67,9 +77,10 @@ class Population:
         cls,
         config: AlgorithmConfig,
         evolution: Evolution,
-        make_env: MakeEnv,
+        make: MakeCollector,
         spaces: Any,
         seeds: Seeds,
+        row_steps: int = 1,
     ) -> Population:
         """The first generation, each member with weights of its own."""
         members = []
@@ -81,7 +92,7 @@ class Population:
             member.state = member.algorithm(spaces).init([seeds / "member" / i])
             members.append(member)
         ordered = [m for group in grouped(members, spaces) for m in group]
-        return cls(ordered, evolution, make_env, spaces, seeds)
+        return cls(ordered, evolution, make, spaces, seeds, row_steps)
 
     @property
     def steps(self) -> int:
@@ -91,96 +102,124 @@ class Population:
         """
         return sum(m.steps for m in self.members)
 
-    def train(self, until: int, horizon: int, seeds: Seeds, on_tick: OnTick) -> None:
-        """Train every member until it has ``until`` steps; schedules end at ``horizon``."""
+    def train(self, until: int, schedule_steps: int, seeds: Seeds, on_tick: OnTick) -> None:
+        """Train every member until it has ``until`` steps."""
+        for i, place in enumerate(self.places):
+            place.start(self.seeds / "start" / i)
         groups = grouped(self.members, self.spaces)
-        gamma = np.array([m.config.gamma for m in self.members])
-        self.collector.env.set_gamma(gamma.repeat(self.members[0].config.num_envs))
-        if isinstance(self.members[0].config, PPO):
-            self._train_one_by_one(groups, until, horizon, seeds, on_tick)
+        if self.replays:
+            self._train_side_by_side(groups, until, schedule_steps, seeds, on_tick)
         else:
-            self._train_side_by_side(groups, until, horizon, seeds, on_tick)
+            self._train_one_by_one(groups, until, schedule_steps, seeds, on_tick)
 
     def _train_one_by_one(
         self,
         groups: list[list[Member]],
         until: int,
-        horizon: int,
+        schedule_steps: int,
         seeds: Seeds,
         on_tick: OnTick,
     ) -> None:
-        """On-policy: a stack's rollouts are its own, so stacks learn one after another.
+        """A stack's rollouts are its own, so stacks learn one after another.
 
         A recurrent member begins a generation without memory: another network made what there was.
         """
-        first = 0
-        self.collector.start(self.seeds / "start")
-        spent = self.collector.spent()  # in search of a start; what follows, its parts count
-        _count(self.members, spent)
+        first = spent = 0
         for i, group in enumerate(groups):
-            algorithm: Any
-            algorithm, state = join(group, self.spaces, self._made)
+            stack = Stack(*join(group, self.spaces, self._made))
             start, count = sum(m.steps for m in group), len(group)
             clock = _Clock(spent, start, on_tick)
-            train_on_policy(
-                algorithm, self.collector.part(first, first + count), state, seeds / i,
-                until * count, steps=start, horizon=horizon * count, tolerant=True,
-                cut_every=NEVER, on_tick=clock,
+            places = self.places[first : first + count]
+            joined = self._together(places, [stack])
+            train(
+                RolloutLearner(stack, seeds / i), Collectors([joined], count), self.episodes,
+                seeds / i, until * count, resume_from=Progress(steps=start), cut_every=NEVER,
+                schedule_steps=schedule_steps * count, skip_diverged=True, on_tick=clock,
             )  # fmt: skip
-            split(algorithm, state, group, self.spaces)
+            apart(joined, places)
+            split(stack.algorithm, stack.state, group, self.spaces)
             spent, first = spent + clock.taken, first + count
             _count(group, clock.taken)
-        self.collector.spent()
 
     def _train_side_by_side(
         self,
         groups: list[list[Member]],
         until: int,
-        horizon: int,
+        schedule_steps: int,
         seeds: Seeds,
         on_tick: OnTick,
     ) -> None:
-        """Off-policy: all stacks act in one environment and learn from one buffer."""
+        """All stacks act at once and learn from one store."""
         stacks = [Stack(*join(group, self.spaces, self._made)) for group in groups]
         start, count = self.steps, len(self.members)
         clock = _Clock(0, start, on_tick)
-        self.collector.start(self.seeds / "start")
-        self.buffer = self.buffer or self._make_buffer()
-        train_stacks(
-            stacks, self.collector, seeds, until * count, self.buffer, steps=start,
-            update=self.rounds, horizon=horizon * count, tolerant=True, cut_every=NEVER,
-            on_tick=clock,
+        self.store = self.store or self._make_store()
+        learner = ReplayLearner(
+            stacks, self.store, seeds, row_steps=self.row_steps, goes_on_at=start
+        )
+        if self._kept:
+            learner.load(self._kept)
+        joined = self._together(self.places, stacks)
+        train(
+            learner, Collectors([joined], count), self.episodes, seeds, until * count,
+            resume_from=Progress(self.rounds, start), schedule_steps=schedule_steps * count,
+            skip_diverged=True, cut_every=NEVER, on_tick=clock,
         )  # fmt: skip
+        apart(joined, self.places)
         for stack, group in zip(stacks, groups, strict=True):
             split(stack.algorithm, stack.state, group, self.spaces)
+        self._kept = {k: v for k, v in learner.kept().items() if not k.startswith("store.")}
         self.rounds = clock.update
         _count(self.members, clock.taken)
 
-    def _make_buffer(self) -> ReplayBuffer:
-        algorithm: Any = self.members[0].algorithm(self.spaces)
-        return make_buffer(algorithm, self.collector.env, len(self.members), shared=True)
+    def _together(self, places: Sequence[Collector], stacks: Sequence[Stack]) -> Collector:
+        """The places as one collector, in which the stacks act."""
+        engine: Any = JoinedEngines([place.engine for place in places])
+        acting = Acting([(s.algorithm, s.members) for s in stacks], engine.num_envs)
+        return together(places, engine, acting)
 
-    def load_buffer(self, saved: dict[str, torch.Tensor]) -> None:
-        """Go on with the replay buffer of a checkpoint."""
-        self.buffer = self._make_buffer()
-        self.buffer.load(saved)
-        self.buffer.cut(self.collector.begun_anew)
+    def _make_store(self) -> ReplayStore:
+        algorithm = self.members[0].algorithm(self.spaces)
+        count = len(self.members)
+        return replay_store(algorithm, count * self.places[0].num_envs, count, shared=True)
 
-    def cut(self, seeds: Seeds) -> dict[str, torch.Tensor]:
+    def cut(self, seeds: Seeds) -> dict[str, Tensor]:
         """Make a clean cut; what resuming from it needs of the environments."""
-        begun_anew = self.collector.cut(seeds)
-        if self.buffer is not None:
-            self.buffer.cut(begun_anew)
-        return self.collector.state()
+        self._begun_anew([place.cut(seeds / i) for i, place in enumerate(self.places)])
+        found = prefixed("episodes", self.episodes.state())
+        for i, place in enumerate(self.places):
+            found |= prefixed(str(i), place.state())
+        return {k: to_tensor(np.array(v)) for k, v in found.items()} | prefixed("kept", self._kept)
+
+    def resume(self, saved: dict[str, Tensor], store: dict[str, Tensor]) -> Array:
+        """Stand where a cut was; (k,) environments that begin anew."""
+        self._kept = unprefixed("kept", saved)
+        arrays = {k: v.numpy() for k, v in saved.items()}
+        self.episodes.load(unprefixed("episodes", arrays))
+        if store:
+            self.store = self._make_store()
+            self.store.load(store)
+        return self._begun_anew([
+            place.restore(unprefixed(str(i), arrays)) for i, place in enumerate(self.places)
+        ])  # fmt: skip
+
+    def _begun_anew(self, ids: Sequence[Array]) -> Array:
+        """Environments of each place, as columns; their open trajectories end here."""
+        columns = np.concatenate([own + i * self.places[0].num_envs for i, own in enumerate(ids)])
+        if self.store is not None:
+            self.store.cut(columns)
+        return columns
 
     def close(self) -> None:
         """Release the environments."""
-        self.collector.env.close()
+        for place in self.places:
+            place.close()
 
-    def fitness(self, env: VecEnv, seeds: Seeds) -> Array:
+    def fitness(self, arena: Collector, seeds: Seeds) -> Array:
         """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
         return np.array([
-            -np.inf if has_diverged(m) else score(self.policy(m), env, seeds) for m in self.members
+            -np.inf if has_diverged(m) else score(self.policy(m), arena, seeds)
+            for m in self.members
         ])  # fmt: skip
 
     def policy(self, member: Member) -> AgentPolicy:
@@ -205,8 +244,8 @@ class Population:
             places[child.number] = heir.parent
             members.append(child)
         self.members = [m for group in grouped(members, self.spaces) for m in group]
-        if self.buffer is not None:
-            self.buffer.inherit(np.array([places[m.number] for m in self.members]))
+        if self.store is not None:
+            self.store.inherit(np.array([places[m.number] for m in self.members]))
 
 
 class _Clock:
@@ -227,10 +266,9 @@ def _count(members: list[Member], steps: int) -> None:
         member.steps += (steps + i) // len(members)
 
 
-def score(policy: Policy, env: VecEnv, seeds: Seeds) -> float:
+def score(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> float:
     """Mean return of an episode in each environment; −inf if it is not finite."""
-    with torch_threads(1):  # several wait for each other, for ever on a busy machine
-        returns = episode_returns(policy, env, seeds)
+    returns = returns_of(policy, arena, seeds)
     return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
 
 

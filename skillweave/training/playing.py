@@ -1,0 +1,47 @@
+"""Episodes of a learner in the environments that it learns in, to see how good it is."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.collector import RETURN, Collector
+from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.ops.threads import torch_threads
+from skillweave.seeding import Seeds
+from skillweave.types import Array
+
+
+class MakeCollector(Protocol):
+    """Makes the collector that a stage learns through."""
+
+    def __call__(
+        self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
+    ) -> Collector:
+        """A collector of ``num_envs`` environments.
+
+        Args:
+            acting: the learners; None where they come later.
+            first: the number of the first environment, for messages.
+            shared: several learn from what each does, with a γ of their own.
+        """
+        ...
+
+
+def returns_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
+    """Returns (N,) of one episode in each of the arena's environments, acting greedily."""
+    return episodes_of(policy, arena, seeds)[:, RETURN]
+
+
+def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
+    """What one episode in each environment came to, (N, 4), as ``Collected.episodes``."""
+    algorithm = policy.algorithm
+    player = arena.like(arena.engine, Acting([(algorithm, 1)], arena.num_envs))
+    params = algorithm.acting_params_of(policy.weights)
+    gamma = np.array([algorithm.config.gamma])
+    request = Request(0, (params,), gamma, seeds / "act", greedy=True)
+    with torch_threads(1):  # several wait for each other, for ever on a busy machine
+        return player.play(request, seeds, LONGEST_EPISODE)

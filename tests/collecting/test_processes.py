@@ -1,0 +1,249 @@
+"""Collectors in processes find what collectors in this thread find, whatever happens to them."""
+
+import itertools
+import os
+import signal
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from reference_calls import Counter, Left, Right, Zigzag
+from toy_acting import Again, Choices, Mortal, requests
+
+from skillweave.collecting import processes
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.group import Collectors, make_collectors
+from skillweave.collecting.processes import ProcessCollectors
+from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.seeding import Seeds
+from skillweave.types import SkillweaveError
+
+NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
+
+
+def skills():
+    kinds = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
+    return SkillSet(kinds, tuple(s.policy for s in kinds), call_steps=5)
+
+
+def deciding(env=Again):
+    def make(num_envs, first):
+        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
+        return DecisionCollector(engine, Choices(num_envs, 4), skills())
+
+    return make
+
+
+def stepping(env=Again):
+    def make(num_envs, first):
+        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
+        return SkillCollector(engine, Choices(num_envs, 3))
+
+    return make
+
+
+def here(make):
+    return Collectors([make(3, 0), make(3, 3)])
+
+
+@pytest.fixture
+def in_processes():
+    made = []
+
+    def of(make, each=3, count=2):
+        made.append(ProcessCollectors(make, each, count, 1, "Walk"))
+        return made[-1]
+
+    yield of
+    for collectors in made:
+        collectors.close()
+
+
+def equal(one, two):
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(one.experience, name), getattr(two.experience, name))
+    assert one.experience.spent == two.experience.spent
+    np.testing.assert_array_equal(one.episodes, two.episodes)
+
+
+@pytest.mark.parametrize("kind", [deciding, stepping])
+@pytest.mark.parametrize("rows", [1, 20])
+def test_the_same_experience_here_and_in_processes(in_processes, kind, rows):
+    plain, apart = here(kind()), in_processes(kind())
+    for collectors in (plain, apart):
+        collectors.start(Seeds(3))
+    for request in itertools.islice(requests(rows), 40):  # with snapshots in between
+        equal(plain.collect(request), apart.collect(request))
+    assert plain.steps_made == apart.steps_made
+
+
+@pytest.mark.parametrize("kind", [deciding, stepping])
+def test_killed_workers_are_made_again_and_find_the_same(in_processes, kind):
+    plain, apart = here(kind()), in_processes(kind())
+    for collectors in (plain, apart):
+        collectors.start(Seeds(3))
+    rng = np.random.default_rng(0)
+    for at, request in enumerate(itertools.islice(requests(15), 60)):
+        if rng.random() < 0.25:
+            victim = apart._workers[int(rng.integers(2))].process
+            os.kill(victim.pid, signal.SIGKILL)
+            if rng.random() < 0.5:
+                victim.join()
+        equal(plain.collect(request), apart.collect(request))
+        if at % 13 == 12:
+            seeds = Seeds(5) / at
+            np.testing.assert_array_equal(plain.cut(seeds), apart.cut(seeds))
+
+
+def test_one_that_dies_in_the_middle_of_a_step_is_made_again(in_processes, tmp_path):
+    fuse = tmp_path / "fuse"
+    kind = type("Fused", (Mortal,), {"fuse": fuse})
+    plain, apart = here(stepping()), in_processes(stepping(kind))
+    for collectors in (plain, apart):
+        collectors.start(Seeds(3))
+    for at, request in enumerate(itertools.islice(requests(15), 6)):
+        if at == 3:
+            fuse.touch()
+        one, two = plain.collect(request), apart.collect(request)
+        equal(one, two)
+    assert not fuse.exists(), "it did not die"
+
+
+def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):
+    plain, apart = here(deciding()), in_processes(deciding())
+    apart.start(Seeds(3))
+    asked = requests(9)
+    for request in itertools.islice(asked, 5):
+        apart.collect(request)
+    apart.cut(Seeds(1))
+    state = apart.state()
+    assert not len(plain.restore({k: np.array(v) for k, v in state.items()}))
+    again = in_processes(deciding())
+    again.restore(state)
+    for request in itertools.islice(asked, 5):
+        found = apart.collect(request)
+        equal(plain.collect(request), found)
+        equal(again.collect(request), found)
+
+
+def test_a_state_of_another_number_of_collectors_is_refused(in_processes):
+    apart = in_processes(deciding())
+    apart.start(Seeds(0))
+    apart.cut(Seeds(1))
+    with pytest.raises(SkillweaveError, match="of 2 collectors, but there are 1"):
+        Collectors([deciding()(6, 0)]).restore(apart.state())
+
+
+class Always(Mortal):
+    """Kills its process in each third step of an episode."""
+
+    def step(self, action):
+        if self.t == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+
+def test_one_that_dies_again_at_the_same_place_is_told(in_processes):
+    collectors = in_processes(stepping(Always))
+    collectors.start(Seeds(0))
+    with pytest.raises(SkillweaveError, match=r"worker 0 \(environments 0 to 2\) died by signal 9"):
+        collectors.collect(next(requests(5)))
+
+
+class Unpicklable(Exception):
+    def __reduce__(self):
+        raise TypeError("cannot be pickled")
+
+
+class Failing(Again):
+    def step(self, action):
+        if self.t == 2:
+            raise Unpicklable("the arm is stuck")
+        return super().step(action)
+
+
+def test_an_error_names_environment_step_and_worker(in_processes):
+    collectors = in_processes(stepping(Failing))
+    collectors.start(Seeds(0))
+    match = r"environment [0-5], step 3.*the arm is stuck.*worker [01]"
+    with pytest.raises(SkillweaveError, match=match):
+        collectors.collect(next(requests(5)))
+
+
+class Stuck(Again):
+    def step(self, action):
+        time.sleep(60)
+
+
+def test_closing_ends_workers_that_are_stuck(in_processes):
+    collectors = in_processes(stepping(Stuck))
+    collectors.start(Seeds(0))
+    collectors._workers[0].pipe.send(("collect", next(requests(5)).of_collector(0)))
+    workers = [w.process for w in collectors._workers]
+    collectors.close()
+    assert not any(w.is_alive() for w in workers)
+
+
+def test_an_environment_that_cannot_be_made_is_told():
+    def broken(num_envs, first):
+        raise SkillweaveError("no such maze")
+
+    with pytest.raises(SkillweaveError, match="no such maze"):
+        ProcessCollectors(broken, 2, 2, 1, "Maze")
+
+
+def test_environments_that_cannot_be_shared_out_equally_are_refused():
+    with pytest.raises(SkillweaveError, match="must be a multiple of workers, 3"):
+        make_collectors(stepping(), 8, 3, 1, "Walk")
+
+
+def test_one_worker_is_this_thread():
+    assert type(make_collectors(stepping(), 4, 1, 1, "Walk")) is Collectors
+
+
+class Wide(gym.Env):
+    """Its observations are large: they grow out of the first block of shared memory."""
+
+    observation_space = gym.spaces.Box(0, 255, (50, 50, 3), np.uint8)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self._look(), {}
+
+    def _look(self):
+        return np.full((50, 50, 3), self.t, np.uint8)
+
+    def step(self, action):
+        self.t += 1
+        return self._look(), 1.0, self.t >= 9, False, {}
+
+
+def test_large_columns_come_whole_though_the_memory_must_grow(in_processes):
+    def make(num_envs, first):
+        engine = make_engine(EnvSpec(Wide, engine="sync"), num_envs, first=first)
+        return SkillCollector(engine, Choices(num_envs, 2))
+
+    plain, apart = here(make), in_processes(make)
+    for collectors in (plain, apart):
+        collectors.start(Seeds(0))
+    for rows in (2, 40, 3):
+        request = next(requests(rows))
+        equal(plain.collect(request), apart.collect(request))
+
+
+def test_no_shared_memory_is_left_behind(in_processes):
+    assert processes.SharedMemory
+    before = set(os.listdir("/dev/shm")) if os.path.isdir("/dev/shm") else set()
+    collectors = in_processes(stepping())
+    collectors.start(Seeds(0))
+    collectors.collect(next(requests(30)))
+    os.kill(collectors._workers[1].process.pid, signal.SIGKILL)
+    collectors.collect(next(requests(30)))
+    collectors.close()
+    after = set(os.listdir("/dev/shm")) if os.path.isdir("/dev/shm") else set()
+    assert {n for n in after - before if n.startswith("psm_")} == set()
