@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Family
+from skillweave.algorithms.base import ActingParams, ParameterGroup
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, normal, weighted_mean
 from skillweave.networks.encoders import Inputs
@@ -103,11 +103,11 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             **self.fresh(len(seeds)),
         )
 
-    def families(self) -> list[Family]:
+    def groups(self) -> list[ParameterGroup]:
         """Everything in the state that has the shape of networks."""
-        return [Family(self.layout, (("network", self.net),), ("params", "target"))]
+        return [ParameterGroup(self.layout, (("network", self.net),), ("params", "target"))]
 
-    def actor(self, state: State, progress: float = 1.0) -> Actor:
+    def actor(self, state: State, progress: float = 1.0) -> ActingParams:
         """A copy of what acting needs, with ε."""
         cfg, actor = self.config, super().actor(state, progress)
         spent = min(1.0, progress / max(cfg.exploration_fraction, 1e-9))
@@ -129,7 +129,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
 
     def act(
         self,
-        actor: Actor,
+        actor: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: tuple[Tensor, Tensor | None] | None,
@@ -172,7 +172,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         self, views: Views, state: State, sample: Sample, noises: Sequence[Tensor | None]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Loss (P,), error of each sample (P, B) and mean value (P,), the latter two detached."""
-        actor = Actor({}, *self.scaling(state))
+        actor = ActingParams({}, *self.scaling(state))
         out = self.net(self._noisy(views, noises[0]), self.inputs(actor, sample.obs))
         out = _taken(out, sample.action)
         next_inputs = self.inputs(actor, sample.next_obs)

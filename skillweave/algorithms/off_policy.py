@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm, Family
+from skillweave.algorithms.base import Algorithm, ParameterGroup
 from skillweave.algorithms.compiled import compiled
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Inputs
@@ -152,10 +152,10 @@ class Critics:
         out = self.net(views, {k: each(v) for k, v in inputs.items()}, extra)
         return out.view(members, count, *out.shape[1:])
 
-    def family(self) -> Family:
+    def family(self) -> ParameterGroup:
         """The fields of a state that hold critics."""
         weights, moments = ("critic", "critic_target"), ("critic_mu", "critic_nu")
-        return Family(self.layout, (("critic", self.net),), weights, moments, "critic_count")
+        return ParameterGroup(self.layout, (("critic", self.net),), weights, moments, "critic_count")
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """Windows into (P, K, D), each (P·K, *shape)."""

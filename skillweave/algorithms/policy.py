@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm, Family
+from skillweave.algorithms.base import Algorithm, ParameterGroup
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -52,7 +52,7 @@ class AgentPolicy(Memoryless):
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
         self.algorithm, self.weights = algorithm, weights
-        self._actor = algorithm.actor_of(weights)
+        self._actor = algorithm.acting_params_of(weights)
         self.observation_space = algorithm.observation_space
         self.action_space = algorithm.action_space
 
@@ -172,7 +172,7 @@ def checked_tensor(
 
 
 def state_from(
-    tensors: Mapping[str, Tensor], like: S, where: str, families: Sequence[Family] = ()
+    tensors: Mapping[str, Tensor], like: S, where: str, groups: Sequence[ParameterGroup] = ()
 ) -> S:
     """The state that ``tensors`` hold by field, if it is of the shapes and types of ``like``.
 
@@ -180,7 +180,7 @@ def state_from(
         SkillweaveError: it is not; the tensor is named.
     """
     shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
-    for family in families:  # after growth each parameter has an age of its own
+    for family in groups:  # after growth each parameter has an age of its own
         if tensors.get(family.count, torch.empty(0)).ndim > 1:
             shapes[family.count] = shapes[family.weights[0]]
     found = {

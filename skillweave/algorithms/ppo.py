@@ -14,7 +14,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Algorithm, Family
+from skillweave.algorithms.base import ActingParams, Algorithm, ParameterGroup
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.minibatches import minibatches
 from skillweave.networks.encoders import Inputs
@@ -111,14 +111,14 @@ class PPOAlgorithm(Algorithm):
             **self.fresh(members),
         )
 
-    def families(self) -> list[Family]:
+    def groups(self) -> list[ParameterGroup]:
         """Everything in the state that has the shape of networks."""
         nets = ("network", self.actor_net), ("critic", self.critic_net)
-        return [Family(self.layout, nets)]
+        return [ParameterGroup(self.layout, nets)]
 
     def act(
         self,
-        actor: Actor,
+        actor: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: Tensor | None,
@@ -262,7 +262,7 @@ class PPOAlgorithm(Algorithm):
         return data, metrics
 
     def _values(
-        self, views: Views, state: State, actor: Actor, data: Mapping[str, Tensor], tr: Transition
+        self, views: Views, state: State, actor: ActingParams, data: Mapping[str, Tensor], tr: Transition
     ) -> tuple[Tensor, Tensor]:
         """V(obs) and V(next_obs), (P, T, B): the latter are the former, shifted, except at ends."""
         lead, after = tr.reward.shape, None

@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Family
+from skillweave.algorithms.base import ActingParams, ParameterGroup
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.config_off_policy import check
 from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
@@ -115,13 +115,13 @@ class SACAlgorithm(OffPolicyAlgorithm):
             **self.fresh(members),
         )
 
-    def families(self) -> list[Family]:
+    def groups(self) -> list[ParameterGroup]:
         """Everything in the state that has the shape of networks."""
-        return [Family(self.layout, (("network", self.net),)), self.critics.family()]
+        return [ParameterGroup(self.layout, (("network", self.net),)), self.critics.family()]
 
     def act(
         self,
-        actor: Actor,
+        actor: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: Tensor | None,
@@ -148,7 +148,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step of critics, actor and temperature, in place."""
-        actor = Actor({}, *self.scaling(state))
+        actor = ActingParams({}, *self.scaling(state))
         eps, learnt = self.config.adam_eps, self.config.learn_ent_coef
         alpha = state.log_alpha.exp() if learnt else state.ent_coef[:, None]
         inputs = self.inputs(actor, sample.obs)
@@ -184,7 +184,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         views: Views,
         state: State,
         sample: Sample,
-        actor: Actor,
+        actor: ActingParams,
         inputs: Inputs,
         alpha: Tensor,
         noise: list[Tensor],
@@ -239,7 +239,7 @@ class SACAlgorithm(OffPolicyAlgorithm):
         return (alpha * log_prob - q).mean(1), -log_prob.detach().mean(1)
 
     def entropy_between(
-        self, state: State, sample: Sample, actor: Actor, noise: list[Tensor]
+        self, state: State, sample: Sample, actor: ActingParams, noise: list[Tensor]
     ) -> Tensor:
         """What the policy's entropy at the steps between adds to n steps' reward, (P, B).
 

@@ -12,7 +12,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Family
+from skillweave.algorithms.base import ActingParams, ParameterGroup
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
 from skillweave.networks.encoders import Inputs
@@ -94,12 +94,12 @@ class TD3Algorithm(OffPolicyAlgorithm):
             **self.fresh(len(seeds)),
         )
 
-    def families(self) -> list[Family]:
+    def groups(self) -> list[ParameterGroup]:
         """Everything in the state that has the shape of networks."""
-        actor = Family(self.layout, (("network", self.net),), ("params", "target"))
+        actor = ParameterGroup(self.layout, (("network", self.net),), ("params", "target"))
         return [actor, self.critics.family()]
 
-    def actor(self, state: State, progress: float = 1.0) -> Actor:
+    def actor(self, state: State, progress: float = 1.0) -> ActingParams:
         """A copy of what acting needs, with the deviation of its noise."""
         actor = super().actor(state, progress)
         actor.extra["noise"] = state.exploration_noise[:, None, None].clone()
@@ -107,7 +107,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
 
     def act(
         self,
-        actor: Actor,
+        actor: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: Tensor | None,
@@ -130,7 +130,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
         self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step of the critics, and now and then of the actor, in place."""
-        actor = Actor({}, *self.scaling(state))
+        actor = ActingParams({}, *self.scaling(state))
         inputs = self.inputs(actor, sample.obs)
         leaves = self.critics.leaves(state.critic)
         loss, error, q = self.critic_loss(leaves, state, sample, actor, inputs, noise)
@@ -150,7 +150,7 @@ class TD3Algorithm(OffPolicyAlgorithm):
         views: Views,
         state: State,
         sample: Sample,
-        actor: Actor,
+        actor: ActingParams,
         inputs: Inputs,
         noise: list[Tensor],
     ) -> tuple[Tensor, Tensor, Tensor]:

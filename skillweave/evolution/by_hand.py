@@ -82,7 +82,7 @@ class ByHand:
             if epsilon and self.rng.random() < epsilon:
                 action = learner.random_actions([self.generator], len(rows), allowed)
             else:
-                actor = learner.actor(self.member.state)
+                actor = learner.acting_params(self.member.state)
                 if "epsilon" in actor.extra:  # said here at each call instead
                     actor.extra["epsilon"].zero_()
                 noise = learner.noise([self.generator], 1, len(rows))[0] if explore else None

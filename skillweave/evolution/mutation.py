@@ -150,7 +150,7 @@ def _add_noise(member: Member, by: Mutations, spaces: Spaces, rng: np.random.Gen
             view.copy_(torch.randn(view.shape, generator=generator) * chosen * scale)
     if not bool(noise.any()):
         return member
-    for name in algorithm.families()[0].weights:
+    for name in algorithm.parameter_groups()[0].weights:
         getattr(found.state, name).add_(noise)
     return found
 

@@ -215,12 +215,12 @@ class _Loop:
         """Keep the running scales of observations and returns."""
         for i, stack in enumerate(self.stacks):
             algorithm, state, part = stack.algorithm, stack.state, self.rows(i)
-            algorithm.see(state, by_member(obs[part], stack.members))
+            algorithm.update_obs_stats(state, by_member(obs[part], stack.members))
             if algorithm.scales_rewards:
                 gamma = np.repeat(state.gamma.numpy(), self._each)
                 now = self._returns[part] * gamma ** step.steps[part] + step.reward[part]
                 self._returns[part] = now
-                algorithm.see_returns(state, by_member(self._returns[part], stack.members))
+                algorithm.update_return_stats(state, by_member(self._returns[part], stack.members))
         self._returns[step.ended] = 0.0
 
     def learn(self, update: int, steps: int) -> None:
@@ -265,7 +265,7 @@ class _Actor:
     def __init__(self, loop: _Loop, at: int, update: int, steps: int) -> None:
         self._stack, self._rows, self._each = loop.stacks[at], loop.rows(at), loop._each
         algorithm = self._stack.algorithm
-        self._actor = algorithm.actor(self._stack.state, min(1.0, steps / loop.horizon))
+        self._actor = algorithm.acting_params(self._stack.state, min(1.0, steps / loop.horizon))
         self._generators = [s.torch() for s in loop.seeds_of(at, "act", update)]
         self._noises = algorithm.noise(self._generators, loop.config.train_freq, loop._each)
         self._at_random = loop.acts_at_random(steps)

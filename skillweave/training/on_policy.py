@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor
+from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
 from skillweave.buffers.rollout import RolloutBuffer
 from skillweave.ops.threads import torch_threads
@@ -59,7 +59,7 @@ def train_on_policy(
     started = time.perf_counter() - seconds
     learner = _Learner(algorithm, state, loop, horizon or budget, tolerant, on_tick, started)
     try:
-        actor = algorithm.actor(state)
+        actor = algorithm.acting_params(state)
         collector.start(seeds / "start")
         while steps < budget:
             rollout = loop.collect(actor, state, update)
@@ -107,11 +107,11 @@ class _Learner:
 
     def wait(
         self,
-        actor: Actor,
+        actor: ActingParams,
         cut: bool = False,
         extra: dict[str, Tensor] | None = None,
         steps: int | None = None,
-    ) -> Actor:
+    ) -> ActingParams:
         """Let a pending update end, report it, and return what acts from now on.
 
         Args:
@@ -127,7 +127,7 @@ class _Learner:
             update, before = self._at
             steps = before if steps is None else steps
             self.on_tick(Tick(update, steps, elapsed, metrics, self.state, cut, extra))
-        return self.algorithm.actor(self.state)
+        return self.algorithm.acting_params(self.state)
 
     def close(self) -> None:
         """Stop; a pending update is finished first, as it changes the state in place."""
@@ -158,7 +158,7 @@ class _Loop:
         return prefixed("collector", self.collector.state())
 
     @torch.inference_mode()
-    def collect(self, actor: Actor, state: State, update: int) -> Rollout:
+    def collect(self, actor: ActingParams, state: State, update: int) -> Rollout:
         """A rollout of ``n_steps`` environment steps of each environment.
 
         Where actions last several steps it has fewer of them, and may last longer by one.
@@ -194,7 +194,7 @@ class _Loop:
 
     def _memory(self) -> Tensor | None:
         """What the network remembers of each environment, (P, B, M), kept by the collector."""
-        if not (size := self.algorithm.memory):
+        if not (size := self.algorithm.memory_size):
             return None
         kept = self.collector.carry("memory", np.zeros((self.collector.num_envs, size), np.float32))
         return by_member(kept, self.members)

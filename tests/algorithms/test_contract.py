@@ -177,7 +177,7 @@ def test_a_policy_in_a_file_acts_as_it_did(case, tmp_path):
             assert np.array_equal(mine, theirs)
             assert mine.dtype == env.action_space.dtype
             assert all(env.action_space.contains(a) for a in mine)
-            if not algorithm.memory:
+            if not algorithm.memory_size:
                 assert memories == [{}, {}]
 
 
@@ -291,11 +291,11 @@ def trained(env: Any, name: str, each: int = 1, scale: float = 1.0) -> tuple[Any
 
 def values(algorithm: Any, state: Any, obs: Any) -> list[float]:
     """What the policy expects of itself in observations (n, ...)."""
-    rows, actor = torch.as_tensor(np.asarray(obs))[None], algorithm.actor(state)
+    rows, actor = torch.as_tensor(np.asarray(obs))[None], algorithm.acting_params(state)
     if isinstance(algorithm, PPOAlgorithm):
-        if not algorithm.memory:
+        if not algorithm.memory_size:
             return algorithm.value(state, rows)[0].tolist()
-        memory = torch.zeros(1, rows.shape[1], algorithm.memory // 2)
+        memory = torch.zeros(1, rows.shape[1], algorithm.memory_size // 2)
         views, inputs = algorithm.layout.views(state.params), algorithm.inputs(actor, rows)
         raw, _ = algorithm.critic_net.step(views, inputs, memory)
         return algorithm._in_rewards(state, raw)[0].tolist()
@@ -359,7 +359,7 @@ def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_ste
     # Without γ^τ the long call would be worth 3 / (1 − 0.8) = 15, and be chosen.
     rows = torch.zeros(1, 1, 1)
     if name in ("dqn", "dqn of three steps", "sac of choices"):
-        actor = algorithm.actor(state)
+        actor = algorithm.acting_params(state)
         if name == "sac of choices":
             inputs = algorithm.inputs(actor, rows)
             q = algorithm.critics(algorithm.critics.views(state.critic), inputs).mean(1)
@@ -421,7 +421,7 @@ def test_a_forbidden_action_is_never_chosen_in_targets(name):
         for flat in (state.critic, state.critic_target):
             algorithm.critics.views(flat)["critic.0.weight"][:] = tempting
     _, state = learn(config, env, 2000, state=state)
-    inputs = algorithm.inputs(algorithm.actor(state), torch.arange(3)[None])
+    inputs = algorithm.inputs(algorithm.acting_params(state), torch.arange(3)[None])
     if "dqn" in name:
         q = algorithm.net(algorithm.layout.views(state.params), inputs)[0, ..., 0]
     else:
@@ -464,7 +464,7 @@ def test_learning_begins_at_the_very_probabilities_that_acting_had(kind):
     algorithm = watched(MEMORIES[kind])
     assert len(algorithm.seen) == 3
     for i, (rollout, params) in enumerate(algorithm.seen):
-        views, tr, cut = algorithm.layout.views(params), rollout.transition, algorithm.memory // 2
+        views, tr, cut = algorithm.layout.views(params), rollout.transition, algorithm.memory_size // 2
         assert rollout.start[:, 1:].any()
         assert bool(rollout.memory.any()) == (i > 0)  # what went on from the rollout before
         memory = rollout.memory[..., :cut]
@@ -494,12 +494,12 @@ def test_the_first_minibatches_ratio_is_one(kind):
 def test_the_value_after_an_end_remembers_what_led_to_it():
     algorithm = watched(MEMORIES["lstm"], updates=2)
     rollout, params = algorithm.seen[1]
-    state, tr, cut = algorithm.init([Seeds(0)]), rollout.transition, algorithm.actor_net.memory
+    state, tr, cut = algorithm.init([Seeds(0)]), rollout.transition, algorithm.actor_net.memory_size
     state.params = params
     views, net = algorithm.layout.views(params), algorithm.critic_net
     data = {"vector": tr.obs, "memory": rollout.memory, "start": rollout.start}
     with torch.no_grad():
-        value, following = algorithm._values(views, state, algorithm.actor(state), data, tr)
+        value, following = algorithm._values(views, state, algorithm.acting_params(state), data, tr)
         memory = rollout.memory[..., cut:]
         for t in range(16):
             memory = memory.masked_fill(rollout.start[:, t, :, None], 0.0)
@@ -514,7 +514,7 @@ def test_a_policy_remembers_until_it_starts_anew():
     algorithm, state, env = TABLE["ppo with lstm, vector, Discrete"].learn()
     policy, obs = AgentPolicy.of(algorithm, state), env.show(np.array([1, 1, 2]))
     fresh = policy.start(3)
-    assert fresh["rnn"].shape == (3, algorithm.memory) == (3, 32)
+    assert fresh["rnn"].shape == (3, algorithm.memory_size) == (3, 32)
     assert not fresh["rnn"].any()
     _, after = policy.act(fresh, obs)
     assert not fresh["rnn"].any()

@@ -160,7 +160,7 @@ def test_the_share_of_random_actions_falls_and_stays(progress, epsilon):
     algorithm, state = make(
         exploration_fraction=0.2, exploration_initial_eps=0.8, exploration_final_eps=0.2
     )
-    actor = algorithm.actor(state, progress)
+    actor = algorithm.acting_params(state, progress)
     assert actor.extra["epsilon"].flatten().tolist() == pytest.approx([epsilon] * P)
     obs, n = torch.ones(P, 20_000, 2), 20_000
     noise = algorithm.noise([Seeds(m).torch() for m in range(P)], 1, n)[0]
@@ -171,7 +171,7 @@ def test_the_share_of_random_actions_falls_and_stays(progress, epsilon):
 
 def test_noisy_weights_explore_and_nothing_else_does():
     algorithm, state = make(noisy=True, network=Network((16,)))
-    actor, obs = algorithm.actor(state), torch.randn(P, 5, 2)
+    actor, obs = algorithm.acting_params(state), torch.randn(P, 5, 2)
     assert not actor.extra["epsilon"].any()
     noises = algorithm.noise([Seeds(m).torch() for m in range(P)], 30, 5)
     values = torch.stack([algorithm.act(actor, obs, None, n)[1] for n in noises])
@@ -206,7 +206,7 @@ def test_a_masked_action_is_not_taken_however_good_it_looks():
     mask = torch.tensor([False, True, True]).expand(P, 2000, A)
     obs = torch.zeros(P, 2000, 2)
     for progress in (0.0, 1.0):
-        actor = algorithm.actor(state, progress)
+        actor = algorithm.acting_params(state, progress)
         for noise in (algorithm.noise([Seeds(m).torch() for m in range(P)], 1, 2000)[0], None):
             action, _, _ = algorithm.act(actor, obs, mask, noise)
             assert (action != 0).all()
@@ -232,7 +232,7 @@ def test_atoms_without_bounds_of_their_own_fit_the_returns_seen():
     )  # fmt: skip
     algorithm, state = learn(config, Pays(8), 1200)
     scale = (state.return_var + state.return_mean.square()).sqrt()
-    _, q, _ = algorithm.act(algorithm.actor(state), torch.zeros(1, 1, 1), None, None)
+    _, q, _ = algorithm.act(algorithm.acting_params(state), torch.zeros(1, 1, 1), None, None)
     # Of the best policy 6000 / (1 − γ); the other action loses 2000 of it.
     assert (q * scale).flatten().tolist() == pytest.approx([10_000, 12_000], rel=0.05)
 

@@ -52,7 +52,7 @@ def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool =
     if masked:
         mask = torch.rand(p, T, B, 4, generator=g) < 0.5
         mask[..., 2] = True
-    actor = algorithm.actor(state)
+    actor = algorithm.acting_params(state)
     noise = algorithm.noise([torch.Generator().manual_seed(m) for m in range(p)], T * B, 1)
     flat_mask = None if mask is None else mask.flatten(1, 2)
     action, head, _ = algorithm.act(
@@ -214,7 +214,7 @@ def test_greedy_is_the_most_probable_action_and_the_mean():
         (Box(-1, 1, (2,)), lambda h: h),
     ):
         algorithm, state = make(space, members=2)
-        action, head, _ = algorithm.act(algorithm.actor(state), obs, None, None)
+        action, head, _ = algorithm.act(algorithm.acting_params(state), obs, None, None)
         assert torch.equal(action, greedy(head))
 
 
@@ -222,7 +222,7 @@ def test_sampling_follows_the_heads_distribution():
     algorithm, state = make()
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([0.0, 1.0, 2.0, 3.0])
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(algorithm.actor(state), torch.zeros(1, 50_000, 3), None, noise)
+    action, head, _ = algorithm.act(algorithm.acting_params(state), torch.zeros(1, 50_000, 3), None, noise)
     frequency = action.flatten().bincount(minlength=4) / 50_000
     torch.testing.assert_close(frequency, head[0, 0].softmax(-1), atol=0.008, rtol=0)
 
@@ -230,7 +230,7 @@ def test_sampling_follows_the_heads_distribution():
 def test_continuous_sampling_has_the_initial_deviation():
     algorithm, state = make(Box(-1, 1, (2,)), action_std_init=0.3)
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(algorithm.actor(state), torch.ones(1, 50_000, 3), None, noise)
+    action, head, _ = algorithm.act(algorithm.acting_params(state), torch.ones(1, 50_000, 3), None, noise)
     torch.testing.assert_close(action[0].std(0), torch.full((2,), 0.3), rtol=0.02, atol=0)
     torch.testing.assert_close(action[0].mean(0), head[0, 0], rtol=0, atol=0.01)
 
@@ -239,7 +239,7 @@ def test_a_masked_action_is_never_taken_and_has_no_probability():
     algorithm, state = make()
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([9.0, 0.0, 0.0, 9.0])
     mask = torch.tensor([False, True, True, False]).expand(1, 20_000, 4)
-    actor, obs = algorithm.actor(state), torch.zeros(1, 20_000, 3)
+    actor, obs = algorithm.acting_params(state), torch.zeros(1, 20_000, 3)
     for noise in (algorithm.noise([Seeds(0).torch()], 1, 20_000)[0], None):
         action, head, _ = algorithm.act(actor, obs, mask, noise)
         assert mask.gather(-1, action[..., None]).all()
@@ -259,11 +259,11 @@ def test_each_member_has_its_own_noise():
 @pytest.mark.parametrize("normalize_obs", [False, True])
 def test_an_actor_is_a_copy_that_learning_does_not_change(normalize_obs):
     algorithm, state = make(normalize_obs=normalize_obs)
-    actor, obs = algorithm.actor(state), torch.randn(1, 5, 3)
+    actor, obs = algorithm.acting_params(state), torch.randn(1, 5, 3)
     before = algorithm.act(actor, obs, None, None)[1].clone()
     algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0)])
     assert torch.equal(algorithm.act(actor, obs, None, None)[1], before)
-    assert not torch.equal(algorithm.act(algorithm.actor(state), obs, None, None)[1], before)
+    assert not torch.equal(algorithm.act(algorithm.acting_params(state), obs, None, None)[1], before)
 
 
 def test_observations_are_normalised_by_all_that_were_seen():
@@ -313,7 +313,7 @@ def test_kl_counts_from_the_first_policy_of_an_update():
         same.params.copy_(state.params)
         if epochs:
             one.update(same, data, 0.0, [Seeds(0)])
-        heads.append(one.act(one.actor(same), tr.obs.flatten(1, 2), None, None)[1])
+        heads.append(one.act(one.acting_params(same), tr.obs.flatten(1, 2), None, None)[1])
     taken = tr.action.flatten(1, 2)
     first, second = (algorithm.head.stats(h, None, None, taken)[0] for h in heads)
     acted = algorithm.head.stats(data.head, None, None, tr.action)[0].flatten(1, 2)

@@ -80,7 +80,7 @@ def squashed(head: torch.Tensor, g: torch.Generator) -> tuple[torch.Tensor, torc
 
 def losses(algorithm: SACAlgorithm, state: State, s: Sample) -> tuple[Any, Any]:
     alpha = state.log_alpha.exp()
-    inputs, actor = {"vector": s.obs}, algorithm.actor(state)
+    inputs, actor = {"vector": s.obs}, algorithm.acting_params(state)
     views = algorithm.critics.views(state.critic)
     noise = algorithm.learning_noise(generators(), s.reward.shape[1], False)
     critic = algorithm.critic_loss(views, state, s, actor, inputs, alpha, noise)
@@ -190,7 +190,7 @@ def test_the_policy_is_delayed_and_the_target_is_not():
 def test_greedy_is_the_squashed_mean_and_samples_follow_the_law():
     algorithm, state = make(FORCES)
     obs = torch.randn(P, 5, 3, generator=torch.Generator().manual_seed(5))
-    actor, noise = algorithm.actor(state), algorithm.noise(generators(), 1, 5)[0]
+    actor, noise = algorithm.acting_params(state), algorithm.noise(generators(), 1, 5)[0]
     greedy, head, _ = algorithm.act(actor, obs, None, None)
     mean, log_std = head.chunk(2, -1)
     torch.testing.assert_close(greedy, mean.tanh())
@@ -227,7 +227,7 @@ def test_the_entropy_between_n_steps_is_part_of_the_target_by_hand(space):
     )
     alpha = torch.tensor(alphas)[:, None]
     noise = algorithm.learning_noise(generators(), B, False)
-    views, actor = algorithm.critics.views(state.critic), algorithm.actor(state)
+    views, actor = algorithm.critics.views(state.critic), algorithm.acting_params(state)
     inputs = {"vector": s.obs}
     _, error, _ = algorithm.critic_loss(views, state, with_between, actor, inputs, alpha, noise)
     extra = torch.zeros(P, B)

@@ -60,9 +60,9 @@ def generators() -> list[torch.Generator]:
 
 
 def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample) -> Any:
-    from skillweave.algorithms.base import Actor
+    from skillweave.algorithms.base import ActingParams
 
-    actor = Actor({}, None, None)
+    actor = ActingParams({}, None, None)
     views = algorithm.critics.views(state.critic)
     noise = algorithm.learning_noise(generators(), B, False)
     return algorithm.critic_loss(views, state, s, actor, {"vector": s.obs}, noise)
@@ -130,8 +130,8 @@ def test_each_member_explores_with_its_own_noise_within_the_bounds():
     algorithm, state = make(exploration_noise=0.5)
     state.exploration_noise = torch.tensor([0.0, 0.5])
     obs, noise = torch.zeros(P, 4000, 3), algorithm.noise(generators(), 1, 4000)[0]
-    action, _, _ = algorithm.act(algorithm.actor(state), obs, None, noise)
-    greedy, _, _ = algorithm.act(algorithm.actor(state), obs, None, None)
+    action, _, _ = algorithm.act(algorithm.acting_params(state), obs, None, noise)
+    greedy, _, _ = algorithm.act(algorithm.acting_params(state), obs, None, None)
     assert torch.equal(action[0], greedy[0])
     expected = (greedy[1] + 0.5 * noise[1]).clamp(-1, 1)
     torch.testing.assert_close(action[1], expected)
