@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.config import check_spaces
+from skillweave.algorithms.parameters import ParameterGroup, setting_number
 from skillweave.experience import Report
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -61,32 +62,6 @@ class ActingParams:
     shift: Tensor | None  # (P, 1, O), where observations are normalised
     scale: Tensor | None  # (P, 1, O)
     extra: dict[str, Tensor] = field(default_factory=dict)  # of exploration, such as ε, (P, 1)
-
-
-@dataclass(frozen=True)
-class ParameterGroup:
-    """Fields of a state (..., D) that hold the same networks, so they change together."""
-
-    layout: Layout
-    nets: tuple[tuple[str, Any], ...]
-    """The networks in the layout, each with the field of the config that shapes it."""
-    weights: tuple[str, ...] = ("params",)
-    """What learns, then its slow copy if there is one."""
-    moments: tuple[str, ...] = ("mu", "nu")
-    """The optimiser's."""
-    count: str = "count"
-    """The field with the optimiser's steps: (P,), or (..., D) where parameters differ in age."""
-
-
-LARGEST = torch.finfo(torch.float32).max
-
-
-def setting_number(value: float | None) -> float:
-    """A hyperparameter as it stands in a state, where None (no limit) is the largest number.
-
-    Not infinity: in a state that is not finite something has diverged.
-    """
-    return LARGEST if value is None else float(value)
 
 
 class Algorithm:

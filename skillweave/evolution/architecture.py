@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import ParameterGroup
+from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution.config import Mutations

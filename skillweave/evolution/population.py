@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.buffers.replay import ReplayBuffer
 from skillweave.envs.joined import JoinedEnvs
@@ -96,7 +96,7 @@ class Population:
         groups = grouped(self.members, self.spaces)
         gamma = np.array([m.config.gamma for m in self.members])
         self.collector.env.set_gamma(gamma.repeat(self.members[0].config.num_envs))
-        if isinstance(self.members[0].config, PPO):
+        if self.members[0].algorithm(self.spaces).store == "rollout":
             self._train_one_by_one(groups, until, horizon, seeds, on_tick)
         else:
             self._train_side_by_side(groups, until, horizon, seeds, on_tick)

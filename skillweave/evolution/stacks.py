@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm, ParameterGroup
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import Network

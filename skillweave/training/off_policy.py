@@ -249,9 +249,11 @@ class _Loop:
             size = cfg.batch_size * min(together, due - done)
             drawn = self.buffer.sample(size, state.gamma, rngs, beta, first)
             for sample in drawn.split(cfg.batch_size):
-                metrics, error = algorithm.update(state, sample, progress, generators)
-                if cfg.prioritized:
-                    self.buffer.update_priorities(sample.index, error, first)
+                sample.progress = progress
+                _, report = algorithm.update(state, sample, generators)
+                metrics = report.metrics
+                if cfg.prioritized and report.error is not None:
+                    self.buffer.update_priorities(sample.index, report.error, first)
         return metrics
 
     def _owed(self, config: OffPolicy, update: int) -> int:

@@ -10,14 +10,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import ActingParams
-from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
+from skillweave.algorithms.base import ActingParams, Algorithm
 from skillweave.buffers.rollout import RolloutBuffer
+from skillweave.experience import Rollout
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.training.collector import Collector
@@ -28,9 +30,9 @@ from skillweave.types import prefixed
 
 @torch_threads(1)
 def train_on_policy(
-    algorithm: PPOAlgorithm,
+    algorithm: Algorithm,
     collector: Collector,
-    state: State,
+    state: Any,
     seeds: Seeds,
     budget: int,
     *,
@@ -41,7 +43,7 @@ def train_on_policy(
     steps: int = 0,
     seconds: float = 0.0,
     on_tick: Callable[[Tick], None] | None = None,
-) -> State:
+) -> Any:
     """Train until ``budget`` environment steps are spent.
 
     Args:
@@ -83,8 +85,8 @@ class _Learner:
 
     def __init__(
         self,
-        algorithm: PPOAlgorithm,
-        state: State,
+        algorithm: Algorithm,
+        state: Any,
         loop: _Loop,
         horizon: int,
         tolerant: bool,
@@ -134,16 +136,17 @@ class _Learner:
         self._worker.shutdown(wait=True)
 
     def _learn(self, rollout: Rollout, update: int, progress: float) -> dict[str, float]:
-        seeds = self.loop.member_seeds("learn", update)
-        _, metrics = self.algorithm.update(self.state, rollout, min(1.0, progress), seeds)
-        return to_numbers(metrics, update, tolerant=self.tolerant)
+        rng = [s.torch() for s in self.loop.member_seeds("learn", update)]
+        rollout = replace(rollout, progress=min(1.0, progress))
+        _, report = self.algorithm.update(self.state, rollout, rng)
+        return to_numbers(report.metrics, update, tolerant=self.tolerant)
 
 
 class _Loop:
     """Environments and the policy that acts in them, a rollout at a time."""
 
     def __init__(
-        self, algorithm: PPOAlgorithm, collector: Collector, seeds: Seeds, members: int
+        self, algorithm: Algorithm, collector: Collector, seeds: Seeds, members: int
     ) -> None:
         self.algorithm, self.collector = algorithm, collector
         self.seeds, self.members = seeds, members
@@ -158,7 +161,7 @@ class _Loop:
         return prefixed("collector", self.collector.state())
 
     @torch.inference_mode()
-    def collect(self, actor: ActingParams, state: State, update: int) -> Rollout:
+    def collect(self, actor: ActingParams, state: Any, update: int) -> Rollout:
         """A rollout of ``n_steps`` environment steps of each environment.
 
         Where actions last several steps it has fewer of them, and may last longer by one.
@@ -187,10 +190,11 @@ class _Loop:
                     starts[:, i + 1] = ended
             if spent >= t * n:
                 break
-        transition, head = buffer.read(state.gamma)
+        rollout = buffer.read(state.gamma)
         log_std = actor.views.get("actor.log_std")
         log_std = None if log_std is None else log_std[:, None]
-        return Rollout(transition, head, log_std, before, starts[:, : transition.reward.shape[1]])
+        starts = starts[:, : rollout.reward.shape[1]]
+        return replace(rollout, log_std=log_std, memory=before, starts=starts)
 
     def _memory(self) -> Tensor | None:
         """What the network remembers of each environment, (P, B, M), kept by the collector."""

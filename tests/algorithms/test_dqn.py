@@ -15,7 +15,7 @@ from skillweave.algorithms.config import DQN
 from skillweave.algorithms.dqn import DQNAlgorithm, State
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
+from skillweave.experience import Sample
 
 P, B, A = 2, 7, 3
 LINEAR = DQN(num_envs=2, network=Network(()), loss="mse", learning_rate=1e-2)
@@ -41,7 +41,7 @@ def sample(members: int = P, masked: bool = False, weighted: bool = False) -> Sa
     return Sample(
         obs=torch.randn(*lead, 2, generator=g), action=torch.randint(A, lead, generator=g),
         reward=torch.randn(lead, generator=g), discount=discount,
-        next_obs=torch.randn(*lead, 2, generator=g), obs_mask=None, mask=mask,
+        next_obs=torch.randn(*lead, 2, generator=g), obs_mask=None, next_obs_mask=mask,
         weight=torch.rand(lead, generator=g) if weighted else None, index=np.zeros(lead, np.int64),
     )  # fmt: skip
 
@@ -68,7 +68,7 @@ def test_the_target_by_hand(double, masked):
         for b in range(B):
             slow = linear(algorithm, state.target, m, s.next_obs[m, b])
             fast = linear(algorithm, state.params, m, s.next_obs[m, b])
-            allowed = [a for a in range(A) if not masked or s.mask[m, b, a]]
+            allowed = [a for a in range(A) if not masked or s.next_obs_mask[m, b, a]]
             judge = fast if double else slow
             best = max(allowed, key=lambda a, judge=judge: judge[a].item())
             differ += best != int(slow.argmax())
@@ -114,7 +114,7 @@ def test_the_distributions_target_is_the_projection_of_the_best_actions(masked):
             fast = linear(algorithm, state.params, m, s.next_obs[m, b]).view(A, 5).softmax(-1)
             slow = linear(algorithm, state.target, m, s.next_obs[m, b]).view(A, 5).softmax(-1)
             worth = fast @ torch.tensor(atoms)
-            allowed = [a for a in range(A) if not masked or s.mask[m, b, a]]
+            allowed = [a for a in range(A) if not masked or s.next_obs_mask[m, b, a]]
             p, target = slow[max(allowed, key=lambda a, w=worth: w[a].item())], [0.0] * 5
             for j in range(5):
                 moved = s.reward[m, b].item() + s.discount[m, b].item() * atoms[j]
@@ -136,19 +136,19 @@ def test_an_update_is_a_step_of_adam_and_the_target_follows():
     before, slow = state.params.clone(), state.target.clone()
     leaf = before.clone().requires_grad_()
     algorithm.loss(algorithm.layout.views(leaf), state, s, [None] * 3)[0].sum().backward()
-    metrics, _ = algorithm.update(state, s, 0.0, [Seeds(0).torch()])
+    _, report = algorithm.update(state, s, [Seeds(0).torch()])
     # Adam's first step: the rate times the sign of the gradient, but for ε.
     step = 1e-2 * leaf.grad / (leaf.grad.abs() + algorithm.config.adam_eps)
     torch.testing.assert_close(state.params, before - step)
     torch.testing.assert_close(state.target, slow + 0.25 * (state.params - slow))
-    assert metrics["grad_norm"].item() == pytest.approx(leaf.grad.norm().item(), rel=1e-4)
+    assert report.metrics["grad_norm"].item() == pytest.approx(leaf.grad.norm().item(), rel=1e-4)
 
 
 def test_the_target_is_updated_now_and_then():
     algorithm, state = make(target_update_interval=3, tau=1.0)
     slow, changed = state.target.clone(), []
     for _ in range(6):
-        algorithm.update(state, sample(), 0.0, [Seeds(m).torch() for m in range(P)])
+        algorithm.update(state, sample(), [Seeds(m).torch() for m in range(P)])
         changed.append(not torch.equal(state.target, slow))
         slow = state.target.clone()
     assert changed == [False, False, True] * 2
@@ -186,8 +186,8 @@ def test_noisy_weights_explore_and_nothing_else_does():
 def test_an_update_with_noisy_weights_draws_noise_of_each_members_own():
     algorithm, state = make(noisy=True, network=Network((4,)))
     one = make(noisy=True, network=Network((4,)))[1]
-    algorithm.update(state, sample(), 0.0, [Seeds(m).torch() for m in range(P)])
-    algorithm.update(one, sample(), 0.0, [Seeds(0).torch(), Seeds(7).torch()])
+    algorithm.update(state, sample(), [Seeds(m).torch() for m in range(P)])
+    algorithm.update(one, sample(), [Seeds(0).torch(), Seeds(7).torch()])
     assert torch.equal(state.params[0], one.params[0])
     assert not torch.equal(state.params[1], one.params[1])
 
@@ -239,7 +239,7 @@ def test_atoms_without_bounds_of_their_own_fit_the_returns_seen():
 
 def test_the_units_of_atoms_by_hand():
     algorithm, state = make(distributional=True, n_atoms=5)
-    assert algorithm.atoms.tolist() == [-10, -5, 0, 5, 10]
+    assert algorithm.atoms.on(torch.device("cpu")).tolist() == [-10, -5, 0, 5, 10]
     assert algorithm.scales_rewards
     state.return_mean[:], state.return_var[:] = 3.0, 16.0
     s = sample()
