@@ -1,12 +1,12 @@
-"""Words that every room shares: transitions, steps, and what acts and what learns.
+"""Words that every room shares: steps, and what acts and what learns.
 
 This module imports nothing of the library and does not import torch at run time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
@@ -14,8 +14,6 @@ from gymnasium import Space
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from skillweave.seeding import Seeds
 
 T = TypeVar("T")
@@ -112,57 +110,6 @@ class VecStep:
         """(n,) bool: the episode ended here, by termination or truncation."""
         ended: Array = self.terminated | self.truncated
         return ended
-
-
-@dataclass(slots=True)
-class Transition:
-    """Trajectories in the form that every algorithm learns from.
-
-    P members, T time steps, B environments per member. ``discount`` is 0 where the episode
-    terminated, else γ^τ; ``last`` says that the trajectory is cut here (terminated, truncated,
-    or end of rollout). ``next_obs`` is the true successor, also where an episode ended.
-    """
-
-    obs: Tensor  # (P, T, B, *obs_shape)
-    action: Tensor  # (P, T, B) int64 or (P, T, B, A) float32
-    reward: Tensor  # (P, T, B)
-    discount: Tensor  # (P, T, B)
-    next_obs: Tensor  # (P, T, B, *obs_shape)
-    last: Tensor  # (P, T, B) bool
-    mask: Tensor | None = None  # (P, T, B, A) bool
-
-
-@dataclass(slots=True)
-class Sample:
-    """A batch from a replay buffer: P members, B transitions of up to n steps each.
-
-    ``reward`` is the discounted sum over the n steps, ``discount`` what the value of
-    ``next_obs`` counts after them: 0 where the episode terminated, else γ^Στ.
-    """
-
-    obs: Tensor  # (P, B, *obs_shape)
-    action: Tensor  # (P, B) int64 or (P, B, A)
-    reward: Tensor  # (P, B) float32
-    discount: Tensor  # (P, B) float32
-    next_obs: Tensor  # (P, B, *obs_shape), the true successor
-    obs_mask: Tensor | None  # (P, B, A) bool, allowed actions in ``obs``; None: all
-    mask: Tensor | None  # (P, B, A) bool, allowed actions in ``next_obs``; None: all
-    weight: Tensor | None  # (P, B) float32, importance weights; None where drawn uniformly
-    index: Array  # (P, B) int64, which transitions these are, to give them new priorities
-    # Where an algorithm asks for them, the n − 1 observations between ``obs`` and ``next_obs``:
-    between_obs: Tensor | None = None  # (P, B, n − 1, *obs_shape)
-    between_mask: Tensor | None = None  # (P, B, n − 1, A) bool, allowed actions; None: all
-    between_discount: Tensor | None = None
-    """(P, B, n − 1), what a reward there counts: γ^Στ, or 0 where the steps ended before."""
-
-    def split(self, batch: int) -> Iterator[Sample]:
-        """Samples of ``batch`` transitions of each member, one after another."""
-        size = self.reward.shape[1]
-        whole: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        for start in range(0, size, batch):
-            part = slice(start, start + batch)
-            found: dict[str, Any] = {k: v if v is None else v[:, part] for k, v in whole.items()}
-            yield Sample(**found)
 
 
 class Restorable(Protocol):

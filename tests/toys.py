@@ -12,7 +12,6 @@ import numpy as np
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
 from skillweave.training.collector import Collector
@@ -410,6 +409,6 @@ def learn(
     algorithm: Algorithm = make_algorithm(config, env.observation_space, env.action_space)
     seeds = Seeds(seeds) if isinstance(seeds, int) else seeds
     state = where.pop("state", None) or algorithm.init([Seeds(m) for m in members])
-    train: Any = train_on_policy if isinstance(algorithm, PPOAlgorithm) else train_off_policy
+    train: Any = train_on_policy if algorithm.store == "rollout" else train_off_policy
     collector = where.pop("collector", None) or Collector(env)
     return algorithm, train(algorithm, collector, state, seeds, budget, **where)

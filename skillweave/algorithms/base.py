@@ -2,84 +2,93 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, NoReturn, TypeVar
 
 import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.config import AlgorithmConfig, check_spaces
+from skillweave.algorithms.config import check_spaces
+from skillweave.algorithms.parameters import ParameterGroup, setting_number
+from skillweave.experience import Report
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.stacked import Layout
-from skillweave.ops.optim import merge_moments
+from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec, obs_codec
-from skillweave.types import Array
+from skillweave.types import Array, SkillweaveError
+
+S = TypeVar("S")
+Device = torch.device | str
 
 
 @dataclass
-class Actor:
+class AgentState:
+    """What every algorithm learns and counts: P members, D parameters, O observation numbers."""
+
+    HOST: ClassVar[tuple[str, ...]] = ()
+    """Fields that stay on the CPU, because Python decides by them."""
+
+    params: Tensor  # (P, D)
+    mu: Tensor  # (P, D), Adam's first moment
+    nu: Tensor  # (P, D), Adam's second moment
+    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
+    obs_mean: Tensor  # (P, O)
+    obs_var: Tensor  # (P, O)
+    obs_count: Tensor  # (P,)
+    return_mean: Tensor  # (P, 1)
+    return_var: Tensor  # (P, 1)
+    return_count: Tensor  # (P,)
+    learning_rate: Tensor  # (P,), of each member
+    gamma: Tensor  # (P,), of each member
+
+
+def state_to(state: S, device: Device) -> S:
+    """The state on a device; tensors that are there already are not copied."""
+    stay: tuple[str, ...] = getattr(state, "HOST", ())
+    moved = {k: v if k in stay else v.to(device) for k, v in vars(state).items()}
+    return type(state)(**moved)
+
+
+@dataclass
+class ActingParams:
     """What acting needs of an algorithm's state: a copy, so that learning may go on beside it."""
 
-    views: dict[str, Tensor]  # the parameters that act, each (P, *shape)
+    views: Mapping[str, Tensor]  # the parameters that act, each (P, *shape)
     shift: Tensor | None  # (P, 1, O), where observations are normalised
     scale: Tensor | None  # (P, 1, O)
-    extra: dict[str, Tensor] = field(default_factory=dict)  # exploration: ε, say, each (P, 1)
-
-
-@dataclass(frozen=True)
-class Family:
-    """Fields of a state (..., D) that hold the same networks, so they change together."""
-
-    layout: Layout
-    nets: tuple[tuple[str, Any], ...]
-    """The networks in the layout, each with the field of the settings that shapes it."""
-    weights: tuple[str, ...] = ("params",)
-    """What learns, then its slow copy if there is one."""
-    moments: tuple[str, ...] = ("mu", "nu")
-    """The optimiser's."""
-    count: str = "count"
-    """The field with the optimiser's steps: (P,), or (..., D) where parameters differ in age."""
-
-
-LARGEST = torch.finfo(torch.float32).max
-
-
-def setting_number(value: float | None) -> float:
-    """A setting as it stands in a state, where "no limit" (None) is the largest number there is.
-
-    Not infinity: in a state that is not finite something has diverged.
-    """
-    return LARGEST if value is None else float(value)
+    extra: dict[str, Tensor] = field(default_factory=dict)  # of exploration, such as ε, (P, 1)
 
 
 class Algorithm:
     """The part of an algorithm that is the same for all.
 
     A subclass sets ``layout``, the columns of its state's ``params`` (P, D), and ``acting``, the
-    first of them, which acting needs; it says how to act, and how to learn.
+    first of them, which acting needs. It defines ``fresh_state``, ``parameter_groups``, ``act``,
+    ``value`` and ``update``. It holds nothing that is learnt: that is in the state.
     """
 
-    state_type: ClassVar[Any]
+    store: ClassVar[Literal["rollout", "replay"]]
+    """What it learns from: a ``Rollout`` of its own recent rows, or a ``Sample`` from replay."""
+    action_spaces: ClassVar[tuple[type[gym.Space[Any]], ...]]
+    """The kinds of action spaces that it can act in."""
+    state_type: ClassVar[Any] = AgentState
     """The dataclass of tensors that it learns."""
-    settings: ClassVar[tuple[str, ...]] = ()
-    """Settings that each member has a value of its own of; all others shape the computation."""
+    member_hyperparameters: ClassVar[tuple[str, ...]] = ("learning_rate", "gamma")
+    """Fields of the config that each member has its own value of, and the state a tensor (P,)."""
     config: Any
     layout: Layout
     acting: Layout
     head: ActionHead
-    memory: int = 0
+    memory_size: int = 0
     """M, numbers that an environment's memory holds; 0: none."""
 
     def __init__(
-        self,
-        config: AlgorithmConfig,
-        observation_space: gym.Space[Any],
-        action_space: gym.Space[Any],
+        self, config: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         check_spaces(config, action_space)
         self.config = config
@@ -87,85 +96,19 @@ class Algorithm:
         self.obs, self.codec = obs_codec(observation_space), action_codec(action_space)
         self.normalize_obs = config.normalize_obs and self.obs.scaled
 
-    def fresh(self, members: int) -> dict[str, Tensor]:
-        """The fields that every state has: moments of observations and returns, settings."""
-        return {
-            "obs_mean": torch.zeros(members, self.obs.size),
-            "obs_var": torch.ones(members, self.obs.size),
-            "obs_count": torch.full((members,), 1e-4),
-            "return_mean": torch.zeros(members, 1),
-            "return_var": torch.ones(members, 1),
-            "return_count": torch.full((members,), 1e-4),
-            **{
-                k: torch.full((members,), setting_number(getattr(self.config, k)))
-                for k in self.settings
-            },
-        }
+    # What an algorithm defines
 
-    def actor(self, state: Any, progress: float = 1.0) -> Actor:
-        """A copy of what acting needs; ``progress`` is the share of the budget that is spent."""
-        views = self.acting.views(state.params[:, : self.acting.size].clone())
-        return Actor(views, *self.scaling(state))
+    def fresh_state(self, seeds: Sequence[Seeds]) -> Any:
+        """A state of fresh members, one for each seed, on the CPU; see ``fresh_fields``."""
+        self._missing("fresh_state")
 
-    def scaling(self, state: Any) -> tuple[Tensor | None, Tensor | None]:
-        """Shift and scale of observations, each (P, 1, O), or None where they are not scaled."""
-        if not self.normalize_obs:
-            return None, None
-        return _scaling(state.obs_mean, state.obs_var)
-
-    def families(self) -> list[Family]:
+    def parameter_groups(self) -> list[ParameterGroup]:
         """Everything in the state that has the shape of networks."""
-        raise NotImplementedError
-
-    def layouts(self) -> dict[str, Layout]:
-        """The fields of the state that hold parameters, or moments of them, and their columns."""
-        return {name: f.layout for f in self.families() for name in (*f.weights, *f.moments)}
-
-    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of one member's ``weights``."""
-        scaling = {"obs_mean": (self.obs.size,), "obs_var": (self.obs.size,)}
-        return self.layout.shapes | (scaling if self.normalize_obs else {})
-
-    def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
-        """One member's policy by name: parameters and observation scaling, copied."""
-        named = {k: v[member].clone() for k, v in self.layout.views(state.params).items()}
-        if self.normalize_obs:
-            named |= {k: getattr(state, k)[member].clone() for k in ("obs_mean", "obs_var")}
-        return named
-
-    def set_weights(self, state: Any, weights: Mapping[str, Tensor]) -> None:
-        """The inverse of ``weights`` for a state of one member, in place; its slow copy follows."""
-        for name in self.families()[0].weights:
-            for k, view in self.layout.views(getattr(state, name)).items():
-                view[0].copy_(weights[k])
-        if self.normalize_obs:
-            for k in ("obs_mean", "obs_var"):
-                getattr(state, k)[0].copy_(weights[k])
-
-    def actor_of(self, weights: Mapping[str, Tensor]) -> Actor:
-        """The actor of one member's ``weights`` (P = 1)."""
-        views = {k: weights[k][None].clone() for k in self.acting.shapes}
-        if not self.normalize_obs:
-            return Actor(views, None, None)
-        return Actor(views, *_scaling(weights["obs_mean"][None], weights["obs_var"][None]))
-
-    def inputs(self, actor: Actor, obs: Tensor) -> Inputs:
-        """Raw observations (P, B, *item) as the network's inputs; images stay as they came."""
-        vector, images = self.obs.split(obs)
-        found = {f"image.{i}": image for i, image in enumerate(images)}
-        if self.obs.size:
-            if actor.shift is not None and actor.scale is not None:
-                vector = ((vector - actor.shift) * actor.scale).clamp(-10.0, 10.0)
-            found["vector"] = vector
-        return found
-
-    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Any:
-        """Exploration noise for ``steps`` calls of ``act``, by step; a stream a member."""
-        return self.head.noise(generators, steps, batch)
+        self._missing("parameter_groups")
 
     def act(
         self,
-        actor: Actor,
+        params: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: Any,
@@ -179,38 +122,156 @@ class Algorithm:
             noise: one step of ``noise``, or None to act greedily.
             memory: (P, B, M), for networks that have one.
         """
-        raise NotImplementedError
+        self._missing("act")
 
-    def init(self, seeds: list[Seeds]) -> Any:
-        """Fresh members, one for each seed; a member does not depend on its neighbours."""
+    def value(self, state: Any, obs: Tensor, mask: Tensor | None = None) -> Tensor:
+        """What it expects of raw observations (P, B, *item), in units of reward, (P, B).
+
+        Args:
+            mask: (P, B, A) bool, allowed actions, or None: all.
+        """
+        self._missing("value")
+
+    def update(
+        self, state: Any, batch: Any, rng: Sequence[torch.Generator]
+    ) -> tuple[Any, Report]:
+        """Learn from a batch, in place; returns the state and what to tell.
+
+        Args:
+            batch: of the kind that ``store`` says, on the device of the state.
+            rng: one generator per member, on the CPU.
+        """
+        self._missing("update")
+
+    # What all share
+
+    def init(self, seeds: Sequence[Seeds]) -> Any:
+        """Fresh members on the CPU, one for each seed; none depends on its neighbours."""
         with torch_threads(1):  # of a QR decomposition, the last bits depend on their number
-            return self._fresh_state(seeds)
+            return self.fresh_state(seeds)
 
-    def _fresh_state(self, seeds: list[Seeds]) -> Any:
-        """What ``init`` returns."""
-        raise NotImplementedError
+    def member_generators(self, seeds: Sequence[Seeds]) -> list[torch.Generator]:
+        """The generators of fresh members' weights."""
+        return [(s / "init").torch() for s in seeds]
 
-    def see(self, state: Any, obs: Tensor) -> None:
-        """Take observations (P, B, *item) into account in the running moments, in place."""
+    def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
+        """The fields that every state has, of fresh parameters (P, D)."""
+        members = len(params)
+        return {
+            "params": params,
+            "mu": torch.zeros_like(params),
+            "nu": torch.zeros_like(params),
+            "count": torch.zeros(members, dtype=torch.int64),
+            "obs_mean": torch.zeros(members, self.obs.size),
+            "obs_var": torch.ones(members, self.obs.size),
+            "obs_count": torch.full((members,), 1e-4),
+            "return_mean": torch.zeros(members, 1),
+            "return_var": torch.ones(members, 1),
+            "return_count": torch.full((members,), 1e-4),
+            **{
+                k: torch.full((members,), setting_number(getattr(self.config, k)))
+                for k in self.member_hyperparameters
+            },
+        }
+
+    def acting_params(
+        self, state: Any, progress: float = 1.0, device: Device = "cpu"
+    ) -> ActingParams:
+        """A copy of what acting needs; ``progress`` is the share of the budget that is spent."""
+        flat = state.params[:, : self.acting.size].detach().to(device, copy=True)
+        scaling = (None if x is None else x.to(device) for x in self.scaling(state))
+        return ActingParams(self.acting.views(flat), *scaling)
+
+    def learning_params(self, state: Any) -> ActingParams:
+        """What learning needs to act with the parameters as they are; not a copy."""
+        return ActingParams(self.layout.views(state.params), *self.scaling(state))
+
+    def scaling(self, state: Any) -> tuple[Tensor | None, Tensor | None]:
+        """Shift and scale of observations, each (P, 1, O), or None where they are not scaled."""
+        if not self.normalize_obs:
+            return None, None
+        return _scaling(state.obs_mean, state.obs_var)
+
+    def layouts(self) -> dict[str, Layout]:
+        """The fields of the state that hold parameters, or moments of them, and their columns."""
+        groups = self.parameter_groups()
+        return {name: g.layout for g in groups for name in (*g.weights, *g.moments)}
+
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of one member's ``weights``."""
+        scaling = {"obs_mean": (self.obs.size,), "obs_var": (self.obs.size,)}
+        return self.layout.shapes | (scaling if self.normalize_obs else {})
+
+    def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
+        """One member's policy by name: parameters and observation scaling, copied to the CPU."""
+        named = {k: v[member] for k, v in self.layout.views(state.params).items()}
+        if self.normalize_obs:
+            named |= {k: getattr(state, k)[member] for k in ("obs_mean", "obs_var")}
+        return {k: v.detach().to("cpu", copy=True) for k, v in named.items()}
+
+    def set_weights(self, state: Any, weights: Mapping[str, Tensor]) -> None:
+        """The inverse of ``weights`` for a state of one member, in place; its slow copy follows."""
+        for name in self.parameter_groups()[0].weights:
+            for k, view in self.layout.views(getattr(state, name)).items():
+                view[0].copy_(weights[k])
+        if self.normalize_obs:
+            for k in ("obs_mean", "obs_var"):
+                getattr(state, k)[0].copy_(weights[k])
+
+    def acting_params_of(self, weights: Mapping[str, Tensor]) -> ActingParams:
+        """What acting needs, of one member's ``weights`` (P = 1)."""
+        views = {k: weights[k][None].clone() for k in self.acting.shapes}
+        if not self.normalize_obs:
+            return ActingParams(views, None, None)
+        return ActingParams(views, *_scaling(weights["obs_mean"][None], weights["obs_var"][None]))
+
+    def inputs(self, params: ActingParams, obs: Tensor) -> Inputs:
+        """Raw observations (P, B, *item) as the network's inputs; images stay as they came."""
+        vector, images = self.obs.split(obs)
+        found = {f"image.{i}": image for i, image in enumerate(images)}
+        if self.obs.size:
+            if params.shift is not None and params.scale is not None:
+                vector = ((vector - params.shift) * params.scale).clamp(-10.0, 10.0)
+            found["vector"] = vector
+        return found
+
+    def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:
+        """Exploration noise for ``steps`` calls of ``act``, by step; one generator per member."""
+        return self.head.noise(generators, steps, batch)
+
+    def update_obs_stats(self, state: Any, obs: Tensor, valid: Tensor | None = None) -> None:
+        """Take observations (P, B, *item) into account in the running moments, in place.
+
+        Args:
+            valid: (P, B) bool, rows that count; None: all.
+        """
         if self.normalize_obs:
             moments = state.obs_mean, state.obs_var, state.obs_count
             vector, _ = self.obs.split(obs)
-            state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector)
+            state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector, valid)
 
-    def see_returns(self, state: Any, returns: Tensor) -> None:
+    def update_return_stats(
+        self, state: Any, returns: Tensor, valid: Tensor | None = None
+    ) -> None:
         """Take returns (P, B) into account in their running moments, in place."""
         moments = state.return_mean, state.return_var, state.return_count
         state.return_mean, state.return_var, state.return_count = merge_moments(
-            *moments, returns[..., None]
+            *moments, returns[..., None], valid
         )
 
     def to_env(self, action: Array) -> Array:
         """Policy units (n, …) to the environment's."""
         return self.codec.to_env(action)
 
-    def member_generators(self, seeds: list[Seeds]) -> list[torch.Generator]:
-        """The generators of fresh members' weights."""
-        return [(s / "init").torch() for s in seeds]
+    def _missing(self, method: str) -> NoReturn:
+        raise SkillweaveError(
+            f"{type(self).__name__} has no method {method!r}, which every algorithm needs; "
+            "see skillweave.Algorithm"
+        )
+
+
+REQUIRED = ("fresh_state", "parameter_groups", "act", "value", "update")
+"""Methods that an algorithm must define."""
 
 
 def _scaling(mean: Tensor, var: Tensor) -> tuple[Tensor, Tensor]:

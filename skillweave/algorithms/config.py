@@ -30,25 +30,49 @@ from skillweave.types import SkillweaveError
 
 
 @dataclass(frozen=True)
-class PPO:
-    """Proximal policy optimisation (Schulman et al. 2017)."""
+class OnPolicy:
+    """What the algorithms that learn from their own latest rollout have in common."""
 
     num_envs: int = 64
     """Environments stepped side by side."""
     n_steps: int = 64
     """Environment steps of each environment between updates, for selectors too."""
+    learning_rate: float = 1e-3
+    """Adam's step size, at the start."""
+    gamma: float = 0.995
+    """Discount γ of one step."""
+    normalize_obs: bool = True
+    """Running zero mean, unit deviation of observations; saved with the policy."""
+    network: Network = field(default_factory=Network)
+    """The actor's network."""
+    overlap: bool = True
+    """Collect the next rollout while learning from the last: the data is one update old."""
+    threads: int = 1
+    """Torch threads while learning."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where learning runs; auto: on a GPU where there is one. Acting runs on the CPU."""
+
+    def __post_init__(self) -> None:
+        check_networks(self)
+        flags(self)
+        whole(self, "num_envs", "n_steps", "threads")
+        number(self, "gamma", high=1.0)
+        positive(self, "learning_rate")
+        one_of(self, "device", ("cpu", "cuda", "auto"))
+
+
+@dataclass(frozen=True)
+class PPO(OnPolicy):
+    """Proximal policy optimisation (Schulman et al. 2017)."""
+
     batch_size: int = 256
     """Samples of one gradient step (a minibatch), about; a smaller rollout is one minibatch."""
     update_epochs: int = 4
     """Passes over each rollout."""
-    learning_rate: float = 1e-3
-    """Adam's step size, at the start."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
     """constant; linear: falls to 0 over the budget; kl: follows target_kl."""
     adam_eps: float = 1e-5
     """Adam's ε."""
-    gamma: float = 0.995
-    """Discount γ of one step."""
     gae_lambda: float = 0.98
     """λ of generalised advantage estimation."""
     clip_coef: float = 0.2
@@ -67,8 +91,6 @@ class PPO:
     """KL at which an update stops early, or that the 'kl' schedule aims at."""
     normalize_advantage: bool = True
     """Zero mean, unit deviation of the advantages of each update."""
-    normalize_obs: bool = True
-    """Running zero mean, unit deviation of observations; saved with the policy."""
     normalize_returns: bool = True
     """The critic learns returns in units of their running deviation: no reward is too large."""
     action_std_init: float = 0.6
@@ -77,21 +99,14 @@ class PPO:
     """The deviation is a parameter of its own, or depends on the state."""
     squash_actions: bool = False
     """Continuous actions go through tanh, else they are clipped to the bounds."""
-    network: Network = field(default_factory=Network)
-    """The actor's network."""
     critic: Network | None = None
     """The critic's network; None: as the actor's."""
-    overlap: bool = True
-    """Collect the next rollout while learning from the last: the data is one update old."""
-    threads: int = 1
-    """Torch threads while learning."""
 
     def __post_init__(self) -> None:
-        check_networks(self)
-        flags(self)
-        whole(self, "num_envs", "n_steps", "batch_size", "update_epochs", "threads")
-        number(self, "gamma", "gae_lambda", high=1.0)
-        positive(self, "learning_rate", "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")
+        super().__post_init__()
+        whole(self, "batch_size", "update_epochs")
+        number(self, "gae_lambda", high=1.0)
+        positive(self, "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")
         number(self, "ent_coef", "vf_coef")
         if self.ent_coef_final is not None:
             number(self, "ent_coef_final")
@@ -108,27 +123,70 @@ class PPO:
         check(self, "batch_size", self.batch_size <= most, says)
 
 
-AlgorithmConfig: TypeAlias = PPO | DQN | TD3 | SAC
-"""Any algorithm's settings."""
+AlgorithmConfig: TypeAlias = OnPolicy | OffPolicy
+"""Any algorithm's settings, those of users' own algorithms included."""
 
-_KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "TD3": TD3, "SAC": SAC}
-_SPACES = gym.spaces
-_ACTS: dict[str, tuple[type, ...]] = {
-    "PPO": (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box),
-    "DQN": (_SPACES.Discrete,),
-    "TD3": (_SPACES.Box,),
-    "SAC": (_SPACES.Box, _SPACES.Discrete),
+
+@dataclass(frozen=True)
+class Registration:
+    """An algorithm that is known by the name of its settings."""
+
+    config: type[Any]
+    """The dataclass of its settings."""
+    algorithm: Any
+    """Its class, or where that is, as ``module:class``."""
+    action_spaces: tuple[type[gym.Space[Any]], ...]
+    """The kinds of action spaces that it can act in."""
+
+
+_SPACES, _HOME = gym.spaces, "skillweave.algorithms"
+_REGISTERED: dict[str, Registration] = {
+    "PPO": Registration(
+        PPO,
+        f"{_HOME}.ppo:PPOAlgorithm",
+        (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box),
+    ),
+    "DQN": Registration(DQN, f"{_HOME}.dqn:DQNAlgorithm", (_SPACES.Discrete,)),
+    "TD3": Registration(TD3, f"{_HOME}.td3:TD3Algorithm", (_SPACES.Box,)),
+    "SAC": Registration(SAC, f"{_HOME}.sac:SACAlgorithm", (_SPACES.Box, _SPACES.Discrete)),
 }
-"""The action spaces that each algorithm can act in."""
+BUILT_IN = tuple(_REGISTERED)
+"""Names of the algorithms of this library."""
 
 
-def check_spaces(config: AlgorithmConfig, action_space: gym.Space[Any], where: str = "") -> None:
+def add_registration(found: Registration) -> None:
+    """Make an algorithm known, or known anew; see ``registry.register_algorithm``."""
+    _REGISTERED[found.config.__name__] = found
+
+
+def registration_of(config: Any) -> Registration:
+    """The algorithm that settings belong to.
+
+    Raises:
+        SkillweaveError: it was never registered.
+    """
+    kind = type(config)
+    for found in _REGISTERED.values():
+        if found.config is kind:
+            return found
+    raise SkillweaveError(_not_registered(kind.__name__))
+
+
+def _not_registered(name: str) -> str:
+    return (
+        f"no algorithm is registered for {name}; there are: {', '.join(_REGISTERED)}. An algorithm "
+        "of your own must be registered in every process that uses it, before it is used: call "
+        "skillweave.register_algorithm(its settings, its class) in the file that defines it, and "
+        "import that file in your program or recipe"
+    )
+
+
+def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> None:
     """Raise a SkillweaveError where an algorithm cannot act in a space; it names those that can."""
-    kind = type(config).__name__
-    if not isinstance(action_space, _ACTS[kind]):
-        able = [name for name, spaces in _ACTS.items() if isinstance(action_space, spaces)]
+    if not isinstance(action_space, registration_of(config).action_spaces):
+        able = [k for k, r in _REGISTERED.items() if isinstance(action_space, r.action_spaces)]
         raise SkillweaveError(
-            f"{where}{kind} cannot act in {action_space}; "
+            f"{where}{type(config).__name__} cannot act in {action_space}; "
             + (f"{', '.join(able)} can" if able else "no algorithm here can")
         )
 
@@ -140,7 +198,8 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
         SkillweaveError: there is none of this name; the message, which begins with ``where``,
             lists them.
     """
-    presets: dict[str, Any] = {**_KINDS, "Rainbow": DQN.rainbow, "DDPG": TD3.ddpg}
+    kinds = {name: found.config for name, found in _REGISTERED.items()}
+    presets: dict[str, Any] = {**kinds, "Rainbow": DQN.rainbow, "DDPG": TD3.ddpg}
     for known, make in presets.items():
         if known.lower() == name.lower():
             config: AlgorithmConfig = make()
@@ -166,12 +225,11 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
     """
     values: dict[str, Any] = fit(dict[str, Any], data, file, path)
     kind = values.pop("algorithm", None)
-    if not isinstance(kind, str) or kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _REGISTERED:
         where = f"{file}: {path}: " if file else ""
-        known = ", ".join(_KINDS)
-        raise SkillweaveError(f"{where}unknown algorithm {shown(kind)}; known are: {known}")
-    config: AlgorithmConfig = fit(_KINDS[kind], values, file, path or kind)
+        raise SkillweaveError(f"{where}{_not_registered(shown(kind))}")
+    config: AlgorithmConfig = fit(_REGISTERED[kind].config, values, file, path or kind)
     return config
 
 
-__all__ = ["DQN", "PPO", "SAC", "TD3", "AlgorithmConfig", "OffPolicy"]
+__all__ = ["DQN", "PPO", "SAC", "TD3", "AlgorithmConfig", "OffPolicy", "OnPolicy"]

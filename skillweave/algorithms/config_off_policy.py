@@ -71,7 +71,7 @@ def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
 def flags(config: Any) -> None:
     """Raise where a field that is yes or no is something else."""
     for f in fields(config):
-        if f.type == "bool":
+        if f.type in ("bool", bool):
             check(config, f.name, isinstance(getattr(config, f.name), bool), "True or False")
 
 
@@ -132,6 +132,8 @@ class OffPolicy:
     """Torch threads while learning."""
     compile: bool = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where learning runs; auto: on a GPU where there is one. Acting runs on the CPU."""
 
     def __post_init__(self) -> None:
         check_networks(self)
@@ -145,6 +147,7 @@ class OffPolicy:
         number(self, "learning_starts")
         check(self, "learning_starts", type(self.learning_starts) is int, "a whole number")
         one_of(self, "learning_rate_schedule", ("constant", "linear"))
+        one_of(self, "device", ("cpu", "cuda", "auto"))
         check(self, "batch_size", self.batch_size <= 1_000_000, "at most 1,000,000")
         least = self.num_envs * (self.n_step + 1)
         check(
@@ -269,15 +272,15 @@ class TD3(ActorCritic):
 
 @dataclass(frozen=True)
 class SAC(ActorCritic):
-    """Soft actor-critic (Haarnoja et al. 2018b); of choices too (Christodoulou 2019)."""
+    """Soft actor-critic (Haarnoja et al. 2018b); for discrete actions Christodoulou 2019."""
 
     ent_coef: float = 1.0
     """The temperature α; where it is learnt, at the start."""
     learn_ent_coef: bool = True
     """α is learnt, so that the policy's entropy is ``target_entropy``."""
     target_entropy: float | None = None
-    """Entropy aimed at, in nats; None: −A for A continuous actions, half of log A for choices.
-    Where a mask allows m of A choices, it is this times log m / log A."""
+    """Entropy aimed at, in nats; None: −A for A continuous actions, half of log A for A discrete
+    ones. Where a mask allows m of A discrete actions, it is this times log m / log A."""
     policy_delay: int = 1
     """Critic updates for each update of the actor."""
 

@@ -13,59 +13,47 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Family
+from skillweave.algorithms.base import ActingParams, Device
 from skillweave.algorithms.config import DQN
-from skillweave.algorithms.off_policy import OffPolicyAlgorithm, normal, weighted_mean
+from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState, normal
+from skillweave.algorithms.parameters import ParameterGroup
+from skillweave.experience import Sample
 from skillweave.networks.encoders import Inputs
-from skillweave.networks.net import QNet
+from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Layout, Views
+from skillweave.ops.device import Constant
 from skillweave.ops.distributions import mask_logits
-from skillweave.ops.losses import categorical_projection, td_loss
+from skillweave.ops.losses import categorical_projection, td_loss, weighted_mean
+from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
 
 WIDEST = 10.0
 """Largest return on atoms without v_min and v_max, in units of the returns seen so far."""
 
 
 @dataclass
-class State:
-    """Everything DQN learns and counts; P members, D parameters, O observation numbers."""
+class State(OffPolicyState):
+    """Everything DQN learns and counts."""
 
-    params: Tensor  # (P, D)
-    target: Tensor  # (P, D), the slow copy
-    mu: Tensor  # (P, D), Adam's first moment
-    nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
-    updates: Tensor  # (P,) int64, gradient steps
-    obs_mean: Tensor  # (P, O)
-    obs_var: Tensor  # (P, O)
-    obs_count: Tensor  # (P,)
-    return_mean: Tensor  # (P, 1)
-    return_var: Tensor  # (P, 1)
-    return_count: Tensor  # (P,)
-    learning_rate: Tensor  # (P,); this and all below are settings, one a member
-    gamma: Tensor  # (P,)
-    tau: Tensor  # (P,)
-    max_grad_norm: Tensor  # (P,)
+    target: Tensor  # (P, D), the slow copy of ``params``
 
 
 class DQNAlgorithm(OffPolicyAlgorithm):
     """DQN on one pair of spaces. Holds no learnt state: that is in ``State``."""
 
     state_type = State
-    settings = ("learning_rate", "gamma", "tau", "max_grad_norm")
 
     def __init__(
         self, config: DQN, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
         self.interval = config.target_update_interval
-        self.atoms = None
+        self.atoms: Constant | None = None
+        """C51's atoms, (N,)."""
         if config.distributional:
             low = -WIDEST if config.v_min is None else config.v_min
             high = WIDEST if config.v_max is None else config.v_max
-            self.atoms = torch.linspace(low, high, config.n_atoms)
+            self.atoms = Constant(torch.linspace(low, high, config.n_atoms))
         self.net = QNet(
             self.obs, config.network, self.codec.size,
             atoms=config.n_atoms if config.distributional else 1,
@@ -83,41 +71,37 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         """Whether it needs the running moments of returns."""
         return super().scales_rewards or (self.atoms is not None and not self._given)
 
-    def rewards(self, state: State, sample: Sample) -> Tensor:
-        """Rewards (P, B) in the units of the atoms."""
+    def reward_scale(self, state: State) -> Tensor | None:
+        """What rewards are multiplied by, (P, 1): it brings them to the units of the atoms."""
         if self.atoms is None or self._given:
-            return super().rewards(state, sample)
+            return super().reward_scale(state)
         # The root of the mean square: of returns that are all alike the deviation would be 0.
         square = state.return_var + state.return_mean.square()
-        return sample.reward * (square + 1e-8).rsqrt()
+        return (square + 1e-8).rsqrt()
 
-    def _fresh_state(self, seeds: list[Seeds]) -> State:
+    def fresh_state(self, seeds: Sequence[Seeds]) -> State:
+        """A state of fresh members, one for each seed."""
         params = torch.zeros(len(seeds), self.layout.size)
         self.net.init_(self.layout.views(params), self.member_generators(seeds))
-        return State(
-            params=params,
-            target=params.clone(),
-            mu=torch.zeros_like(params),
-            nu=torch.zeros_like(params),
-            count=torch.zeros(len(seeds), dtype=torch.int64),
-            **self.fresh(len(seeds)),
-        )
+        return State(**self.fresh_fields(params), target=params.clone())
 
-    def families(self) -> list[Family]:
+    def parameter_groups(self) -> list[ParameterGroup]:
         """Everything in the state that has the shape of networks."""
-        return [Family(self.layout, (("network", self.net),), ("params", "target"))]
+        return [ParameterGroup(self.layout, (("network", self.net),), ("params", "target"))]
 
-    def actor(self, state: State, progress: float = 1.0) -> Actor:
+    def acting_params(
+        self, state: State, progress: float = 1.0, device: Device = "cpu"
+    ) -> ActingParams:
         """A copy of what acting needs, with ε."""
-        cfg, actor = self.config, super().actor(state, progress)
+        cfg, params = self.config, super().acting_params(state, progress, device)
         spent = min(1.0, progress / max(cfg.exploration_fraction, 1e-9))
         start, final = cfg.exploration_initial_eps, cfg.exploration_final_eps
-        eps = start + spent * (final - start)
-        actor.extra["epsilon"] = torch.full((len(state.params), 1), 0.0 if cfg.noisy else eps)
-        return actor
+        eps = 0.0 if cfg.noisy else start + spent * (final - start)
+        params.extra["epsilon"] = torch.full((len(state.params), 1), eps, device=device)
+        return params
 
     def noise(
-        self, generators: list[torch.Generator], steps: int, batch: int
+        self, generators: Sequence[torch.Generator], steps: int, batch: int
     ) -> list[tuple[Tensor, Tensor | None]]:
         """For each step, uniform numbers (P, batch, A + 1) and the weights' noise (P, K)."""
         shape, inner = (steps, batch, self.codec.size + 1), self.net.noise_size
@@ -129,7 +113,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
 
     def act(
         self,
-        actor: Actor,
+        params: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: tuple[Tensor, Tensor | None] | None,
@@ -137,24 +121,30 @@ class DQNAlgorithm(OffPolicyAlgorithm):
     ) -> tuple[Tensor, Tensor, None]:
         """Actions (P, B), their values (P, B, A), and no memory; see ``Algorithm.act``."""
         uniform, normal = noise or (None, None)
-        views = actor.views if normal is None else self.net.perturbed(actor.views, normal)
-        q = mask_logits(self._q(self.net(views, self.inputs(actor, obs))), mask)
+        views = params.views if normal is None else self.net.perturbed(params.views, normal)
+        q = mask_logits(self._q(self.net(views, self.inputs(params, obs))), mask)
         action = q.argmax(-1)
         if uniform is not None:
             anything = mask_logits(uniform[..., 1:], mask).argmax(-1)
-            epsilon = actor.extra.get("epsilon")
+            epsilon = params.extra.get("epsilon")
             final = self.config.exploration_final_eps * (not self.config.noisy)
             explore = uniform[..., 0] < (final if epsilon is None else epsilon)
             action = torch.where(explore, anything, action)
         return action, q, None
 
+    def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
+        """``max Q`` over allowed actions, of C51 their means, in units of reward, (P, B)."""
+        params = self.learning_params(state)
+        q = self._q(self.net(params.views, self.inputs(params, obs)))
+        return self.in_rewards(state, mask_logits(q, mask).amax(-1))
+
     def learning_noise(
-        self, generators: list[torch.Generator], batch: int, due: bool
+        self, rng: Sequence[torch.Generator], batch: int, due: bool
     ) -> list[Tensor]:
         """Of the weights: online, the target's, and those that choose its action; (P, K) each."""
         if not self.config.noisy:
             return []
-        return list(normal(generators, 3, self.net.noise_size).unbind(1))
+        return list(normal(rng, 3, self.net.noise_size).unbind(1))
 
     def learn(
         self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
@@ -172,10 +162,10 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         self, views: Views, state: State, sample: Sample, noises: Sequence[Tensor | None]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Loss (P,), error of each sample (P, B) and mean value (P,), the latter two detached."""
-        actor = Actor({}, *self.scaling(state))
-        out = self.net(self._noisy(views, noises[0]), self.inputs(actor, sample.obs))
+        params = ActingParams({}, *self.scaling(state))
+        out = self.net(self._noisy(views, noises[0]), self.inputs(params, sample.obs))
         out = _taken(out, sample.action)
-        next_inputs = self.inputs(actor, sample.next_obs)
+        next_inputs = self.inputs(params, sample.next_obs)
         reward = self.rewards(state, sample)
         with torch.no_grad():
             target = self._target(views, state, sample, next_inputs, reward, noises)
@@ -186,7 +176,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         else:
             log_p = out.log_softmax(-1)
             each = -(target * log_p).sum(-1)
-            value = (log_p.detach().exp() * self.atoms).sum(-1)
+            value = (log_p.detach().exp() * self.atoms.on(log_p.device)).sum(-1)
             error = each.detach()
         return weighted_mean(each, sample.weight), error, value.detach().mean(1)
 
@@ -199,15 +189,16 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         reward: Tensor,
         noises: Sequence[Tensor | None],
     ) -> Tensor:
-        """r + discount·Q̄(s′, a′), (P, B); or its distribution over the atoms, (P, B, N)."""
+        """``r + discount·Q̄(s′, a′)``, (P, B); or its distribution over the atoms, (P, B, N)."""
         slow = self.layout.views(state.target)
         out = self.net(self._noisy(slow, noises[1]), inputs)
         judge = self.net(self._noisy(views, noises[2]), inputs) if self.config.double else out
-        best = mask_logits(self._q(judge), sample.mask).argmax(-1)
+        best = mask_logits(self._q(judge), sample.next_obs_mask).argmax(-1)
         chosen = _taken(out, best)
         if self.atoms is None:
-            return self.target(reward, sample.discount, chosen.squeeze(-1))
-        return categorical_projection(chosen.softmax(-1), self.atoms, reward, sample.discount)
+            return td_target(reward, sample.discount, chosen.squeeze(-1))
+        atoms = self.atoms.on(reward.device)
+        return categorical_projection(chosen.softmax(-1), atoms, reward, sample.discount)
 
     def _noisy(self, views: Views, noise: Tensor | None) -> Views:
         return views if noise is None else self.net.perturbed(views, noise)
@@ -216,7 +207,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         """Network outputs (P, B, A, atoms) as values (P, B, A)."""
         if self.atoms is None:
             return out.squeeze(-1)
-        return (out.softmax(-1) * self.atoms).sum(-1)
+        return (out.softmax(-1) * self.atoms.on(out.device)).sum(-1)
 
 
 def _taken(out: Tensor, action: Tensor) -> Tensor:

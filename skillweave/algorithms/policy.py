@@ -11,40 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm, Family
-from skillweave.algorithms.config import (
-    DQN,
-    PPO,
-    SAC,
-    TD3,
-    AlgorithmConfig,
-    config_from_json,
-    config_to_json,
-)
-from skillweave.algorithms.dqn import DQNAlgorithm
-from skillweave.algorithms.ppo import PPOAlgorithm
-from skillweave.algorithms.sac import SACAlgorithm
-from skillweave.algorithms.td3 import TD3Algorithm
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.config import config_from_json, config_to_json
+from skillweave.algorithms.parameters import ParameterGroup
+from skillweave.algorithms.registry import make_algorithm
 from skillweave.reading import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless, SkillweaveError
 
 S = TypeVar("S")
-_ALGORITHMS: dict[type, type[Algorithm]] = {
-    PPO: PPOAlgorithm,
-    DQN: DQNAlgorithm,
-    TD3: TD3Algorithm,
-    SAC: SACAlgorithm,
-}
-
-
-def make_algorithm(config: AlgorithmConfig, observation_space: Any, action_space: Any) -> Algorithm:
-    """The algorithm that these settings belong to, on one pair of spaces.
-
-    Raises:
-        SkillweaveError: it cannot act in these spaces; the message names those that can.
-    """
-    return _ALGORITHMS[type(config)](config, observation_space, action_space)
 
 
 class AgentPolicy(Memoryless):
@@ -52,7 +27,7 @@ class AgentPolicy(Memoryless):
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
         self.algorithm, self.weights = algorithm, weights
-        self._actor = algorithm.actor_of(weights)
+        self._params = algorithm.acting_params_of(weights)
         self.observation_space = algorithm.observation_space
         self.action_space = algorithm.action_space
 
@@ -63,7 +38,7 @@ class AgentPolicy(Memoryless):
 
     def start(self, n: int) -> Memory:
         """Zeros, (n, M), where the network has a memory."""
-        size = self.algorithm.memory
+        size = self.algorithm.memory_size
         return {"rnn": np.zeros((n, size), np.float32)} if size else {}
 
     @torch.inference_mode()
@@ -85,7 +60,7 @@ class AgentPolicy(Memoryless):
         allowed = None if mask is None else torch.from_numpy(mask)[None]
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
         before = torch.from_numpy(memory["rnn"])[None] if memory else None
-        action, _, after = self.algorithm.act(self._actor, rows, allowed, noise, before)
+        action, _, after = self.algorithm.act(self._params, rows, allowed, noise, before)
         memory = {} if after is None else {"rnn": after[0].numpy()}
         return self.algorithm.to_env(action[0].numpy()), memory
 
@@ -172,7 +147,7 @@ def checked_tensor(
 
 
 def state_from(
-    tensors: Mapping[str, Tensor], like: S, where: str, families: Sequence[Family] = ()
+    tensors: Mapping[str, Tensor], like: S, where: str, groups: Sequence[ParameterGroup] = ()
 ) -> S:
     """The state that ``tensors`` hold by field, if it is of the shapes and types of ``like``.
 
@@ -180,7 +155,7 @@ def state_from(
         SkillweaveError: it is not; the tensor is named.
     """
     shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
-    for family in families:  # after growth each parameter has an age of its own
+    for family in groups:  # after growth each parameter has an age of its own
         if tensors.get(family.count, torch.empty(0)).ndim > 1:
             shapes[family.count] = shapes[family.weights[0]]
     found = {
@@ -188,3 +163,8 @@ def state_from(
         for name, value in vars(like).items()
     }
     return type(like)(**found)
+
+
+__all__ = [
+    "AgentHeader", "AgentPolicy", "checked_tensor", "make_algorithm", "state_from",
+]  # fmt: skip

@@ -1,12 +1,13 @@
 """PPO (Schulman et al. 2017) for P members at once; a single agent is P = 1.
 
-Read down the page: State, init, act, update, loss. The settings are ``config.PPO``. What acted
-may be an update old: the objective is the decoupled one of Hilton, Cobbe & Schulman 2022.
+Read down the page: State, init, act, value, update, loss, preparation. The settings are
+``config.PPO``. What acted may be an update old: the objective is the decoupled one of Hilton, Cobbe
+& Schulman 2022.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,19 +15,29 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Algorithm, Family
+from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
 from skillweave.algorithms.config import PPO
-from skillweave.algorithms.minibatches import minibatches
+from skillweave.algorithms.parameters import ParameterGroup
+from skillweave.algorithms.rollouts import (
+    Cells,
+    Samples,
+    minibatches,
+    rows_where,
+    without_gaps,
+)
+from skillweave.experience import Report, Rollout
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views, take_rows
+from skillweave.ops.device import all_false
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
+from skillweave.ops.moments import explained_variance, masked_mean, normalise
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
-from skillweave.ops.returns import explained_variance, gae, normalise
+from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
-from skillweave.types import Array, Transition
+from skillweave.types import Array
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""
@@ -34,44 +45,22 @@ _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
 
 @dataclass
-class State:
-    """Everything PPO learns and counts; P members, D parameters, O observation numbers."""
+class State(AgentState):
+    """Everything PPO learns and counts; ``params`` is the actor first, then the critic."""
 
-    params: Tensor  # (P, D), actor first, then critic
-    mu: Tensor  # (P, D), Adam's first moment
-    nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
-    obs_mean: Tensor  # (P, O)
-    obs_var: Tensor  # (P, O)
-    obs_count: Tensor  # (P,)
-    return_mean: Tensor  # (P, 1)
-    return_var: Tensor  # (P, 1)
-    return_count: Tensor  # (P,)
-    learning_rate: Tensor  # (P,); this and all below are settings, one a member
-    gamma: Tensor  # (P,)
-    gae_lambda: Tensor  # (P,)
+    gae_lambda: Tensor  # (P,), as all below a hyperparameter of each member
     clip_coef: Tensor  # (P,)
     ent_coef: Tensor  # (P,)
     vf_coef: Tensor  # (P,)
     max_grad_norm: Tensor  # (P,)
 
 
-@dataclass
-class Rollout:
-    """Transitions with what the acting policy's distribution was (``head``: logits, or mean)."""
-
-    transition: Transition
-    head: Tensor  # (P, T, B, A)
-    log_std: Tensor | None  # (P, 1, 1, A), continuous actions
-    memory: Tensor | None = None  # (P, B, M), before the first step
-    start: Tensor | None = None  # (P, T, B) bool, an episode begins within the rollout
-
-
 class PPOAlgorithm(Algorithm):
     """PPO on one pair of spaces. Holds no learnt state: that is in ``State``."""
 
+    store = "rollout"
     state_type = State
-    settings = (
+    member_hyperparameters = (
         "learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "vf_coef",
         "max_grad_norm",
     )  # fmt: skip
@@ -87,213 +76,222 @@ class PPOAlgorithm(Algorithm):
         if not self.head.discrete and not self.head.std_in_head:
             acting["actor.log_std"] = (1, self.codec.size)
         self.layout = Layout(acting | self.critic_net.shapes)
-        self.memory = self.actor_net.memory + self.critic_net.memory
+        self.memory_size = self.actor_net.memory_size + self.critic_net.memory_size
         # With memory the critic runs along while acting: its memory must be known, too.
-        self.acting = self.layout if self.memory else Layout(acting)
+        self.acting = self.layout if self.memory_size else Layout(acting)
 
-    def _fresh_state(self, seeds: list[Seeds]) -> State:
-        members, cfg = len(seeds), self.config
-        params = torch.zeros(members, self.layout.size)
-        views = self.layout.views(params)
-        generators = self.member_generators(seeds)
+    def fresh_state(self, seeds: Sequence[Seeds]) -> State:
+        """A state of fresh members, one for each seed."""
+        params = torch.zeros(len(seeds), self.layout.size)
+        views, generators = self.layout.views(params), self.member_generators(seeds)
         self.actor_net.init_(views, 0.01, generators)
         self.critic_net.init_(views, 1.0, generators)
         if self.head.std_in_head:
             bias = views[f"{self.actor_net.head}.bias"]
-            bias[..., self.codec.size :].fill_(cfg.action_std_init).log_()
+            bias[..., self.codec.size :].fill_(self.config.action_std_init).log_()
         elif not self.head.discrete:
-            views["actor.log_std"].fill_(cfg.action_std_init).log_()
-        return State(
-            params=params,
-            mu=torch.zeros_like(params),
-            nu=torch.zeros_like(params),
-            count=torch.zeros(members, dtype=torch.int64),
-            **self.fresh(members),
-        )
+            views["actor.log_std"].fill_(self.config.action_std_init).log_()
+        return State(**self.fresh_fields(params))
 
-    def families(self) -> list[Family]:
+    def parameter_groups(self) -> list[ParameterGroup]:
         """Everything in the state that has the shape of networks."""
         nets = ("network", self.actor_net), ("critic", self.critic_net)
-        return [Family(self.layout, nets)]
+        return [ParameterGroup(self.layout, nets)]
 
     def act(
         self,
-        actor: Actor,
+        params: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: Tensor | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Actions in policy units, the head they came from, and the memory; `Algorithm.act`."""
-        inputs = self.inputs(actor, obs)
+        inputs, views = self.inputs(params, obs), params.views
         if memory is None:
-            head = self.actor_net(actor.views, inputs)
+            head = self.actor_net(views, inputs)
         else:
-            cut = self.actor_net.memory
-            head, after = self.actor_net.step(actor.views, inputs, memory[..., :cut])
-            _, other = self.critic_net.step(actor.views, inputs, memory[..., cut:])
-            memory = torch.cat([after, other], dim=-1)
+            own, other = memory.tensor_split([self.actor_net.memory_size], dim=-1)
+            head, own = self.actor_net.step(views, inputs, own)
+            _, other = self.critic_net.step(views, inputs, other)
+            memory = torch.cat([own, other], dim=-1)
         if self.head.discrete:
             head = mask_logits(head, mask)
-        return self.head.act(head, actor.views.get("actor.log_std"), noise), head, memory
+        return self.head.act(head, views.get("actor.log_std"), noise), head, memory
 
     def to_env(self, action: Array) -> Array:
         """Policy units (n, …) to the environment's."""
         return self.head.to_env(action)
 
-    def value(self, state: State, obs: Tensor) -> Tensor:
-        """V in reward units; raw observations (P, B, *item) to (P, B). Not for memories."""
-        inputs = self.inputs(self.actor(state), obs)
-        return self._in_rewards(state, self.critic_net(self.layout.views(state.params), inputs))
+    def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
+        """V in units of reward, (P, B); with a memory, that of an episode's first observation."""
+        params = self.learning_params(state)
+        inputs, size = self.inputs(params, obs), self.critic_net.memory_size
+        if not size:
+            return self._in_rewards(state, self.critic_net(params.views, inputs))
+        empty = state.params.new_zeros(*obs.shape[:2], size)
+        return self._in_rewards(state, self.critic_net.step(params.views, inputs, empty)[0])
 
     def update(
-        self, state: State, rollout: Rollout, progress: float, seeds: list[Seeds]
-    ) -> tuple[State, dict[str, Tensor]]:
-        """Learn from a rollout, in place; returns the state and metrics of shape (P,).
-
-        Args:
-            progress: share of the budget that is spent, for the learning-rate schedule.
-            seeds: one a member, for the order of the minibatches.
-        """
-        cfg, tr = self.config, rollout.transition
-        data, metrics = self._prepare(state, rollout)
+        self, state: State, batch: Rollout, rng: Sequence[torch.Generator]
+    ) -> tuple[State, Report]:
+        """Learn from the valid rows of a rollout, in place; ``rng`` orders the minibatches."""
+        cfg = self.config
+        samples, metrics = self._prepare(state, without_gaps(batch))
         leaves = self.layout.leaves(state.params)
-        rate, ent_coef = state.learning_rate, state.ent_coef
-        if cfg.learning_rate_schedule == "linear":
-            rate = rate * (1.0 - progress)
-        if cfg.ent_coef_final is not None:
-            ent_coef = torch.lerp(ent_coef, torch.full_like(rate, cfg.ent_coef_final), progress)
+        rate, ent_coef = self._scheduled(state, batch.progress)
         limit = None if cfg.learning_rate_schedule == "kl" else cfg.target_kl
-        active = torch.ones(len(seeds), dtype=torch.bool)
-        counted = torch.zeros(len(seeds))
-        sums = torch.zeros(len(REPORT), len(seeds))
-        for batch in minibatches(data, seeds, cfg.update_epochs, cfg.batch_size):
-            loss, report = self.loss(leaves, state, batch, ent_coef)
+        count = samples.count
+        active, all_learn = count > 0, limit is None and samples.valid is None
+        taken, sums = torch.zeros_like(rate), rate.new_zeros(len(REPORT), len(rate))
+        for minibatch in minibatches(samples, rng, cfg.update_epochs, cfg.batch_size):
+            loss, report = self.loss(leaves, state, minibatch, ent_coef)
             grad = self.layout.gradient(loss, leaves)
             report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
-            counted = counted + active
+            taken = taken + active
             sums.addcmul_(torch.stack([report[k] for k in REPORT]), active.float())
             if limit is not None:
                 # As in Stable-Baselines3: a member stops before the step that oversteps.
                 active = active & (report["kl"] <= 1.5 * limit)
-                if not bool(active.any()):
+                if all_false(active):
                     break
             adam_(
                 state.params, grad, state.mu, state.nu, state.count, rate,
-                eps=cfg.adam_eps, active=None if limit is None else active,
+                eps=cfg.adam_eps, active=None if all_learn else active,
             )  # fmt: skip
-        metrics |= dict(zip(REPORT, sums / counted, strict=True))
+        metrics |= dict(zip(REPORT, sums / taken.clamp_min(1.0), strict=True))
         if cfg.learning_rate_schedule == "kl":
             target = torch.full_like(rate, cfg.target_kl or 0.0)
             state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)
-        metrics["learning_rate"] = rate
-        metrics["samples"] = torch.full_like(rate, float(tr.reward[0].numel()))
-        return state, metrics
+        return state, Report(metrics | {"learning_rate": rate, "samples": count})
 
-    def _run(self, net: Net, views: Views, batch: Mapping[str, Tensor]) -> Tensor:
-        """A network's outputs for a batch, (P, N, out); sequences are laid end to end."""
-        if "memory" not in batch:
-            return net(views, _inputs(batch))
-        cut = self.actor_net.memory
-        memory = batch["memory"]
-        memory = memory[..., :cut] if net is self.actor_net else memory[..., cut:]
-        return net.sequence(views, _inputs(batch), memory, batch["start"])[0].flatten(1, 2)
+    def _scheduled(self, state: State, progress: float) -> tuple[Tensor, Tensor]:
+        """Learning rate and entropy coefficient now, each (P,)."""
+        rate, ent_coef, final = state.learning_rate, state.ent_coef, self.config.ent_coef_final
+        if self.config.learning_rate_schedule == "linear":
+            rate = rate * (1.0 - progress)
+        if final is not None:
+            ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
+        return rate, ent_coef
 
     def loss(
-        self, views: Views, state: State, batch: Mapping[str, Tensor], ent_coef: Tensor
+        self, views: Views, state: State, batch: Samples, ent_coef: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Policy, value and entropy loss of one minibatch, (P,), and detached metrics (P,)."""
-        head = self._run(self.actor_net, views, batch)
-        raw = self._run(self.critic_net, views, batch).squeeze(-1)
-        if "memory" in batch:
-            batch = {k: v.flatten(1, 2) for k, v in batch.items() if k != "memory"}
-        log_std, mask = views.get("actor.log_std"), batch.get("mask")
-        log_prob, entropy = self.head.stats(head, log_std, mask, batch["action"])
-        proximal, weight = batch["proximal"], batch["weight"]
-        policy = ppo_policy_loss(log_prob, proximal, batch["advantage"], state.clip_coef, weight)
+        head, _ = self._run(self.actor_net, views, batch.inputs, batch.memory, batch.starts)
+        raw, _ = self._run(self.critic_net, views, batch.inputs, batch.memory, batch.starts)
+        if batch.memory is not None:
+            batch = batch.changed(lambda x: x.flatten(1, 2))
+        log_std, valid = views.get("actor.log_std"), batch.valid
+        log_prob, entropy = self.head.stats(head, log_std, batch.mask, batch.action)
+        old, weight = batch.log_prob, batch.importance
+        policy = ppo_policy_loss(log_prob, old, batch.advantage, state.clip_coef, weight, valid)
         clip = self.config.clip_value
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
-        value = value_loss(raw, batch["target"], batch.get("old_value"), bound)
-        bonus = entropy.mean(1)
+        value = value_loss(raw.squeeze(-1), batch.target, batch.old_value, bound, valid)
+        bonus = masked_mean(entropy, valid)
         total = policy + state.vf_coef * value - ent_coef * bonus
         with torch.no_grad():
-            kl = approximate_kl(log_prob, proximal, weight)
+            kl = approximate_kl(log_prob, old, weight, valid)
         report = {"policy_loss": policy, "value_loss": value, "entropy": bonus, "kl": kl}
         return total, {k: v.detach() for k, v in report.items()}
 
     @torch.no_grad()
-    def _prepare(
-        self, state: State, rollout: Rollout
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The rollout as (P, T, B, ...) tensors: inputs, action, advantage, target, and so on."""
-        cfg, tr = self.config, rollout.transition
-        self.see(state, tr.obs.flatten(1, 2))
-        actor, views = self.actor(state), self.layout.views(state.params)
-        inputs = self.inputs(actor, tr.obs.flatten(1, 2))
-        data = {k: v.unflatten(1, tr.reward.shape[1:]) for k, v in inputs.items()}
-        if rollout.memory is not None and rollout.start is not None:
-            data |= {"memory": rollout.memory, "start": rollout.start}
-            inputs = data
-        acted, _ = self.head.stats(rollout.head, rollout.log_std, tr.mask, tr.action)
-        # Clipping and KL count from the policy as it is now, whoever acted.
-        head = self._run(self.actor_net, views, inputs).view_as(rollout.head)
-        log_std = None if rollout.log_std is None else views["actor.log_std"][:, None]
-        proximal, _ = self.head.stats(head, log_std, tr.mask, tr.action)
-        value, next_value = self._values(views, state, actor, data, tr)
-        advantage = gae(tr.reward, tr.discount, value, next_value, tr.last, state.gae_lambda)
+    def _prepare(self, state: State, rollout: Rollout) -> tuple[Samples, dict[str, Tensor]]:
+        """What ``loss`` needs of a rollout without gaps, and metrics (P,)."""
+        cfg, memory, starts = self.config, rollout.memory, rollout.starts
+        if not self.memory_size:
+            memory = starts = None
+        cells = Cells(rollout, all_cells=memory is not None)
+        obs, valid = cells.flat(rollout.obs), cells.flat_or_none(rollout.valid)
+        self.update_obs_stats(state, obs, valid)
+        params = self.learning_params(state)
+        inputs = self.inputs(params, obs)
+        if memory is not None:
+            inputs = {k: cells.unflat(v) for k, v in inputs.items()}
+        raw, after = self._run(self.critic_net, params.views, inputs, memory, starts)
+        value = self._in_rewards(state, raw)
+        following = self._next_values(state, params, rollout, cells.grid(value), after)
+        reward, discount, last = rollout.reward, rollout.discount, rollout.last
+        grid = gae(reward, discount, cells.grid(value), following, last, state.gae_lambda)
+        advantage = cells.flat(grid)
         returns = advantage + value
-        metrics = {"explained_variance": explained_variance(value.flatten(1), returns.flatten(1))}
+        metrics = {"explained_variance": explained_variance(value, returns, valid)}
         if cfg.normalize_returns:
-            self.see_returns(state, returns.flatten(1))
-        if cfg.normalize_advantage:
-            advantage = normalise(advantage)
-        mean, scale = state.return_mean[..., None], self._return_scale(state)[..., None]
-        data |= {
-            "action": tr.action,
-            "proximal": proximal,
-            "weight": (proximal - acted).exp(),
-            "advantage": advantage,
-            "target": (returns - mean) / scale,
-        }
-        if tr.mask is not None:
-            data["mask"] = tr.mask
-        if cfg.clip_value is not None:
-            data["old_value"] = (value - mean) / scale
-        return data, metrics
+            self.update_return_stats(state, returns, valid)
+        mean, scale = state.return_mean, self._return_scale(state)
+        action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.obs_mask)
+        # Clipping and KL count from the policy as it is now, whoever acted.
+        head, _ = self._run(self.actor_net, params.views, inputs, memory, starts)
+        log_prob, _ = self.head.stats(head, params.views.get("actor.log_std"), mask, action)
+        samples = Samples(
+            inputs={} if memory is not None else inputs,
+            action=action,
+            log_prob=log_prob,
+            importance=(log_prob - self._acted(rollout, cells, mask, action)).exp(),
+            advantage=normalise(advantage, valid) if cfg.normalize_advantage else advantage,
+            target=(returns - mean) / scale,
+            old_value=None if cfg.clip_value is None else (value - mean) / scale,
+            mask=mask,
+            valid=valid,
+            most=value.shape[1],
+        )
+        if memory is not None:
+            samples = samples.changed(cells.unflat)
+            samples.inputs, samples.memory, samples.starts = inputs, memory, starts
+        return samples, metrics
 
-    def _values(
-        self, views: Views, state: State, actor: Actor, data: Mapping[str, Tensor], tr: Transition
-    ) -> tuple[Tensor, Tensor]:
-        """V(obs) and V(next_obs), (P, T, B): the latter are the former, shifted, except at ends."""
-        lead, after = tr.reward.shape, None
-        if "memory" in data:
-            own = data["memory"][..., self.actor_net.memory :]
-            raw, after = self.critic_net.sequence(views, _inputs(data), own, data["start"])
-            raw = raw.flatten(1, 2)
-        else:
-            raw = self.critic_net(views, {k: v.flatten(1, 2) for k, v in _inputs(data).items()})
-        value = self._in_rewards(state, raw).view(lead)
-        next_value = torch.zeros_like(value)
-        next_value[:, :-1] = value[:, 1:]
-        last = tr.last.flatten(1)
-        widest = int(last.sum(1).max())
-        # Members may have different numbers of ends: the first `widest` of a stable sort holds
-        # them all. Surplus rows get what the shift gave them, the value of their true successor.
-        rows = last.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :widest]
-        inputs = self.inputs(actor, take_rows(tr.next_obs.flatten(1, 2), rows))
+    def _acted(
+        self, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor
+    ) -> Tensor:
+        """Log-probabilities (P, N) of the actions by the policy that acted."""
+        assert rollout.head is not None
+        log_std = None if rollout.log_std is None else rollout.log_std.flatten(1, 2)
+        return self.head.stats(cells.flat(rollout.head), log_std, mask, action)[0]
+
+    def _next_values(
+        self,
+        state: State,
+        params: ActingParams,
+        rollout: Rollout,
+        value: Tensor,
+        after: Tensor | None,
+    ) -> Tensor:
+        """V(next_obs), (P, T, B): V(obs), (P, T, B), of the next row, except at ends.
+
+        Args:
+            after: (P, T·B, M), the critic's memory after each row, if it has one.
+        """
+        following = torch.zeros_like(value)
+        following[:, :-1] = value[:, 1:]
+        # Surplus rows of members with fewer ends get what the shift gave them.
+        rows = rows_where(rollout.last.flatten(1))
+        inputs = self.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
         if after is None:
-            ends = self.critic_net(views, inputs)
+            raw = self.critic_net(params.views, inputs)
         else:
-            ends, _ = self.critic_net.step(views, inputs, take_rows(after.flatten(1, 2), rows))
-        ends = self._in_rewards(state, ends)
-        return value, next_value.flatten(1).scatter(1, rows, ends).view(lead)
+            raw, _ = self.critic_net.step(params.views, inputs, take_rows(after, rows))
+        ends = self._in_rewards(state, raw)
+        return following.flatten(1).scatter(1, rows, ends).view_as(value)
+
+    def _run(
+        self,
+        net: Net,
+        views: Views,
+        inputs: Inputs,
+        memory: Tensor | None,
+        starts: Tensor | None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """A network's outputs (P, N, out) and memories (P, N, M); sequences are laid end to end."""
+        if memory is None or starts is None:
+            return net(views, inputs), None
+        own, other = memory.tensor_split([self.actor_net.memory_size], dim=-1)
+        memory = own if net is self.actor_net else other
+        out, after = net.sequence(views, inputs, memory, starts)
+        return out.flatten(1, 2), after.flatten(1, 2)
 
     def _in_rewards(self, state: State, raw: Tensor) -> Tensor:
         return raw.squeeze(-1) * self._return_scale(state) + state.return_mean
 
     def _return_scale(self, state: State) -> Tensor:
         return (state.return_var + 1e-8).sqrt()
-
-
-def _inputs(batch: Mapping[str, Tensor]) -> Inputs:
-    return {k: v for k, v in batch.items() if k == "vector" or k.startswith("image.")}

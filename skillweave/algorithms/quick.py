@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.algorithms.base import Actor, Algorithm
+from skillweave.algorithms.base import ActingParams, Algorithm
 from skillweave.networks.net import Net
 from skillweave.networks.numpy_mlp import NumpyMLP
 from skillweave.types import Array
@@ -25,7 +25,7 @@ class Quick:
         self.algorithm, self.state = algorithm, state
         self._space: Any = algorithm.observation_space
         self._one_hot = not np.issubdtype(self._space.dtype, np.floating)
-        family = algorithm.families()[0]
+        family = algorithm.parameter_groups()[0]
         self._all = dict(family.nets)
         self._views = family.layout.views(state.params[:1])
         self._nets = {
@@ -45,7 +45,7 @@ class Quick:
         if field in self._nets:
             return self._nets[field](self._vectors(rows) if self._one_hot else rows)
         with torch.inference_mode():
-            actor = Actor({}, *self.algorithm.scaling(self.state))
+            actor = ActingParams({}, *self.algorithm.scaling(self.state))
             inputs = self.algorithm.inputs(actor, torch.from_numpy(rows)[None])
             found: Array = self._all[field](self._views, inputs)[0].numpy()
         return found

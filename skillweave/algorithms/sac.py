@@ -1,11 +1,14 @@
-"""Soft actor-critic (Haarnoja et al. 2018b) for P members at once, of forces and of choices.
+"""Soft actor-critic (Haarnoja et al. 2018b) for P members at once.
 
-Read down the page: State, init, act, update, losses. The settings are ``config.SAC``.
+For continuous actions, and for discrete ones (Christodoulou 2019). Read down the page: State, init,
+act, value, and how it learns; the critics' step is ``actor_critic.learn``. The settings are
+``config.SAC``.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,60 +16,45 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Family
+from skillweave.algorithms.actor_critic import ActorCriticAlgorithm, ActorCriticState, Critics
+from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.config_off_policy import check
-from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
+from skillweave.algorithms.off_policy import normal
+from skillweave.experience import Sample
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
-from skillweave.ops.distributions import mask_logits, tanh_log_det
+from skillweave.ops.distributions import (
+    mask_logits,
+    masked_log_probs,
+    squashed_entropy,
+    squashed_sample,
+)
+from skillweave.ops.losses import expected_soft_value, masked_entropy_target
 from skillweave.ops.optim import adam_
+from skillweave.ops.returns import discounted, td_target
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
-
-_HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 @dataclass
-class State:
-    """Everything SAC learns and counts; P members, K = 2 critics, D parameters of a network."""
+class State(ActorCriticState):
+    """Everything SAC learns and counts."""
 
-    params: Tensor  # (P, D), the actor
-    mu: Tensor  # (P, D), Adam's first moment
-    nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
-    critic: Tensor  # (P, K, D)
-    critic_target: Tensor  # (P, K, D)
-    critic_mu: Tensor  # (P, K, D)
-    critic_nu: Tensor  # (P, K, D)
-    critic_count: Tensor  # (P,) int64, or (P, K, D)
     log_alpha: Tensor  # (P, 1), log of the temperature
     alpha_mu: Tensor  # (P, 1)
     alpha_nu: Tensor  # (P, 1)
     alpha_count: Tensor  # (P,) int64
-    updates: Tensor  # (P,) int64, gradient steps
-    obs_mean: Tensor  # (P, O)
-    obs_var: Tensor  # (P, O)
-    obs_count: Tensor  # (P,)
-    return_mean: Tensor  # (P, 1)
-    return_var: Tensor  # (P, 1)
-    return_count: Tensor  # (P,)
-    policy_loss: Tensor  # (P,), the latest, for the metrics
     entropy: Tensor  # (P,), the latest, nats
-    learning_rate: Tensor  # (P,); this and all below are settings, one a member
-    gamma: Tensor  # (P,)
-    tau: Tensor  # (P,)
-    max_grad_norm: Tensor  # (P,)
-    ent_coef: Tensor  # (P,), the temperature where it is not learnt
+    ent_coef: Tensor  # (P,), of each member: the temperature where it is not learnt
 
 
-class SACAlgorithm(OffPolicyAlgorithm):
+class SACAlgorithm(ActorCriticAlgorithm):
     """SAC on one pair of spaces. Holds no learnt state: that is in ``State``."""
 
     state_type = State
-    settings = ("learning_rate", "gamma", "tau", "max_grad_norm", "ent_coef")
+    member_hyperparameters = ("learning_rate", "gamma", "tau", "max_grad_norm", "ent_coef")
     between = True
 
     def __init__(
@@ -90,193 +78,136 @@ class SACAlgorithm(OffPolicyAlgorithm):
             f"at most {highest:.4g}, the entropy of {action_space} at random",
         )
 
-    def _fresh_state(self, seeds: list[Seeds]) -> State:
+    def fresh_state(self, seeds: Sequence[Seeds]) -> State:
+        """A state of fresh members, one for each seed."""
         members = len(seeds)
-        params = torch.zeros(members, self.layout.size)
-        generators = self.member_generators(seeds)
-        self.net.init_(self.layout.views(params), 0.01, generators)
-        critic = self.critics.init(generators)
         return State(
-            params=params,
-            mu=torch.zeros_like(params),
-            nu=torch.zeros_like(params),
-            count=torch.zeros(members, dtype=torch.int64),
-            critic=critic,
-            critic_target=critic.clone(),
-            critic_mu=torch.zeros_like(critic),
-            critic_nu=torch.zeros_like(critic),
-            critic_count=torch.zeros(members, dtype=torch.int64),
+            **self.fresh_networks(seeds),
             log_alpha=torch.full((members, 1), math.log(self.config.ent_coef)),
             alpha_mu=torch.zeros(members, 1),
             alpha_nu=torch.zeros(members, 1),
             alpha_count=torch.zeros(members, dtype=torch.int64),
-            policy_loss=torch.zeros(members),
             entropy=torch.zeros(members),
-            **self.fresh(members),
         )
-
-    def families(self) -> list[Family]:
-        """Everything in the state that has the shape of networks."""
-        return [Family(self.layout, (("network", self.net),)), self.critics.family()]
 
     def act(
         self,
-        actor: Actor,
+        params: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: Tensor | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, None]:
-        """Choices (P, B), or forces (P, B, A) in [−1, 1]; see ``Algorithm.act``."""
-        head = self.net(actor.views, self.inputs(actor, obs))
+        """Discrete actions (P, B), or continuous ones (P, B, A) in [−1, 1]; `Algorithm.act`."""
+        head = self.net(params.views, self.inputs(params, obs))
         if self.codec.discrete:
             head = mask_logits(head, mask)
             return self.head.act(head, None, noise), head, None
         return self.head.act(head, None, noise).tanh(), head, None
 
+    def alpha(self, state: State) -> Tensor:
+        """The temperature, (P, 1)."""
+        return state.log_alpha.exp() if self.config.learn_ent_coef else state.ent_coef[:, None]
+
+    def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
+        """The soft value ``E[min Q − α·log π]`` in units of reward, (P, B).
+
+        Of continuous actions it is that of the greedy action, with ``squashed_entropy``.
+        """
+        params = self.learning_params(state)
+        inputs, alpha = self.inputs(params, obs), self.alpha(state)
+        head = self.net(params.views, inputs)
+        if self.codec.discrete:
+            q = self.smallest(state.critic, inputs)
+            return self.in_rewards(
+                state, expected_soft_value(masked_log_probs(head, mask), q, alpha)
+            )
+        mean, log_std = self.head.moments(head, None)
+        q = self.smallest(state.critic, inputs, mean.tanh())
+        return self.in_rewards(state, q + alpha * squashed_entropy(mean, log_std))
+
     def learning_noise(
-        self, generators: list[torch.Generator], batch: int, due: bool
+        self, rng: Sequence[torch.Generator], batch: int, due: bool
     ) -> list[Tensor]:
         """Of the next actions, of those between, and of the actor's; (P, B or B·(n − 1), A)."""
         if self.codec.discrete:
             return []
         between = [batch * (self.config.n_step - 1)] * (self.config.n_step > 1)
         sizes = [batch, *between, *[batch] * due]
-        return [normal(generators, size, self.codec.size) for size in sizes]
+        return [normal(rng, size, self.codec.size) for size in sizes]
 
     def learn(
         self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One gradient step of critics, actor and temperature, in place."""
-        actor = Actor({}, *self.scaling(state))
-        eps, learnt = self.config.adam_eps, self.config.learn_ent_coef
-        alpha = state.log_alpha.exp() if learnt else state.ent_coef[:, None]
-        inputs = self.inputs(actor, sample.obs)
-        leaves = self.critics.leaves(state.critic)
-        loss, error, q = self.critic_loss(leaves, state, sample, actor, inputs, alpha, noise)
-        norm = self.critics.step_(state, loss, leaves, rate, eps)
-        if due:
-            policy = self.layout.leaves(state.params)
-            policy_loss, entropy = self.policy_loss(
-                policy, state, sample.obs_mask, inputs, alpha, noise[-1:]
-            )
-            self.step_(state, policy_loss, policy, rate)
-            state.policy_loss, state.entropy = policy_loss.detach(), entropy
-            if learnt:
-                # d/d log α of −log α·(log π + H̄), as in the authors' code, not of −α·(…).
-                slope = (entropy - self.entropy_aim(sample.obs_mask))[:, None]
-                moments = state.alpha_mu, state.alpha_nu, state.alpha_count
-                adam_(state.log_alpha, slope, *moments, rate, eps=eps)
-        state.critic_target.lerp_(state.critic, state.tau[:, None, None])
-        metrics = {
-            "critic_loss": loss.detach(),
-            "policy_loss": state.policy_loss,
-            "entropy": state.entropy,
-            "ent_coef": alpha.squeeze(1),
-            "q": q,
-            "grad_norm": norm,
-            "learning_rate": rate,
-        }
-        return metrics, error
+        alpha = self.alpha(state).squeeze(1)
+        metrics, error = super().learn(state, sample, rate, noise, due)
+        return metrics | {"entropy": state.entropy, "ent_coef": alpha}, error
 
-    def critic_loss(
-        self,
-        views: Views,
-        state: State,
-        sample: Sample,
-        actor: Actor,
-        inputs: Inputs,
-        alpha: Tensor,
-        noise: list[Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss (P,), error of each sample (P, B) and mean value (P,)."""
-        with torch.no_grad():
-            slow, following = (
-                self.critics.views(state.critic_target),
-                self.inputs(actor, sample.next_obs),
-            )
-            head = self.net(self.layout.views(state.params), following)
-            if self.codec.discrete:
-                log_p = _log_p(head, sample.mask)
-                q = self.critics(slow, following).amin(1)
-                value = (log_p.exp() * (q - alpha[..., None] * log_p)).sum(-1)
-            else:
-                action, log_prob = self._sampled(head, noise[0])
-                q = self.critics(slow, following, action).squeeze(-1).amin(1)
-                value = q - alpha * log_prob
-            reward = self.rewards(state, sample)
-            if sample.between_obs is not None:
-                reward = reward + alpha * self.entropy_between(state, sample, actor, noise[1:])
-            target = self.target(reward, sample.discount, value)
+    def critic_target(
+        self, state: State, sample: Sample, params: ActingParams, noise: list[Tensor]
+    ) -> Tensor:
+        """``r + discount·V̄(s′)`` with the soft value V̄ of the slow critics (eq. 5), (P, B)."""
+        inputs, alpha = self.inputs(params, sample.next_obs), self.alpha(state)
+        head, slow = self.net(self.layout.views(state.params), inputs), state.critic_target
         if self.codec.discrete:
-            out = self.critics(views, inputs)  # (P, K, B, A)
-            chosen = sample.action[:, None, :, None].expand(*out.shape[:3], 1)
-            q = out.gather(-1, chosen).squeeze(-1)
+            log_p = masked_log_probs(head, sample.next_obs_mask)
+            value = expected_soft_value(log_p, self.smallest(slow, inputs), alpha)
         else:
-            q = self.critics(views, inputs, sample.action).squeeze(-1)
-        return regression(q, target, sample.weight)
-
-    def policy_loss(
-        self,
-        views: Views,
-        state: State,
-        mask: Tensor | None,
-        inputs: Inputs,
-        alpha: Tensor,
-        noise: list[Tensor],
-    ) -> tuple[Tensor, Tensor]:
-        """``E[α·log π − min Q]`` (eq. 7) and the policy's entropy, detached; each (P,)."""
-        head, critics = self.net(views, inputs), self.critics.views(state.critic)
-        if self.codec.discrete:
-            log_p = _log_p(head, mask)
-            p = log_p.exp()
-            with torch.no_grad():
-                q = self.critics(critics, inputs).amin(1)
-            loss = (p * (alpha[..., None] * log_p - q)).sum(-1).mean(1)
-            return loss, -(p * log_p).detach().sum(-1).mean(1)
-        action, log_prob = self._sampled(head, noise[0])
-        q = self.critics(critics, inputs, action).squeeze(-1).amin(1)
-        return (alpha * log_prob - q).mean(1), -log_prob.detach().mean(1)
+            action, log_prob = squashed_sample(*self.head.moments(head, None), noise[0])
+            value = self.smallest(slow, inputs, action) - alpha * log_prob
+        reward = self.rewards(state, sample)
+        if sample.between_obs is not None:
+            reward = reward + alpha * self.entropy_between(state, sample, params, noise[1:])
+        return td_target(reward, sample.discount, value)
 
     def entropy_between(
-        self, state: State, sample: Sample, actor: Actor, noise: list[Tensor]
+        self, state: State, sample: Sample, params: ActingParams, noise: list[Tensor]
     ) -> Tensor:
         """What the policy's entropy at the steps between adds to n steps' reward, (P, B).
 
         The soft value of the first step holds ``γᵏ·α·H(π(·|sₖ))`` for each k from 1 to n − 1
-        (Haarnoja et al. 2018a, eq. 3). Of forces it is estimated by an action drawn now: of the
-        one that was taken, by an older policy, −log π may be as large as it likes.
+        (Haarnoja et al. 2018a, eq. 3). Of continuous actions H is estimated by an action drawn
+        now: of the one that was taken, by an older policy, −log π may be any number.
         """
         assert sample.between_obs is not None
         assert sample.between_discount is not None
         lead = sample.between_discount.shape
-        inputs = self.inputs(actor, sample.between_obs.flatten(1, 2))
+        inputs = self.inputs(params, sample.between_obs.flatten(1, 2))
         head = self.net(self.layout.views(state.params), inputs)
         if self.codec.discrete:
             mask = sample.between_mask
-            log_p = _log_p(head, None if mask is None else mask.flatten(1, 2))
+            log_p = masked_log_probs(head, None if mask is None else mask.flatten(1, 2))
             entropy = -(log_p.exp() * log_p).sum(-1)
         else:
-            entropy = -self._sampled(head, noise[0])[1]
-        # As in `target`: 0·NaN is NaN.
-        discount = sample.between_discount
-        return torch.where(discount == 0.0, 0.0, discount * entropy.view(lead)).sum(-1)
+            entropy = -squashed_sample(*self.head.moments(head, None), noise[0])[1]
+        return discounted(sample.between_discount, entropy.view(lead)).sum(-1)
 
-    def entropy_aim(self, mask: Tensor | None) -> Tensor | float:
-        """The entropy aimed at: of m choices allowed instead of A, log m / log A of it; (P,)."""
-        if mask is None or self.codec.size == 1:
-            return self.target_entropy
-        share = mask.sum(-1).clamp_min(1).log() / math.log(self.codec.size)
-        return self.target_entropy * share.mean(1)
+    def improve_policy(
+        self, state: State, sample: Sample, inputs: Inputs, rate: Tensor, noise: list[Tensor]
+    ) -> None:
+        """One gradient step of the actor, and of the temperature if it is learnt, in place."""
+        leaves, mask = self.layout.leaves(state.params), sample.obs_mask
+        loss, entropy = self.policy_loss(leaves, state, mask, inputs, noise[-1:])
+        self.step_(state, loss, leaves, rate)
+        state.policy_loss, state.entropy = loss.detach(), entropy
+        if self.config.learn_ent_coef:
+            # d/d log α of −log α·(log π + H̄), as in the authors' code, not of −α·(…).
+            slope = entropy - masked_entropy_target(self.target_entropy, mask)
+            moments = state.alpha_mu, state.alpha_nu, state.alpha_count
+            adam_(state.log_alpha, slope[:, None], *moments, rate, eps=self.config.adam_eps)
 
-    def _sampled(self, head: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Squashed actions (P, B, A) and their log-probability (P, B); app. C."""
-        mean, log_std = self.head.moments(head, None)
-        u = torch.addcmul(mean, log_std.exp(), z)
-        log_prob = -0.5 * z.square() - log_std - _HALF_LOG_TWO_PI - tanh_log_det(u)
-        return u.tanh(), log_prob.sum(-1)
-
-
-def _log_p(logits: Tensor, mask: Tensor | None) -> Tensor:
-    """Log-probabilities; of forbidden choices a number whose exp is 0, but times α is finite."""
-    return mask_logits(logits, mask).log_softmax(-1).clamp_min(-200.0)
+    def policy_loss(
+        self, views: Views, state: State, mask: Tensor | None, inputs: Inputs, noise: list[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """``E[α·log π − min Q]`` (eq. 7) and the policy's entropy, detached; each (P,)."""
+        head, alpha = self.net(views, inputs), self.alpha(state)
+        if self.codec.discrete:
+            log_p = masked_log_probs(head, mask)
+            with torch.no_grad():
+                q = self.smallest(state.critic, inputs)
+            entropy = -(log_p.exp() * log_p).detach().sum(-1)
+            return -expected_soft_value(log_p, q, alpha).mean(1), entropy.mean(1)
+        action, log_prob = squashed_sample(*self.head.moments(head, None), noise[0])
+        q = self.smallest(state.critic, inputs, action)
+        return (alpha * log_prob - q).mean(1), -log_prob.detach().mean(1)

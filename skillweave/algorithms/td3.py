@@ -1,10 +1,12 @@
 """TD3 (Fujimoto et al. 2018) for P members at once; DDPG is a preset of it.
 
-Read down the page: State, init, act, update. The settings are ``config.TD3``.
+Read down the page: State, init, act, value, and how it learns; the critics' step is
+``actor_critic.learn``. The settings are ``config.TD3``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,53 +14,36 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Actor, Family
+from skillweave.algorithms.actor_critic import ActorCriticAlgorithm, ActorCriticState, Critics
+from skillweave.algorithms.base import ActingParams, Device
 from skillweave.algorithms.config import TD3
-from skillweave.algorithms.off_policy import Critics, OffPolicyAlgorithm, normal, regression
+from skillweave.algorithms.off_policy import normal
+from skillweave.experience import Sample
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
+from skillweave.ops.distributions import smoothed_action
+from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
 
 
 @dataclass
-class State:
-    """Everything TD3 learns and counts; P members, K critics, D parameters of a network."""
+class State(ActorCriticState):
+    """Everything TD3 learns and counts."""
 
-    params: Tensor  # (P, D), the actor
-    target: Tensor  # (P, D), its slow copy
-    mu: Tensor  # (P, D), Adam's first moment
-    nu: Tensor  # (P, D), Adam's second moment
-    count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
-    critic: Tensor  # (P, K, D)
-    critic_target: Tensor  # (P, K, D)
-    critic_mu: Tensor  # (P, K, D)
-    critic_nu: Tensor  # (P, K, D)
-    critic_count: Tensor  # (P,) int64, or (P, K, D)
-    updates: Tensor  # (P,) int64, gradient steps
-    obs_mean: Tensor  # (P, O)
-    obs_var: Tensor  # (P, O)
-    obs_count: Tensor  # (P,)
-    return_mean: Tensor  # (P, 1)
-    return_var: Tensor  # (P, 1)
-    return_count: Tensor  # (P,)
-    policy_loss: Tensor  # (P,), the latest, for the metrics
-    learning_rate: Tensor  # (P,); this and all below are settings, one a member
-    gamma: Tensor  # (P,)
-    tau: Tensor  # (P,)
-    max_grad_norm: Tensor  # (P,)
-    exploration_noise: Tensor  # (P,)
+    target: Tensor  # (P, D), the actor's slow copy
+    exploration_noise: Tensor  # (P,), as all below a hyperparameter of each member
     target_noise: Tensor  # (P,)
     target_noise_clip: Tensor  # (P,)
 
 
-class TD3Algorithm(OffPolicyAlgorithm):
+class TD3Algorithm(ActorCriticAlgorithm):
     """TD3 on one pair of spaces. Holds no learnt state: that is in ``State``."""
 
     state_type = State
-    settings = (
+    actor_weights = ("params", "target")
+    member_hyperparameters = (
         "learning_rate", "gamma", "tau", "max_grad_norm", "exploration_noise", "target_noise",
         "target_noise_clip",
     )  # fmt: skip
@@ -74,102 +59,76 @@ class TD3Algorithm(OffPolicyAlgorithm):
         network, count = config.critic or config.network, 2 if config.twin else 1
         self.critics = Critics(self.obs, network, 1, self.codec.size, count)
 
-    def _fresh_state(self, seeds: list[Seeds]) -> State:
-        params = torch.zeros(len(seeds), self.layout.size)
-        generators = self.member_generators(seeds)
-        self.net.init_(self.layout.views(params), 0.01, generators)
-        critic = self.critics.init(generators)
-        return State(
-            params=params,
-            target=params.clone(),
-            mu=torch.zeros_like(params),
-            nu=torch.zeros_like(params),
-            count=torch.zeros(len(seeds), dtype=torch.int64),
-            critic=critic,
-            critic_target=critic.clone(),
-            critic_mu=torch.zeros_like(critic),
-            critic_nu=torch.zeros_like(critic),
-            critic_count=torch.zeros(len(seeds), dtype=torch.int64),
-            policy_loss=torch.zeros(len(seeds)),
-            **self.fresh(len(seeds)),
-        )
+    def fresh_state(self, seeds: Sequence[Seeds]) -> State:
+        """A state of fresh members, one for each seed."""
+        fields = self.fresh_networks(seeds)
+        return State(**fields, target=fields["params"].clone())
 
-    def families(self) -> list[Family]:
-        """Everything in the state that has the shape of networks."""
-        actor = Family(self.layout, (("network", self.net),), ("params", "target"))
-        return [actor, self.critics.family()]
-
-    def actor(self, state: State, progress: float = 1.0) -> Actor:
+    def acting_params(
+        self, state: State, progress: float = 1.0, device: Device = "cpu"
+    ) -> ActingParams:
         """A copy of what acting needs, with the deviation of its noise."""
-        actor = super().actor(state, progress)
-        actor.extra["noise"] = state.exploration_noise[:, None, None].clone()
-        return actor
+        params = super().acting_params(state, progress, device)
+        params.extra["noise"] = state.exploration_noise[:, None, None].to(device, copy=True)
+        return params
 
     def act(
         self,
-        actor: Actor,
+        params: ActingParams,
         obs: Tensor,
         mask: Tensor | None,
         noise: Tensor | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, None, None]:
         """Actions (P, B, A) in [−1, 1]; see ``Algorithm.act``."""
-        action = self.net(actor.views, self.inputs(actor, obs)).tanh()
+        action = self.net(params.views, self.inputs(params, obs)).tanh()
         if noise is not None:
-            scale = actor.extra.get("noise", self.config.exploration_noise)
+            scale = params.extra.get("noise", self.config.exploration_noise)
             action = (action + scale * noise).clamp(-1.0, 1.0)
         return action, None, None
 
+    def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
+        """``min Q(s, π(s))`` over the critics, in units of reward, (P, B)."""
+        params = self.learning_params(state)
+        inputs = self.inputs(params, obs)
+        action = self.net(params.views, inputs).tanh()
+        return self.in_rewards(state, self.smallest(state.critic, inputs, action))
+
     def learning_noise(
-        self, generators: list[torch.Generator], batch: int, due: bool
+        self, rng: Sequence[torch.Generator], batch: int, due: bool
     ) -> list[Tensor]:
         """Of the target's actions, (P, B, A), where there is any."""
-        return [normal(generators, batch, self.codec.size)] if self.config.target_noise else []
+        return [normal(rng, batch, self.codec.size)] if self.config.target_noise else []
 
-    def learn(
-        self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """One gradient step of the critics, and now and then of the actor, in place."""
-        actor = Actor({}, *self.scaling(state))
-        inputs = self.inputs(actor, sample.obs)
-        leaves = self.critics.leaves(state.critic)
-        loss, error, q = self.critic_loss(leaves, state, sample, actor, inputs, noise)
-        norm = self.critics.step_(state, loss, leaves, rate, self.config.adam_eps)
-        if due:
-            policy = self.layout.leaves(state.params)
-            policy_loss = self.policy_loss(policy, state, inputs)
-            self.step_(state, policy_loss, policy, rate * self.config.actor_rate)
-            state.target.lerp_(state.params, state.tau[:, None])
-            state.critic_target.lerp_(state.critic, state.tau[:, None, None])
-            state.policy_loss = policy_loss.detach()
-        metrics = {"critic_loss": loss.detach(), "policy_loss": state.policy_loss, "q": q}
-        return metrics | {"grad_norm": norm, "learning_rate": rate}, error
+    def critic_target(
+        self, state: State, sample: Sample, params: ActingParams, noise: list[Tensor]
+    ) -> Tensor:
+        """``r + discount·min Q̄(s′, π̄(s′) + noise)`` (eq. 10 and 14), (P, B)."""
+        inputs = self.inputs(params, sample.next_obs)
+        action = self.net(self.layout.views(state.target), inputs).tanh()
+        if noise:
+            std, bound = state.target_noise, state.target_noise_clip
+            action = smoothed_action(action, noise[0], std[:, None, None], bound[:, None, None])
+        value = self.smallest(state.critic_target, inputs, action)
+        return td_target(self.rewards(state, sample), sample.discount, value)
 
-    def critic_loss(
-        self,
-        views: Views,
-        state: State,
-        sample: Sample,
-        actor: Actor,
-        inputs: Inputs,
-        noise: list[Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss (P,), error of each sample (P, B) and mean value (P,)."""
-        with torch.no_grad():
-            following = self.inputs(actor, sample.next_obs)
-            action = self.net(self.layout.views(state.target), following).tanh()
-            if noise:
-                bound = state.target_noise_clip[:, None, None]
-                moved = (noise[0] * state.target_noise[:, None, None]).clamp(-bound, bound)
-                action = (action + moved).clamp(-1.0, 1.0)
-            slow = self.critics.views(state.critic_target)
-            value = self.critics(slow, following, action).squeeze(-1).amin(1)
-            target = self.target(self.rewards(state, sample), sample.discount, value)
-        q = self.critics(views, inputs, sample.action).squeeze(-1)  # (P, K, B)
-        return regression(q, target, sample.weight)
+    def improve_policy(
+        self, state: State, sample: Sample, inputs: Inputs, rate: Tensor, noise: list[Tensor]
+    ) -> None:
+        """One gradient step of the actor, in place."""
+        leaves = self.layout.leaves(state.params)
+        loss = self.policy_loss(leaves, state, inputs)
+        self.step_(state, loss, leaves, rate * self.config.actor_rate)
+        state.policy_loss = loss.detach()
 
     def policy_loss(self, views: Views, state: State, inputs: Inputs) -> Tensor:
         """``−Q₁(s, π(s))`` (eq. 15 with one critic, as in the paper), (P,)."""
         first = self.critics.views(state.critic[:, :1])
         q = self.critics(first, inputs, self.net(views, inputs).tanh())
         return -q.flatten(1).mean(1)
+
+    def move_targets(self, state: State, due: bool) -> None:
+        """Let the slow copies follow where it is the actor's turn, in place."""
+        if due:
+            super().move_targets(state, due)
+            state.target.lerp_(state.params, state.tau[:, None])

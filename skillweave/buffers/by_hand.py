@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from skillweave.buffers.replay import ReplayBuffer
-from skillweave.types import Array, Sample, VecStep
+from skillweave.experience import Sample
+from skillweave.types import Array, VecStep
 
 
 class Recorder:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from skillweave.buffers.priorities import Priorities
 from skillweave.buffers.store import GOES_ON, TERMINATED, Store
+from skillweave.experience import Sample
 from skillweave.spaces import to_tensor
-from skillweave.types import Array, Sample, VecStep
+from skillweave.types import Array, VecStep
 
 
 class ReplayBuffer(Store):
@@ -106,7 +107,7 @@ class ReplayBuffer(Store):
             discount=to_tensor(discount * (end != TERMINATED)),
             next_obs=to_tensor(after["obs"]),
             obs_mask=self._allowed(now.get("mask")),
-            mask=self._allowed(after.get("mask")),
+            next_obs_mask=self._allowed(after.get("mask")),
             weight=None if weight is None else to_tensor(weight),
             index=index,
             **self._seen_between(between),

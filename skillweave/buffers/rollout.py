@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.experience import Rollout
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
-from skillweave.types import Array, Transition, VecStep
+from skillweave.types import Array, VecStep
 
 
 class RolloutBuffer:
-    """Filled a step at a time, then read once as a ``Transition``; it need not be full.
+    """Filled a step at a time, then read once as a ``Rollout``; it need not be full.
 
     N = P·B columns: the environments of member 0 first, then those of member 1, and so on.
     """
@@ -48,24 +49,24 @@ class RolloutBuffer:
         self._head.append(head)
         self._at += 1
 
-    def read(self, gamma: Tensor) -> tuple[Transition, Tensor]:
-        """The transitions, discounted by each member's γ (P,), and the heads (P, T, B, A)."""
+    def read(self, gamma: Tensor) -> Rollout:
+        """What was added, discounted by each member's γ (P,)."""
         done = self._at
         self._last[done - 1] = True  # the end of the rollout cuts every trajectory
         steps = self._by_member(self._steps[:done])
         alive = self._by_member(~self._terminated[:done])
         discount = gamma[:, None, None].pow(steps) * alive
         masks = [m for m in self._mask[:done] if m is not None]
-        transition = Transition(
+        return Rollout(
             obs=self._by_member(self._obs[:done]),
             action=torch.stack(self._action, dim=1),
             reward=self._by_member(self._reward[:done]),
             discount=discount,
             next_obs=self._by_member(self._next_obs[:done]),
             last=self._by_member(self._last[:done]),
-            mask=self._by_member(self._masks(masks[0])) if masks else None,
+            obs_mask=self._by_member(self._masks(masks[0])) if masks else None,
+            head=torch.stack(self._head, dim=1),
         )
-        return transition, torch.stack(self._head, dim=1)
 
     def _masks(self, example: Array) -> Array:
         """(T, N, A) bool; a step without a mask allows everything."""

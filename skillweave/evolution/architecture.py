@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Family
+from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution.config import Mutations
@@ -23,8 +23,8 @@ from skillweave.evolution.stacks import Member, copy, even_count, networks_of, s
 from skillweave.networks import growth
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
-from skillweave.networks.growth import Units
 from skillweave.networks.stacked import Views
+from skillweave.networks.units import Units, channels_of, hidden_units, joint_of
 from skillweave.types import SkillweaveError
 
 Alter = Callable[[Views, bool], dict[str, Tensor]]
@@ -124,7 +124,7 @@ def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
 
 def _cnn(member: Member, spaces: Any) -> CNN | None:
     """What encodes the member's images, if one architecture encodes them all."""
-    (_, net), *_ = member.algorithm(spaces).families()[0].nets
+    (_, net), *_ = member.algorithm(spaces).parameter_groups()[0].nets
     kinds = {e.cnn for e in net.encoders.values() if isinstance(e, ImageEncoder)}
     return kinds.pop() if len(kinds) == 1 else None
 
@@ -163,14 +163,14 @@ def rebuilt(member: Member, change: Change, spaces: Any, rng: np.random.Generato
     new = make_algorithm(config, *spaces)
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     state = vars(copy(member).state)
-    for before, after in zip(old.families(), new.families(), strict=True):
+    for before, after in zip(old.parameter_groups(), new.parameter_groups(), strict=True):
         state |= _carried(before, after, state, change, generator)
     return replace(member, config=config, state=new.state_type(**state))
 
 
 def _carried(
-    before: Family,
-    after: Family,
+    before: ParameterGroup,
+    after: ParameterGroup,
     state: dict[str, Tensor],
     change: Change,
     generator: torch.Generator,
@@ -193,7 +193,7 @@ def _carried(
 def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
     """What happens to a network's parameters, one plan after another."""
     if change.kind == "layer":
-        joint, activation = net.joint(), net.network.activation
+        joint, activation = joint_of(net), net.network.activation
         if change.by > 0:
             return [lambda _: lambda v, m: growth.deepened(v, joint, activation, moments=m)]
         return [lambda _: lambda v, m: growth.shallower(v, joint, moments=m)] * (joint.depth > 1)
@@ -204,7 +204,7 @@ def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
             if isinstance(encoder, ImageEncoder)
         ]
     layer = min(change.layer, len(net.network.hidden) - 1)
-    groups = net.units(layer) if change.kind == "units" else net.channels(change.layer)
+    groups = hidden_units(net, layer) if change.kind == "units" else channels_of(net, change.layer)
     return [functools.partial(_resized, units, change.by, generator) for units in groups]
 
 

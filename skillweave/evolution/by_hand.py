@@ -82,7 +82,7 @@ class ByHand:
             if epsilon and self.rng.random() < epsilon:
                 action = learner.random_actions([self.generator], len(rows), allowed)
             else:
-                actor = learner.actor(self.member.state)
+                actor = learner.acting_params(self.member.state)
                 if "epsilon" in actor.extra:  # said here at each call instead
                     actor.extra["epsilon"].zero_()
                 noise = learner.noise([self.generator], 1, len(rows))[0] if explore else None
@@ -95,17 +95,17 @@ class ByHand:
         """Learn from T steps, as of ``rollout_of``; metrics."""
         rollout = rollout_of(self.learner, self.member.state, *record)
         self.updates += 1
-        seeds = [self.seeds / "update" / self.updates]
-        _, metrics = self.learner.update(self.member.state, rollout, 0.0, seeds)
+        rng = [(self.seeds / "update" / self.updates).torch()]
+        _, report = self.learner.update(self.member.state, rollout, rng)
         self.quick = self._quick()
-        return {k: float(v) for k, v in metrics.items()}
+        return {k: float(v) for k, v in report.metrics.items()}
 
     def learn_sample(self, gamma: float, *record: Any) -> tuple[dict[str, float], Array]:
         """One gradient step on B transitions, as of ``sample_of``; metrics and errors (B,)."""
         sample = sample_of(self.learner, gamma, *record)
-        metrics, errors = self.learner.update(self.member.state, sample, 0.0, [self.generator])
+        _, report = self.learner.update(self.member.state, sample, [self.generator])
         self.quick = self._quick()
-        return {k: float(v) for k, v in metrics.items()}, errors[0].numpy()
+        return {k: float(v) for k, v in report.metrics.items()}, report.error[0].numpy()
 
     def copy(self, seed: int) -> Self:
         """The same agent with weights and chance of its own."""

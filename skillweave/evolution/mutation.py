@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.algorithms.base import setting_number
+from skillweave.algorithms.parameters import setting_number
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
@@ -150,7 +150,7 @@ def _add_noise(member: Member, by: Mutations, spaces: Spaces, rng: np.random.Gen
             view.copy_(torch.randn(view.shape, generator=generator) * chosen * scale)
     if not bool(noise.any()):
         return member
-    for name in algorithm.families()[0].weights:
+    for name in algorithm.parameter_groups()[0].weights:
         getattr(found.state, name).add_(noise)
     return found
 

@@ -266,7 +266,7 @@ class _Evolving:
                 unprefixed(str(i), tensors),
             )
             fresh, where = algorithm.init([self.seeds]), f"{self.run.path}: member {i}"
-            member.state = state_from(own, fresh, where, algorithm.families())
+            member.state = state_from(own, fresh, where, algorithm.parameter_groups())
             members.append(member)
         self.population = Population(
             members, self.evolution, self.phase.make_env, self.spaces, self.seeds

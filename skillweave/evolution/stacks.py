@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm, Family
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import Network
@@ -78,7 +79,7 @@ def grouped(members: Sequence[Member], spaces: tuple[Any, Any]) -> list[list[Mem
     """Members by the stack that they share, in the order in which stacks first appear."""
     groups: dict[AlgorithmConfig, list[Member]] = {}
     for member in members:
-        key = stack_key(member.config, member.algorithm(spaces).settings)
+        key = stack_key(member.config, member.algorithm(spaces).member_hyperparameters)
         groups.setdefault(key, []).append(member)
     return list(groups.values())
 
@@ -93,7 +94,7 @@ def join(
     Algorithms are kept in ``made``: what one of them has compiled need not be compiled again.
     """
     first = members[0]
-    key = stack_key(first.config, first.algorithm(spaces).settings)
+    key = stack_key(first.config, first.algorithm(spaces).member_hyperparameters)
     widest: dict[str, Any] = {
         name: _widest([getattr(m.config, name) for m in members])
         for name in networks_of(first.config)
@@ -103,7 +104,7 @@ def join(
         made[config] = make_algorithm(config, *spaces)
     algorithm = made[config]
     wide, padded = algorithm.layouts(), []
-    uneven = [f for f in algorithm.families() if any(_count(m, f).ndim > 1 for m in members)]
+    uneven = [f for f in algorithm.parameter_groups() if any(_count(m, f).ndim > 1 for m in members)]
     for member in members:
         own = member.algorithm(spaces).layouts()
         tensors = {f.name: getattr(member.state, f.name) for f in fields(member.state)}
@@ -126,7 +127,7 @@ def split(
         own = member.algorithm(spaces).layouts()
         tensors = {f.name: getattr(state, f.name)[i : i + 1].clone() for f in fields(state)}
         tensors |= {k: crop(v, wide[k], own[k]) for k, v in tensors.items() if k in wide}
-        for f in algorithm.families():
+        for f in algorithm.parameter_groups():
             if (count := tensors[f.count]).ndim > 1:
                 like = f.weights[0]
                 tensors[f.count] = even_count(crop(count, wide[like], own[like]))
@@ -149,7 +150,7 @@ def even_count(count: Tensor) -> Tensor:
     return oldest if bool(same.all()) else count
 
 
-def _count(member: Member, family: Family) -> Tensor:
+def _count(member: Member, family: ParameterGroup) -> Tensor:
     found: Tensor = getattr(member.state, family.count)
     return found
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
+from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, check_spaces
 from skillweave.buffers.memory import check_memory
 from skillweave.envs.make import EnvSpec
 from skillweave.collecting.calls import SkillSet
@@ -220,7 +220,7 @@ class Declaration:
             self.flat,
             *(s.algorithm for s in self.skills),
         ):
-            if isinstance(config, PPO):
+            if isinstance(config, OnPolicy):
                 size = config.num_envs * config.n_steps
                 check_memory(size, each + 32, str(short(space)), "rollout", "num_envs or n_steps")
 

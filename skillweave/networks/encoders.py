@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import torch
@@ -11,13 +11,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from skillweave.networks.config import CNN, Activation
-from skillweave.networks.growth import Part, Units
 from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
 from skillweave.spaces import ObsCodec
 from skillweave.types import SkillweaveError
 
 Inputs = Mapping[str, Tensor]
-"""What a network eats: ``vector`` (P, B, O) float and ``image.<i>`` (P, B, C, H, W), raw."""
+"""What a network takes in: ``vector`` (P, B, O) float and ``image.<i>`` (P, B, C, H, W), raw."""
 
 
 class Encoder(Protocol):
@@ -34,7 +33,7 @@ class Encoder(Protocol):
     """Names and shapes of one member's parameters."""
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
-        """Fill fresh parameters in place, one generator a member."""
+        """Fill fresh parameters in place, one generator per member."""
         ...
 
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
@@ -99,34 +98,6 @@ class ImageEncoder:
 
     def _layer(self, name: str, n_in: int, n_out: int, kernel: int) -> None:
         self.shapes |= {f"{name}.weight": (n_out, n_in, kernel, kernel), f"{name}.bias": (n_out,)}
-
-    def units(self, layer: int, prefix: str, onward: Sequence[tuple[str, int]]) -> list[Units]:
-        """The channels of a convolution or of a stage, in groups that have own filters each.
-
-        Args:
-            prefix: of this encoder's parameters, in the network.
-            onward: weights that read the features, and where those begin in them.
-        """
-        count, last = self.cnn.channels[layer], layer == len(self.cnn.channels) - 1
-
-        def own(*names: str) -> tuple[Part, ...]:
-            filters = tuple(Part(f"{prefix}.{n}.weight", -4) for n in names)
-            return (*filters, *(Part(f"{prefix}.{n}.bias", -1) for n in names))
-
-        def read(*names: str) -> tuple[Part, ...]:
-            return tuple(Part(f"{prefix}.{n}.weight", -3) for n in names)
-
-        after = tuple(Part(name, -2, start, self.size // count) for name, start in onward)
-        if self.cnn.kind == "plain":
-            return [Units(count, own(str(layer)), after if last else read(str(layer + 1)))]
-        s, after = layer, after if last else read(f"{layer + 1}.in")
-        return [  # what runs through the stage, and what lies within each of its blocks
-            Units(
-                count, own(f"{s}.in", f"{s}.0.1", f"{s}.1.1"), read(f"{s}.0.0", f"{s}.1.0") + after
-            ),
-            Units(count, own(f"{s}.0.0"), read(f"{s}.0.1")),
-            Units(count, own(f"{s}.1.0"), read(f"{s}.1.1")),
-        ]
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
         """Orthogonal filters, gain √2, biases zero."""

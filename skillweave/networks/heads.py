@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from skillweave.ops.device import Constant
 from skillweave.ops.distributions import (
     categorical_sample,
     categorical_stats,
@@ -25,11 +27,12 @@ LOG_STD = (-5.0, 2.0)
 
 
 class ActionHead:
-    """Choices: the head is logits. Box: it is the mean, and perhaps the log deviation after it.
+    """What a head (..., width) means.
 
-    ``head`` is (..., width); actions are (...) int64 for Discrete, (..., K) int64 for several
-    choices, (..., A) float in policy units for a Box. A squashed Box action is kept as it was
-    before tanh, whose log-probability is exact; ``to_env`` applies it.
+    Of discrete actions it is logits; of a Box the mean, and perhaps the log deviation after it.
+    Actions are (...) int64 for Discrete, (..., K) int64 for MultiDiscrete and MultiBinary,
+    (..., A) float in policy units for a Box. A squashed Box action is kept as it was before tanh,
+    where its log-probability is exact; ``to_env`` applies tanh.
     """
 
     def __init__(
@@ -47,16 +50,17 @@ class ActionHead:
         for n in codec.parts:
             rows.append([start + min(i, n - 1) for i in range(widest)])
             start += n
-        self._columns = torch.tensor(rows)
-        self._exists = torch.tensor([[i < n for i in range(widest)] for n in codec.parts])
+        self._columns = Constant(torch.tensor(rows))
+        exists = [[i < n for i in range(widest)] for n in codec.parts]
+        self._exists = Constant(torch.tensor(exists))
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are choices."""
+        """Whether actions are discrete."""
         return self.codec.discrete
 
-    def noise(self, generators: list[torch.Generator], steps: int, batch: int) -> Tensor:
-        """Noise for ``steps`` calls of ``act``: (steps, P, batch, A), a stream a member."""
+    def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Tensor:
+        """Noise for ``steps`` calls of ``act``: (steps, P, batch, A), one generator per member."""
         shape = (steps, batch, self.codec.size)
         if self.discrete:
             drawn = [gumbel(torch.rand(shape, generator=g)) for g in generators]
@@ -70,7 +74,7 @@ class ActionHead:
             mean, log_std = self.moments(head, log_std)
             return mean if noise is None else torch.addcmul(mean, log_std.exp(), noise)
         if self.codec.multi:
-            head, noise = self._parts(head), None if noise is None else noise[..., self._columns]
+            head, noise = self._parts(head), None if noise is None else self._spread(noise)
         return head.argmax(-1) if noise is None else categorical_sample(head, noise)
 
     def stats(
@@ -93,9 +97,9 @@ class ActionHead:
         return log_prob, entropy
 
     def with_log_prob(self, action: Tensor, log_prob: Tensor, log_std: Tensor | None) -> Tensor:
-        """A head of which single choices, or Box actions, have just these log-probabilities (...).
+        """A head under which Discrete or Box actions have exactly these log-probabilities (...).
 
-        For who is told what was done and how likely it was, but not the whole distribution.
+        For a caller who knows what was done and how likely it was, but not the distribution.
         """
         if self.discrete:
             rest = torch.log1p(-log_prob.exp().clamp(max=1.0 - 1e-6))
@@ -120,5 +124,9 @@ class ActionHead:
         return self.codec.to_env(torch.from_numpy(action).tanh().numpy() if self.squash else action)
 
     def _parts(self, logits: Tensor) -> Tensor:
-        """(..., ΣN) to (..., K, widest), what does not exist at the smallest finite number."""
-        return mask_logits(logits[..., self._columns], self._exists)
+        """Logits (..., ΣN) to (..., K, widest); what does not exist has the smallest number."""
+        return mask_logits(self._spread(logits), self._exists.on(logits.device))
+
+    def _spread(self, x: Tensor) -> Tensor:
+        """(..., ΣN) to (..., K, widest), the last entry of short parts repeated."""
+        return x[..., self._columns.on(x.device)]

@@ -11,7 +11,7 @@ from skillweave.networks.stacked import Views, orthogonal_
 Shapes = dict[str, tuple[int, ...]]
 
 
-def memory_size(rnn: RNN) -> int:
+def rnn_memory_size(rnn: RNN) -> int:
     """M, the numbers that one environment's memory holds: h, and an LSTM's c after it."""
     return rnn.size * (2 if rnn.kind == "lstm" else 1)
 
@@ -59,17 +59,17 @@ def cell(views: Views, prefix: str, rnn: RNN, gates: Tensor, memory: Tensor) -> 
 
 
 def sequence(
-    views: Views, prefix: str, rnn: RNN, x: Tensor, memory: Tensor, start: Tensor
+    views: Views, prefix: str, rnn: RNN, x: Tensor, memory: Tensor, starts: Tensor
 ) -> Tensor:
     """Memories after each of T steps, (P, T, B, M).
 
     Args:
         x: (P, T, B, in).
         memory: (P, B, M), before the first step.
-        start: (P, T, B) bool, an episode begins at this step: its memory begins at zero.
+        starts: (P, T, B) bool, an episode begins at this step: its memory begins at zero.
     """
     gates = project(views, prefix, x.flatten(1, 2)).unflatten(1, x.shape[1:3])
-    keep = (~start).unsqueeze(-1)
+    keep = (~starts).unsqueeze(-1)
     after = []
     for t in range(x.shape[1]):
         memory = cell(views, prefix, rnn, gates[:, t], memory * keep[:, t])

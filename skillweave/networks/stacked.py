@@ -84,7 +84,7 @@ def mlp_shapes(
 
 
 def orthogonal_(weight: Tensor, gain: float, generators: list[torch.Generator]) -> None:
-    """Orthogonal matrices in place, (P, in, ...), one generator a member.
+    """Orthogonal matrices in place, (P, in, ...), one generator per member.
 
     So a member's weights do not depend on its neighbours. Saxe et al. 2014.
     """
@@ -131,4 +131,4 @@ def take_rows(x: Tensor, rows: Tensor) -> Tensor:
     """Rows of each member: x (P, B, ...), rows (P, K) to (P, K, ...)."""
     if x.shape[0] == 1:
         return x[0].index_select(0, rows[0])[None]
-    return x[torch.arange(x.shape[0])[:, None], rows]
+    return x[torch.arange(x.shape[0], device=x.device)[:, None], rows]

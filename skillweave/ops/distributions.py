@@ -79,3 +79,45 @@ def tanh_log_det(x: Tensor) -> Tensor:
     ``2·(log 2 − x − softplus(−2x))``, as in the SAC authors' code (Haarnoja et al. 2018, app. C).
     """
     return 2.0 * (math.log(2.0) - x - torch.nn.functional.softplus(-2.0 * x))
+
+
+def masked_log_probs(logits: Tensor, mask: Tensor | None) -> Tensor:
+    """Log-probabilities of discrete actions; logits and mask (..., A) to (..., A).
+
+    Of forbidden actions it is a number whose exp is 0, but whose product with one is finite.
+    """
+    return mask_logits(logits, mask).log_softmax(-1).clamp_min(-200.0)
+
+
+def squashed_sample(mean: Tensor, log_std: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Actions ``tanh(mean + std·z)`` and their log-density (Haarnoja et al. 2018, app. C).
+
+    Args:
+        mean, log_std, z: (..., A), z standard normal.
+
+    Returns:
+        (..., A) in (−1, 1), and (...).
+    """
+    u = torch.addcmul(mean, log_std.exp(), z)
+    log_prob = -0.5 * z.square() - log_std - _HALF_LOG_TWO_PI - tanh_log_det(u)
+    return u.tanh(), log_prob.sum(-1)
+
+
+def squashed_entropy(mean: Tensor, log_std: Tensor) -> Tensor:
+    """The entropy of ``tanh`` of normals, about: (..., A) to (...).
+
+    The entropy of the normals plus ``log(1 − tanh²)`` at their means. Exact is its expectation,
+    which has no closed form.
+    """
+    return (log_std + 0.5 + _HALF_LOG_TWO_PI + tanh_log_det(mean)).sum(-1)
+
+
+def smoothed_action(action: Tensor, noise: Tensor, std: Tensor, bound: Tensor) -> Tensor:
+    """An action in [−1, 1] moved by clipped noise: target policy smoothing (TD3, eq. 14).
+
+    Args:
+        action, noise: (P, B, A), noise standard normal.
+        std, bound: (P, 1, 1), the deviation of the noise, and its largest size.
+    """
+    moved = (noise * std).clamp(-bound, bound)
+    return (action + moved).clamp(-1.0, 1.0)

@@ -1,12 +1,16 @@
-"""Losses, reduced over the batch to one number a member: (P, B) to (P,).
+"""Losses, reduced over the batch to one number per member: (P, B) to (P,).
 
 Summing the members gives each its own gradient in one backward pass (contract 5).
 """
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+
+from skillweave.ops.moments import masked_mean
 
 
 def ppo_policy_loss(
@@ -15,6 +19,7 @@ def ppo_policy_loss(
     advantage: Tensor,
     clip_coef: Tensor,
     weight: Tensor | None = None,
+    valid: Tensor | None = None,
 ) -> Tensor:
     """Clipped surrogate, ``−E[w·min(ρA, clip(ρ, 1−ε, 1+ε)A)]`` (Schulman et al. 2017, eq. 7).
 
@@ -25,6 +30,7 @@ def ppo_policy_loss(
         log_prob, old_log_prob, advantage: (P, B).
         clip_coef: (P,), ε.
         weight: (P, B), w; None: 1.
+        valid: (P, B) bool, samples that count; None: all.
 
     Returns:
         (P,).
@@ -33,11 +39,15 @@ def ppo_policy_loss(
     eps = clip_coef[:, None]
     clipped = torch.clamp(ratio, 1.0 - eps, 1.0 + eps)
     gain = torch.minimum(ratio * advantage, clipped * advantage)
-    return -(gain if weight is None else weight * gain).mean(1)
+    return -masked_mean(gain if weight is None else weight * gain, valid)
 
 
 def value_loss(
-    value: Tensor, target: Tensor, old_value: Tensor | None = None, clip: Tensor | None = None
+    value: Tensor,
+    target: Tensor,
+    old_value: Tensor | None = None,
+    clip: Tensor | None = None,
+    valid: Tensor | None = None,
 ) -> Tensor:
     """Half the mean squared error, optionally with PPO's value clipping.
 
@@ -46,6 +56,7 @@ def value_loss(
 
     Args:
         value, target, old_value: (P, B).
+        valid: (P, B) bool, samples that count; None: all.
 
     Returns:
         (P,).
@@ -55,18 +66,23 @@ def value_loss(
         bound = clip[:, None]
         step = torch.minimum(torch.maximum(value - old_value, -bound), bound)
         error = torch.maximum(error, (old_value + step - target).square())
-    return 0.5 * error.mean(1)
+    return 0.5 * masked_mean(error, valid)
 
 
-def approximate_kl(log_prob: Tensor, old_log_prob: Tensor, weight: Tensor | None = None) -> Tensor:
+def approximate_kl(
+    log_prob: Tensor,
+    old_log_prob: Tensor,
+    weight: Tensor | None = None,
+    valid: Tensor | None = None,
+) -> Tensor:
     """``E[w·((ρ − 1) − log ρ)]``, the low-variance estimator k3 of KL(old‖new); (P, B) to (P,).
 
-    Schulman 2020, "Approximating KL divergence". ``weight`` as of ``ppo_policy_loss``: samples of
-    another policy count as often as the old one would have drawn them.
+    Schulman 2020, "Approximating KL divergence". ``weight`` and ``valid`` as of
+    ``ppo_policy_loss``: samples of another policy count as often as the old one would have drawn them.
     """
     log_ratio = log_prob - old_log_prob
     kl = torch.expm1(log_ratio) - log_ratio
-    return (kl if weight is None else weight * kl).mean(1)
+    return masked_mean(kl if weight is None else weight * kl, valid)
 
 
 def td_loss(value: Tensor, target: Tensor, kind: str) -> Tensor:
@@ -74,6 +90,47 @@ def td_loss(value: Tensor, target: Tensor, kind: str) -> Tensor:
     if kind == "huber":
         return torch.nn.functional.smooth_l1_loss(value, target, reduction="none")
     return 0.5 * (value - target).square()
+
+
+def weighted_mean(loss: Tensor, weight: Tensor | None) -> Tensor:
+    """Mean over the batch, (P, B) to (P,), with the weights of prioritised replay."""
+    return loss.mean(1) if weight is None else (loss * weight).mean(1)
+
+
+def critic_loss(q: Tensor, target: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Values of K critics (P, K, B) against one target (P, B): half the squared error.
+
+    Returns:
+        Loss (P,), summed over the critics; detached, the error of each sample (P, B) and the mean
+        value (P,).
+    """
+    target = target[:, None]
+    loss = weighted_mean(td_loss(q, target, "mse").sum(1), weight)
+    error = (q.detach() - target).abs().mean(1)
+    return loss, error, q.detach().mean((1, 2))
+
+
+def expected_soft_value(log_p: Tensor, q: Tensor, alpha: Tensor) -> Tensor:
+    """``Σₐ π(a)·(Q(a) − α·log π(a))`` of discrete actions (Christodoulou 2019, eq. 10).
+
+    Args:
+        log_p, q: (P, B, A); alpha: (P, 1).
+
+    Returns:
+        (P, B).
+    """
+    return (log_p.exp() * (q - alpha[..., None] * log_p)).sum(-1)
+
+
+def masked_entropy_target(target: float, mask: Tensor | None) -> Tensor | float:
+    """An entropy to aim at where masks (P, B, A) allow only some of A discrete actions.
+
+    Of m actions it is ``target·log m / log A``, here the mean over the batch, (P,).
+    """
+    if mask is None or mask.shape[-1] == 1:
+        return target
+    share = mask.sum(-1).clamp_min(1).log() / math.log(mask.shape[-1])
+    return target * share.mean(1)
 
 
 def categorical_projection(p: Tensor, atoms: Tensor, reward: Tensor, discount: Tensor) -> Tensor:

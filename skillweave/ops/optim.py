@@ -1,4 +1,4 @@
-"""Optimiser maths on flat parameters: one row of (P, D) a member, settings of shape (P,)."""
+"""Optimiser maths on flat parameters: one row of (P, D) per member, settings of shape (P,)."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def adam_(
         learning_rate: (P,).
         active: (P,) bool; members at False are left exactly as they are.
     """
-    if active is not None and not bool(active.all()):
-        rows = active.nonzero().squeeze(1)
-        part = [x[rows] for x in (params, grad, mu, nu, count, learning_rate)]
-        adam_(*part, beta1=beta1, beta2=beta2, eps=eps)
-        for whole, new in zip((params, mu, nu, count), (part[0], *part[2:5]), strict=True):
-            whole[rows] = new
+    if active is not None and not (active.device.type == "cpu" and bool(active.all())):
+        before = [x.clone() for x in (params, mu, nu, count)]
+        adam_(params, grad, mu, nu, count, learning_rate, beta1=beta1, beta2=beta2, eps=eps)
+        for now, old in zip((params, mu, nu, count), before, strict=True):
+            stays = ~active.view(-1, *[1] * (now.ndim - 1))
+            now.copy_(torch.where(stays, old, now))
         return
     count.add_(1)
     age = (count[:, None] if count.ndim == 1 else count.flatten(1)).to(params.dtype)
@@ -70,22 +70,3 @@ def kl_adapted_rate(
     rate = torch.where(kl > 2.0 * target_kl, learning_rate / 1.5, learning_rate)
     rate = torch.where(kl < 0.5 * target_kl, rate * 1.5, rate)
     return rate.clamp(low, high)
-
-
-def merge_moments(
-    mean: Tensor, var: Tensor, count: Tensor, batch: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Running mean and variance after a batch (Chan, Golub & LeVeque 1979, eq. 2.1).
-
-    Args:
-        mean, var: (P, O); count: (P,); batch: (P, B, O).
-
-    Returns:
-        The new mean, variance and count.
-    """
-    n = float(batch.shape[1])
-    batch_var, batch_mean = torch.var_mean(batch, dim=1, unbiased=False)
-    total = count + n
-    old, new = (count / total)[:, None], n / total[:, None]
-    delta = batch_mean - mean
-    return mean + delta * new, var * old + batch_var * new + delta.square() * old * new, total

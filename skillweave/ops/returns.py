@@ -1,4 +1,4 @@
-"""Returns and advantages from transitions that carry a number ``discount``."""
+"""Returns, targets and advantages from rows that carry a number ``discount``."""
 
 from __future__ import annotations
 
@@ -28,9 +28,7 @@ def gae(
     Returns:
         Advantages, (P, T, B).
     """
-    # Not a product: what a terminal observation is worth may be anything, 0·NaN is NaN.
-    future = torch.where(discount == 0.0, 0.0, discount * next_value)
-    delta = reward + future - value
+    delta = td_target(reward, discount, next_value) - value
     decay = discount * gae_lambda[:, None, None] * (~last)
     advantage = torch.empty_like(delta)
     running = torch.zeros_like(delta[:, 0])
@@ -40,15 +38,14 @@ def gae(
     return advantage
 
 
-def normalise(x: Tensor, eps: float = 1e-8) -> Tensor:
-    """Zero mean and unit deviation over all axes but the first; (P, ...) to (P, ...)."""
-    dims = tuple(range(1, x.ndim))
-    std, mean = torch.std_mean(x, dim=dims, keepdim=True, unbiased=False)
-    return (x - mean) / (std + eps)
+def td_target(reward: Tensor, discount: Tensor, value: Tensor) -> Tensor:
+    """``r + discount·V(s′)``, what a value is learnt from (Sutton 1988); all of any one shape."""
+    return reward + discounted(discount, value)
 
 
-def explained_variance(value: Tensor, target: Tensor) -> Tensor:
-    """``1 − Var(target − value) / Var(target)`` per member; (P, ...) to (P,)."""
-    dims = tuple(range(1, value.ndim))
-    residual = (target - value).var(dim=dims, unbiased=False)
-    return 1.0 - residual / target.var(dim=dims, unbiased=False).clamp_min(1e-12)
+def discounted(discount: Tensor, value: Tensor) -> Tensor:
+    """``discount·value``, but 0 where ``discount`` is 0; both of any one shape.
+
+    Not a product: what a terminal observation is worth may be anything, and 0·NaN is NaN.
+    """
+    return torch.where(discount == 0.0, 0.0, discount * value)

@@ -42,5 +42,5 @@ def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str
     algorithm.set_weights(state, tensors)
     saved = {k[len("state.") :]: v for k, v in tensors.items() if k.startswith("state.")}
     if saved:
-        state = state_from(vars(state) | saved, state, str(path), algorithm.families())
+        state = state_from(vars(state) | saved, state, str(path), algorithm.parameter_groups())
     return algorithm, state, header.get("about", {})

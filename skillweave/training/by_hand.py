@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
-from skillweave.types import Sample, Transition
+from skillweave.algorithms.ppo import PPOAlgorithm, State
+from skillweave.experience import Rollout, Sample
 
 
 def returns_of(
@@ -60,11 +60,14 @@ def rollout_of(
     actions = _tensor(action, kind).view(*lead, *(algorithm.action_space.shape or ()))
     discount = state.gamma[:, None, None] * ~ended
     following = torch.cat([before[:, 1:], after], 1)
-    transition = Transition(before, actions, rewards.view(lead), discount, following, last)
     log_std = algorithm.layout.views(state.params).get("actor.log_std")
     log_std = None if log_std is None else log_std[:, None].clone()
     log_probs = _tensor(log_prob, np.float32).view(lead)
-    return Rollout(transition, algorithm.head.with_log_prob(actions, log_probs, log_std), log_std)
+    head = algorithm.head.with_log_prob(actions, log_probs, log_std)
+    rewards = rewards.view(lead)
+    return Rollout(
+        before, actions, rewards, discount, following, last, head=head, log_std=log_std
+    )
 
 
 def sample_of(

@@ -9,9 +9,7 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.collector import Collector
@@ -81,8 +79,8 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
         entry: the manifest's; "evolution" says of how many members.
     """
     config = config_from_json(entry["algorithm"])
-    algorithm = make_algorithm(config, observation_space, action_space)
-    if not isinstance(algorithm, OffPolicyAlgorithm):
+    algorithm: Any = make_algorithm(config, observation_space, action_space)
+    if algorithm.store != "replay":
         return
     members = int((entry.get("evolution") or {"population": 1})["population"])
     env: Any = SimpleNamespace(
@@ -178,7 +176,7 @@ def train_phase(
     every, episodes = run.manifest.get("eval_every"), run.manifest.get("eval_episodes", 0)
     probe = Probe(phase.make_env, config.gamma, seeds, every, episodes)
     try:
-        algorithm = make_algorithm(config, env.observation_space, env.action_space)
+        algorithm: Any = make_algorithm(config, env.observation_space, env.action_space)
         fresh = algorithm.init([seeds / "member" / 0])
         found = run.load_checkpoint(algorithm.state_type, phase.name, like=fresh)
         state, at, extra = found or (fresh, dict(START), {})
@@ -197,9 +195,9 @@ def train_phase(
 
         where: dict[str, Any] = {k: at[k] for k in ("update", "steps", "seconds")}
         where |= {"cut_every": int(run.manifest["cut_every"]), "on_tick": on_tick}
-        if isinstance(algorithm, PPOAlgorithm):
+        if algorithm.store == "rollout":
             train_on_policy(algorithm, collector, state, seeds, budget, **where)
-        elif isinstance(algorithm, OffPolicyAlgorithm):
+        else:
             saved = unprefixed("buffer", extra)
             train_off_policy(algorithm, collector, state, seeds, budget, saved=saved, **where)
     finally:

@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import torch
 from skillweave import DQN, SAC, TD3, Network, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
+from skillweave.experience import Sample
 
 P, B = 2, 16
 OBS = gym.spaces.Box(-1.0, 1.0, (3,))
@@ -42,7 +42,7 @@ def sample(space: gym.Space[Any], seed: int) -> Sample:
         discount=torch.rand(P, B, generator=g).round() * 0.9,
         next_obs=torch.randn(P, B, 3, generator=g),
         obs_mask=allowed if discrete else None,
-        mask=allowed if discrete else None,
+        next_obs_mask=allowed if discrete else None,
         weight=torch.rand(P, B, generator=g),
         index=np.zeros((P, B), np.int64),
     )
@@ -64,7 +64,7 @@ def test_compiled_steps_equal_plain_ones(kind: Any, space: gym.Space[Any]) -> No
         state = algorithm.init([Seeds(m) for m in range(P)])
         for u in range(5):
             generators = [(Seeds(u) / m).torch() for m in range(P)]
-            algorithm.update(state, sample(space, u), 0.1, generators)
+            algorithm.update(state, replace(sample(space, u), progress=0.1), generators)
         states.append(state)
     for field in fields(states[0]):
         plain, fused = (getattr(s, field.name) for s in states)

@@ -177,7 +177,7 @@ def test_a_policy_in_a_file_acts_as_it_did(case, tmp_path):
             assert np.array_equal(mine, theirs)
             assert mine.dtype == env.action_space.dtype
             assert all(env.action_space.contains(a) for a in mine)
-            if not algorithm.memory:
+            if not algorithm.memory_size:
                 assert memories == [{}, {}]
 
 
@@ -290,23 +290,8 @@ def trained(env: Any, name: str, each: int = 1, scale: float = 1.0) -> tuple[Any
 
 
 def values(algorithm: Any, state: Any, obs: Any) -> list[float]:
-    """What the policy expects of itself in observations (n, ...)."""
-    rows, actor = torch.as_tensor(np.asarray(obs))[None], algorithm.actor(state)
-    if isinstance(algorithm, PPOAlgorithm):
-        if not algorithm.memory:
-            return algorithm.value(state, rows)[0].tolist()
-        memory = torch.zeros(1, rows.shape[1], algorithm.memory // 2)
-        views, inputs = algorithm.layout.views(state.params), algorithm.inputs(actor, rows)
-        raw, _ = algorithm.critic_net.step(views, inputs, memory)
-        return algorithm._in_rewards(state, raw)[0].tolist()
-    action, q, _ = algorithm.act(actor, rows, None, None)
-    if not isinstance(algorithm.config, DQN):
-        views, inputs = algorithm.critics.views(state.critic), algorithm.inputs(actor, rows)
-        if algorithm.codec.discrete:
-            q = algorithm.critics(views, inputs).mean(1)
-        else:
-            return algorithm.critics(views, inputs, action).mean((1, 3))[0].tolist()
-    return q.gather(-1, action[..., None])[0, :, 0].tolist()
+    """What the policy expects in observations (n, ...)."""
+    return algorithm.value(state, torch.as_tensor(np.asarray(obs))[None])[0].tolist()
 
 
 @pytest.mark.parametrize("name", [name for name in VALUED if name != "ddpg"])
@@ -359,7 +344,7 @@ def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_ste
     # Without γ^τ the long call would be worth 3 / (1 − 0.8) = 15, and be chosen.
     rows = torch.zeros(1, 1, 1)
     if name in ("dqn", "dqn of three steps", "sac of choices"):
-        actor = algorithm.actor(state)
+        actor = algorithm.acting_params(state)
         if name == "sac of choices":
             inputs = algorithm.inputs(actor, rows)
             q = algorithm.critics(algorithm.critics.views(state.critic), inputs).mean(1)
@@ -421,7 +406,7 @@ def test_a_forbidden_action_is_never_chosen_in_targets(name):
         for flat in (state.critic, state.critic_target):
             algorithm.critics.views(flat)["critic.0.weight"][:] = tempting
     _, state = learn(config, env, 2000, state=state)
-    inputs = algorithm.inputs(algorithm.actor(state), torch.arange(3)[None])
+    inputs = algorithm.inputs(algorithm.acting_params(state), torch.arange(3)[None])
     if "dqn" in name:
         q = algorithm.net(algorithm.layout.views(state.params), inputs)[0, ..., 0]
     else:
@@ -445,10 +430,10 @@ MEMORIES = {"lstm": replace(LSTM, overlap=False), "gru": replace(GRU, overlap=Fa
 class Watched(PPOAlgorithm):
     """Keeps every rollout, with the state that it met."""
 
-    def update(self, state, rollout, progress, seeds):
+    def update(self, state, batch, rng):
         self.seen = getattr(self, "seen", [])
-        self.seen.append((rollout, state.params.clone()))
-        return super().update(state, rollout, progress, seeds)
+        self.seen.append((batch, state.params.clone()))
+        return super().update(state, batch, rng)
 
 
 def watched(config: PPO, updates: int = 3) -> Watched:
@@ -464,18 +449,18 @@ def test_learning_begins_at_the_very_probabilities_that_acting_had(kind):
     algorithm = watched(MEMORIES[kind])
     assert len(algorithm.seen) == 3
     for i, (rollout, params) in enumerate(algorithm.seen):
-        views, tr, cut = algorithm.layout.views(params), rollout.transition, algorithm.memory // 2
-        assert rollout.start[:, 1:].any()
+        views, tr, cut = algorithm.layout.views(params), rollout, algorithm.memory_size // 2
+        assert rollout.starts[:, 1:].any()
         assert bool(rollout.memory.any()) == (i > 0)  # what went on from the rollout before
         memory = rollout.memory[..., :cut]
         inputs = {"vector": tr.obs}
-        head, _ = algorithm.actor_net.sequence(views, inputs, memory, rollout.start)
+        head, _ = algorithm.actor_net.sequence(views, inputs, memory, rollout.starts)
         torch.testing.assert_close(head, rollout.head, rtol=1e-4, atol=1e-6)
         old, _ = algorithm.head.stats(rollout.head, None, None, tr.action)
         new, _ = algorithm.head.stats(head, None, None, tr.action)
         torch.testing.assert_close(new, old, rtol=1e-4, atol=1e-5)
         # A version that forgets where episodes began would not agree:
-        never = torch.zeros_like(rollout.start)
+        never = torch.zeros_like(rollout.starts)
         other, _ = algorithm.actor_net.sequence(views, inputs, memory, never)
         assert (other - rollout.head).abs().max() > 1e-4
 
@@ -487,26 +472,28 @@ def test_the_first_minibatches_ratio_is_one(kind):
     rollout, params = algorithm.seen[0]
     state = algorithm.init([Seeds(0)])
     assert torch.equal(state.params, params)
-    _, metrics = algorithm.update(state, rollout, 0.0, [Seeds(0)])
-    assert metrics["kl"].item() == pytest.approx(0.0, abs=1e-6)
+    _, report = algorithm.update(state, rollout, [Seeds(0).torch()])
+    assert report.metrics["kl"].item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_value_after_an_end_remembers_what_led_to_it():
     algorithm = watched(MEMORIES["lstm"], updates=2)
-    rollout, params = algorithm.seen[1]
-    state, tr, cut = algorithm.init([Seeds(0)]), rollout.transition, algorithm.actor_net.memory
-    state.params = params
-    views, net = algorithm.layout.views(params), algorithm.critic_net
-    data = {"vector": tr.obs, "memory": rollout.memory, "start": rollout.start}
+    tr, views = algorithm.seen[1][0], algorithm.layout.views(algorithm.seen[1][1])
+    state, cut, net = algorithm.init([Seeds(0)]), algorithm.actor_net.memory_size, algorithm.critic_net
+    state.params = algorithm.seen[1][1]
     with torch.no_grad():
-        value, following = algorithm._values(views, state, algorithm.actor(state), data, tr)
-        memory = rollout.memory[..., cut:]
+        own = tr.memory[..., cut:]
+        out, after = net.sequence(views, {"vector": tr.obs}, own, tr.starts)
+        params = algorithm.learning_params(state)
+        value = out[..., 0]
+        following = algorithm._next_values(state, params, tr, value, after.flatten(1, 2))
+        memory = own
         for t in range(16):
-            memory = memory.masked_fill(rollout.start[:, t, :, None], 0.0)
+            memory = memory.masked_fill(tr.starts[:, t, :, None], 0.0)
             now, memory = net.step(views, {"vector": tr.obs[:, t]}, memory)
-            after, _ = net.step(views, {"vector": tr.next_obs[:, t]}, memory)
+            later, _ = net.step(views, {"vector": tr.next_obs[:, t]}, memory)
             torch.testing.assert_close(value[:, t], now[..., 0], rtol=1e-4, atol=1e-5)
-            torch.testing.assert_close(following[:, t], after[..., 0], rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(following[:, t], later[..., 0], rtol=1e-4, atol=1e-5)
     assert tr.last.sum() > 8
 
 
@@ -514,7 +501,7 @@ def test_a_policy_remembers_until_it_starts_anew():
     algorithm, state, env = TABLE["ppo with lstm, vector, Discrete"].learn()
     policy, obs = AgentPolicy.of(algorithm, state), env.show(np.array([1, 1, 2]))
     fresh = policy.start(3)
-    assert fresh["rnn"].shape == (3, algorithm.memory) == (3, 32)
+    assert fresh["rnn"].shape == (3, algorithm.memory_size) == (3, 32)
     assert not fresh["rnn"].any()
     _, after = policy.act(fresh, obs)
     assert not fresh["rnn"].any()

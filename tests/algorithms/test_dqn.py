@@ -15,7 +15,7 @@ from skillweave.algorithms.config import DQN
 from skillweave.algorithms.dqn import DQNAlgorithm, State
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
+from skillweave.experience import Sample
 
 P, B, A = 2, 7, 3
 LINEAR = DQN(num_envs=2, network=Network(()), loss="mse", learning_rate=1e-2)
@@ -41,7 +41,7 @@ def sample(members: int = P, masked: bool = False, weighted: bool = False) -> Sa
     return Sample(
         obs=torch.randn(*lead, 2, generator=g), action=torch.randint(A, lead, generator=g),
         reward=torch.randn(lead, generator=g), discount=discount,
-        next_obs=torch.randn(*lead, 2, generator=g), obs_mask=None, mask=mask,
+        next_obs=torch.randn(*lead, 2, generator=g), obs_mask=None, next_obs_mask=mask,
         weight=torch.rand(lead, generator=g) if weighted else None, index=np.zeros(lead, np.int64),
     )  # fmt: skip
 
@@ -68,7 +68,7 @@ def test_the_target_by_hand(double, masked):
         for b in range(B):
             slow = linear(algorithm, state.target, m, s.next_obs[m, b])
             fast = linear(algorithm, state.params, m, s.next_obs[m, b])
-            allowed = [a for a in range(A) if not masked or s.mask[m, b, a]]
+            allowed = [a for a in range(A) if not masked or s.next_obs_mask[m, b, a]]
             judge = fast if double else slow
             best = max(allowed, key=lambda a, judge=judge: judge[a].item())
             differ += best != int(slow.argmax())
@@ -114,7 +114,7 @@ def test_the_distributions_target_is_the_projection_of_the_best_actions(masked):
             fast = linear(algorithm, state.params, m, s.next_obs[m, b]).view(A, 5).softmax(-1)
             slow = linear(algorithm, state.target, m, s.next_obs[m, b]).view(A, 5).softmax(-1)
             worth = fast @ torch.tensor(atoms)
-            allowed = [a for a in range(A) if not masked or s.mask[m, b, a]]
+            allowed = [a for a in range(A) if not masked or s.next_obs_mask[m, b, a]]
             p, target = slow[max(allowed, key=lambda a, w=worth: w[a].item())], [0.0] * 5
             for j in range(5):
                 moved = s.reward[m, b].item() + s.discount[m, b].item() * atoms[j]
@@ -136,19 +136,19 @@ def test_an_update_is_a_step_of_adam_and_the_target_follows():
     before, slow = state.params.clone(), state.target.clone()
     leaf = before.clone().requires_grad_()
     algorithm.loss(algorithm.layout.views(leaf), state, s, [None] * 3)[0].sum().backward()
-    metrics, _ = algorithm.update(state, s, 0.0, [Seeds(0).torch()])
+    _, report = algorithm.update(state, s, [Seeds(0).torch()])
     # Adam's first step: the rate times the sign of the gradient, but for ε.
     step = 1e-2 * leaf.grad / (leaf.grad.abs() + algorithm.config.adam_eps)
     torch.testing.assert_close(state.params, before - step)
     torch.testing.assert_close(state.target, slow + 0.25 * (state.params - slow))
-    assert metrics["grad_norm"].item() == pytest.approx(leaf.grad.norm().item(), rel=1e-4)
+    assert report.metrics["grad_norm"].item() == pytest.approx(leaf.grad.norm().item(), rel=1e-4)
 
 
 def test_the_target_is_updated_now_and_then():
     algorithm, state = make(target_update_interval=3, tau=1.0)
     slow, changed = state.target.clone(), []
     for _ in range(6):
-        algorithm.update(state, sample(), 0.0, [Seeds(m).torch() for m in range(P)])
+        algorithm.update(state, sample(), [Seeds(m).torch() for m in range(P)])
         changed.append(not torch.equal(state.target, slow))
         slow = state.target.clone()
     assert changed == [False, False, True] * 2
@@ -160,7 +160,7 @@ def test_the_share_of_random_actions_falls_and_stays(progress, epsilon):
     algorithm, state = make(
         exploration_fraction=0.2, exploration_initial_eps=0.8, exploration_final_eps=0.2
     )
-    actor = algorithm.actor(state, progress)
+    actor = algorithm.acting_params(state, progress)
     assert actor.extra["epsilon"].flatten().tolist() == pytest.approx([epsilon] * P)
     obs, n = torch.ones(P, 20_000, 2), 20_000
     noise = algorithm.noise([Seeds(m).torch() for m in range(P)], 1, n)[0]
@@ -171,7 +171,7 @@ def test_the_share_of_random_actions_falls_and_stays(progress, epsilon):
 
 def test_noisy_weights_explore_and_nothing_else_does():
     algorithm, state = make(noisy=True, network=Network((16,)))
-    actor, obs = algorithm.actor(state), torch.randn(P, 5, 2)
+    actor, obs = algorithm.acting_params(state), torch.randn(P, 5, 2)
     assert not actor.extra["epsilon"].any()
     noises = algorithm.noise([Seeds(m).torch() for m in range(P)], 30, 5)
     values = torch.stack([algorithm.act(actor, obs, None, n)[1] for n in noises])
@@ -186,8 +186,8 @@ def test_noisy_weights_explore_and_nothing_else_does():
 def test_an_update_with_noisy_weights_draws_noise_of_each_members_own():
     algorithm, state = make(noisy=True, network=Network((4,)))
     one = make(noisy=True, network=Network((4,)))[1]
-    algorithm.update(state, sample(), 0.0, [Seeds(m).torch() for m in range(P)])
-    algorithm.update(one, sample(), 0.0, [Seeds(0).torch(), Seeds(7).torch()])
+    algorithm.update(state, sample(), [Seeds(m).torch() for m in range(P)])
+    algorithm.update(one, sample(), [Seeds(0).torch(), Seeds(7).torch()])
     assert torch.equal(state.params[0], one.params[0])
     assert not torch.equal(state.params[1], one.params[1])
 
@@ -206,7 +206,7 @@ def test_a_masked_action_is_not_taken_however_good_it_looks():
     mask = torch.tensor([False, True, True]).expand(P, 2000, A)
     obs = torch.zeros(P, 2000, 2)
     for progress in (0.0, 1.0):
-        actor = algorithm.actor(state, progress)
+        actor = algorithm.acting_params(state, progress)
         for noise in (algorithm.noise([Seeds(m).torch() for m in range(P)], 1, 2000)[0], None):
             action, _, _ = algorithm.act(actor, obs, mask, noise)
             assert (action != 0).all()
@@ -232,14 +232,14 @@ def test_atoms_without_bounds_of_their_own_fit_the_returns_seen():
     )  # fmt: skip
     algorithm, state = learn(config, Pays(8), 1200)
     scale = (state.return_var + state.return_mean.square()).sqrt()
-    _, q, _ = algorithm.act(algorithm.actor(state), torch.zeros(1, 1, 1), None, None)
+    _, q, _ = algorithm.act(algorithm.acting_params(state), torch.zeros(1, 1, 1), None, None)
     # Of the best policy 6000 / (1 − γ); the other action loses 2000 of it.
     assert (q * scale).flatten().tolist() == pytest.approx([10_000, 12_000], rel=0.05)
 
 
 def test_the_units_of_atoms_by_hand():
     algorithm, state = make(distributional=True, n_atoms=5)
-    assert algorithm.atoms.tolist() == [-10, -5, 0, 5, 10]
+    assert algorithm.atoms.on(torch.device("cpu")).tolist() == [-10, -5, 0, 5, 10]
     assert algorithm.scales_rewards
     state.return_mean[:], state.return_var[:] = 3.0, 16.0
     s = sample()

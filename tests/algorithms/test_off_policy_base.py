@@ -9,7 +9,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from skillweave.algorithms.base import LARGEST
+from skillweave.algorithms.parameters import LARGEST
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -19,12 +19,15 @@ from skillweave.algorithms.config import (
     config_from_json,
     config_to_json,
 )
-from skillweave.algorithms.off_policy import Critics, weighted_mean
+from skillweave.algorithms.actor_critic import Critics
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import CNN, RNN, Network
+from skillweave.ops.losses import weighted_mean
+from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
-from skillweave.types import Sample, SkillweaveError
+from skillweave.experience import Sample
+from skillweave.types import SkillweaveError
 
 NAN, INF = float("nan"), float("inf")
 RANGES: list[tuple[type, str, object, str]] = [
@@ -159,9 +162,8 @@ def test_the_rate_is_constant_or_falls_to_nothing():
 
 
 def test_what_follows_an_end_may_be_anything():
-    algorithm = make_algorithm(DQN(), Discrete(2), Discrete(2))
     reward, discount = torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 0.5]])
-    target = algorithm.target(reward, discount, torch.tensor([[NAN, 8.0]]))
+    target = td_target(reward, discount, torch.tensor([[NAN, 8.0]]))
     assert target.tolist() == [[1.0, 6.0]]
 
 
@@ -237,7 +239,7 @@ def test_the_slow_networks_turn_comes_beyond_what_a_float_can_count():
     moved = []
     for _ in range(4):
         before = state.params.clone()
-        algorithm.update(state, sample, 0.0, [])
+        algorithm.update(state, sample, [])
         moved.append(not torch.equal(state.params, before))
     assert moved == [False, True, False, True]
     assert state.updates.tolist() == [(1 << 24) + 4]

@@ -8,13 +8,15 @@ from torch import nn
 from toys import Echo, learn
 
 from skillweave.algorithms.config import PPO, config_from_json, config_to_json
-from skillweave.algorithms.ppo import PPOAlgorithm, Rollout, State
+from skillweave.algorithms.ppo import PPOAlgorithm, State
+from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
-from skillweave.ops.returns import gae, normalise
+from skillweave.ops.moments import normalise
+from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
 from skillweave.training.collector import Collector
 from skillweave.training.on_policy import train_on_policy
-from skillweave.types import SkillweaveError, Transition
+from skillweave.types import SkillweaveError
 
 T, B = 8, 6
 OBS = Box(-np.inf, np.inf, (3,), np.float32)
@@ -29,12 +31,13 @@ def make(action=None, members=1, **settings) -> tuple[PPOAlgorithm, State]:
     return algorithm, algorithm.init([Seeds(m) for m in range(members)])
 
 
+def rngs(*seeds: int | Seeds) -> list[torch.Generator]:
+    return [(s if isinstance(s, Seeds) else Seeds(s)).torch() for s in seeds]
+
+
 def members_of(x, rows: slice):
-    """The members ``rows`` of a State, Rollout or Transition, as a copy."""
+    """The members ``rows`` of a State or Rollout, as a copy."""
     values = {f.name: getattr(x, f.name) for f in fields(x)}
-    values["transition"] = members_of(x.transition, rows) if "transition" in values else None
-    if not isinstance(x, Rollout):
-        del values["transition"]
     copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
     return type(x)(**{**values, **copied})
 
@@ -52,20 +55,18 @@ def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool =
     if masked:
         mask = torch.rand(p, T, B, 4, generator=g) < 0.5
         mask[..., 2] = True
-    actor = algorithm.actor(state)
+    actor = algorithm.acting_params(state)
     noise = algorithm.noise([torch.Generator().manual_seed(m) for m in range(p)], T * B, 1)
     flat_mask = None if mask is None else mask.flatten(1, 2)
     action, head, _ = algorithm.act(
         actor, obs.flatten(1, 2), flat_mask, noise[:, :, 0].transpose(0, 1)
     )
-    transition = Transition(
-        obs, action.unflatten(1, (T, B)), torch.randn(p, T, B, generator=g),
-        0.9 * (~terminated), next_obs, last, mask,
-    )  # fmt: skip
     log_std = actor.views.get("actor.log_std")
     return Rollout(
-        transition, head.unflatten(1, (T, B)), None if log_std is None else log_std[:, None]
-    )
+        obs, action.unflatten(1, (T, B)), torch.randn(p, T, B, generator=g),
+        0.9 * (~terminated), next_obs, last, mask, head=head.unflatten(1, (T, B)),
+        log_std=None if log_std is None else log_std[:, None],
+    )  # fmt: skip
 
 
 def updated(
@@ -75,7 +76,8 @@ def updated(
     for u in range(updates):
         whole = rollout(algorithm, algorithm.init([Seeds(m) for m in range(3)]), seed=u, **kwargs)
         mine = members_of(whole, slice(members.start, members.stop))
-        state, _ = algorithm.update(state, mine, u / updates, [Seeds(9) / m / u for m in members])
+        mine.progress = u / updates
+        state, _ = algorithm.update(state, mine, rngs(*(Seeds(9) / m / u for m in members)))
     return state
 
 
@@ -131,7 +133,7 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not()
     def weights(seed: int) -> torch.Tensor:
         algorithm, state = make()
         data = rollout(algorithm, state)
-        return algorithm.update(state, data, 0.0, [Seeds(seed)])[0].params
+        return algorithm.update(state, data, rngs(seed))[0].params
 
     assert torch.equal(weights(1), weights(1))
     assert not torch.equal(weights(1), weights(2))  # the order of the minibatches
@@ -159,8 +161,8 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     algorithm, state = make(space, **settings)
     cfg = algorithm.config
     data = rollout(algorithm, state, masked=masked)
-    tr = data.transition
-    acted, _ = algorithm.head.stats(data.head, data.log_std, tr.mask, tr.action)
+    tr = data
+    acted, _ = algorithm.head.stats(data.head, data.log_std, tr.obs_mask, tr.action)
     if late:  # what learns is no longer what acted
         state = algorithm.init([Seeds(7)])
         algorithm.layout.views(state.params)["actor.1.weight"].mul_(100.0)
@@ -173,7 +175,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     def policy() -> torch.distributions.Distribution:
         head = actor(tr.obs)
         if algorithm.head.discrete:
-            head = head.masked_fill(~tr.mask, -1e9) if masked else head
+            head = head.masked_fill(~tr.obs_mask, -1e9) if masked else head
             return torch.distributions.Categorical(logits=head)
         return torch.distributions.Independent(torch.distributions.Normal(head, log_std.exp()), 1)
 
@@ -196,7 +198,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
         loss.backward()
         nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
         adam.step()
-    state, metrics = algorithm.update(state, data, 0.0, [Seeds(0)])
+    state, report = algorithm.update(state, data, rngs(0))
     for prefix, network in (("actor", actor), ("critic", critic)):
         stacked = plain_network(algorithm, state, prefix)
         for a, b in zip(stacked.parameters(), network.parameters(), strict=True):
@@ -204,7 +206,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     if not algorithm.head.discrete:
         got = algorithm.layout.views(state.params)["actor.log_std"][0, 0]
         torch.testing.assert_close(got, log_std.data, rtol=1e-4, atol=1e-6)
-    assert metrics["samples"].tolist() == [T * B]
+    assert report.metrics["samples"].tolist() == [T * B]
 
 
 def test_greedy_is_the_most_probable_action_and_the_mean():
@@ -214,7 +216,7 @@ def test_greedy_is_the_most_probable_action_and_the_mean():
         (Box(-1, 1, (2,)), lambda h: h),
     ):
         algorithm, state = make(space, members=2)
-        action, head, _ = algorithm.act(algorithm.actor(state), obs, None, None)
+        action, head, _ = algorithm.act(algorithm.acting_params(state), obs, None, None)
         assert torch.equal(action, greedy(head))
 
 
@@ -222,7 +224,7 @@ def test_sampling_follows_the_heads_distribution():
     algorithm, state = make()
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([0.0, 1.0, 2.0, 3.0])
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(algorithm.actor(state), torch.zeros(1, 50_000, 3), None, noise)
+    action, head, _ = algorithm.act(algorithm.acting_params(state), torch.zeros(1, 50_000, 3), None, noise)
     frequency = action.flatten().bincount(minlength=4) / 50_000
     torch.testing.assert_close(frequency, head[0, 0].softmax(-1), atol=0.008, rtol=0)
 
@@ -230,7 +232,7 @@ def test_sampling_follows_the_heads_distribution():
 def test_continuous_sampling_has_the_initial_deviation():
     algorithm, state = make(Box(-1, 1, (2,)), action_std_init=0.3)
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(algorithm.actor(state), torch.ones(1, 50_000, 3), None, noise)
+    action, head, _ = algorithm.act(algorithm.acting_params(state), torch.ones(1, 50_000, 3), None, noise)
     torch.testing.assert_close(action[0].std(0), torch.full((2,), 0.3), rtol=0.02, atol=0)
     torch.testing.assert_close(action[0].mean(0), head[0, 0], rtol=0, atol=0.01)
 
@@ -239,7 +241,7 @@ def test_a_masked_action_is_never_taken_and_has_no_probability():
     algorithm, state = make()
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([9.0, 0.0, 0.0, 9.0])
     mask = torch.tensor([False, True, True, False]).expand(1, 20_000, 4)
-    actor, obs = algorithm.actor(state), torch.zeros(1, 20_000, 3)
+    actor, obs = algorithm.acting_params(state), torch.zeros(1, 20_000, 3)
     for noise in (algorithm.noise([Seeds(0).torch()], 1, 20_000)[0], None):
         action, head, _ = algorithm.act(actor, obs, mask, noise)
         assert mask.gather(-1, action[..., None]).all()
@@ -259,19 +261,19 @@ def test_each_member_has_its_own_noise():
 @pytest.mark.parametrize("normalize_obs", [False, True])
 def test_an_actor_is_a_copy_that_learning_does_not_change(normalize_obs):
     algorithm, state = make(normalize_obs=normalize_obs)
-    actor, obs = algorithm.actor(state), torch.randn(1, 5, 3)
+    actor, obs = algorithm.acting_params(state), torch.randn(1, 5, 3)
     before = algorithm.act(actor, obs, None, None)[1].clone()
-    algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0)])
+    algorithm.update(state, rollout(algorithm, state), rngs(0))
     assert torch.equal(algorithm.act(actor, obs, None, None)[1], before)
-    assert not torch.equal(algorithm.act(algorithm.actor(state), obs, None, None)[1], before)
+    assert not torch.equal(algorithm.act(algorithm.acting_params(state), obs, None, None)[1], before)
 
 
 def test_observations_are_normalised_by_all_that_were_seen():
     algorithm, state = make(normalize_obs=True)
     data = [rollout(algorithm, state, seed=s) for s in range(2)]
     for d in data:
-        algorithm.update(state, d, 0.0, [Seeds(0)])
-    seen = torch.cat([d.transition.obs.flatten(0, 2) for d in data])
+        algorithm.update(state, d, rngs(0))
+    seen = torch.cat([d.obs.flatten(0, 2) for d in data])
     torch.testing.assert_close(state.obs_mean[0], seen.mean(0), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(state.obs_var[0], seen.var(0, unbiased=False), rtol=1e-4, atol=1e-4)
 
@@ -279,16 +281,16 @@ def test_observations_are_normalised_by_all_that_were_seen():
 def test_a_member_that_oversteps_the_kl_stops_and_the_others_go_on():
     algorithm, state = make(members=2, target_kl=0.01, update_epochs=10)
     state.learning_rate = torch.tensor([0.05, 1e-5])
-    algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0), Seeds(1)])
+    algorithm.update(state, rollout(algorithm, state), rngs(0, 1))
     assert 0 < state.count[0] < 30
     assert state.count[1] == 30
 
 
 def test_metrics_of_an_update_that_stops_early_are_means_over_the_steps_it_took():
     algorithm, state = make(target_kl=1e-4, update_epochs=10, learning_rate=1e-2)
-    _, metrics = algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0)])
+    _, report = algorithm.update(state, rollout(algorithm, state), rngs(0))
     assert 0 < state.count.item() < 30
-    assert metrics["entropy"].item() == pytest.approx(np.log(4), rel=0.05)  # still almost uniform
+    assert report.metrics["entropy"].item() == pytest.approx(np.log(4), rel=0.05)  # still almost uniform
 
 
 @pytest.mark.parametrize("settings", [{}, {"normalize_obs": True}])
@@ -297,38 +299,38 @@ def test_an_update_from_an_old_policy_is_never_empty(settings):
     stale = rollout(algorithm, state)
     for done in range(1, 4):  # by the second, the policy is another than acted
         before = state.params.clone()
-        _, metrics = algorithm.update(state, stale, 0.0, [Seeds(0)])
+        _, report = algorithm.update(state, stale, rngs(0))
         assert state.count.item() == done  # the second step would overstep
         assert not torch.equal(state.params, before)
-        assert metrics["kl"].item() > 1e-5
+        assert report.metrics["kl"].item() > 1e-5
 
 
 def test_kl_counts_from_the_first_policy_of_an_update():
     algorithm, state = make(batch_size=T * B, update_epochs=2, learning_rate=0.05)
     data = rollout(algorithm, state)
     algorithm.layout.views(state.params)["actor.1.bias"] += torch.tensor([0.5, 0.0, -0.5, 0.0])
-    tr, heads = data.transition, []
+    tr, heads = data, []
     for epochs in range(2):  # the policies before the first and the second gradient step
         one, same = make(batch_size=T * B, update_epochs=1, learning_rate=0.05)
         same.params.copy_(state.params)
         if epochs:
-            one.update(same, data, 0.0, [Seeds(0)])
-        heads.append(one.act(one.actor(same), tr.obs.flatten(1, 2), None, None)[1])
+            one.update(same, data, rngs(0))
+        heads.append(one.act(one.acting_params(same), tr.obs.flatten(1, 2), None, None)[1])
     taken = tr.action.flatten(1, 2)
     first, second = (algorithm.head.stats(h, None, None, taken)[0] for h in heads)
     acted = algorithm.head.stats(data.head, None, None, tr.action)[0].flatten(1, 2)
     ratio = (second - first).exp()
     expected = ((first - acted).exp() * (ratio - 1.0 - ratio.log())).mean() / 2  # the first is 0
-    _, metrics = algorithm.update(state, data, 0.0, [Seeds(0)])
+    _, report = algorithm.update(state, data, rngs(0))
     assert expected > 1e-4
-    assert metrics["kl"].item() == pytest.approx(expected.item(), rel=1e-2)
+    assert report.metrics["kl"].item() == pytest.approx(expected.item(), rel=1e-2)
 
 
 class Weighed(PPOAlgorithm):
     """Keeps the weights of all samples."""
 
     def loss(self, views, state, batch, ent_coef):
-        self.found = [*getattr(self, "found", []), batch["weight"]]
+        self.found = [*getattr(self, "found", []), batch.importance]
         return super().loss(views, state, batch, ent_coef)
 
 
@@ -369,27 +371,27 @@ def test_a_rollout_of_any_size_is_learnt_from(columns, steps, asks, rnn):
 def test_the_linear_schedule_falls_to_nothing():
     algorithm, state = make(learning_rate_schedule="linear")
     data, before = rollout(algorithm, state), state.params.clone()
-    _, metrics = algorithm.update(state, data, 1.0, [Seeds(0)])
+    _, report = algorithm.update(state, replace(data, progress=1.0), rngs(0))
     assert torch.equal(state.params, before)
-    _, metrics = algorithm.update(state, data, 0.75, [Seeds(0)])
-    assert metrics["learning_rate"].item() == pytest.approx(0.25 * CONFIG.learning_rate)
+    _, report = algorithm.update(state, replace(data, progress=0.75), rngs(0))
+    assert report.metrics["learning_rate"].item() == pytest.approx(0.25 * CONFIG.learning_rate)
     assert not torch.equal(state.params, before)
 
 
 def test_the_kl_schedule_speeds_a_timid_member_up_and_slows_a_bold_one_down():
     algorithm, state = make(members=2, learning_rate_schedule="kl", target_kl=1e-3)
     state.learning_rate = torch.tensor([2e-5, 9e-3])
-    algorithm.update(state, rollout(algorithm, state), 0.0, [Seeds(0), Seeds(1)])
+    algorithm.update(state, rollout(algorithm, state), rngs(0, 1))
     torch.testing.assert_close(state.learning_rate, torch.tensor([3e-5, 6e-3]))
 
 
 def test_a_terminal_observation_that_is_not_finite_does_no_harm():
     algorithm, state = make()
     data = rollout(algorithm, state)
-    ends = data.transition.discount == 0
+    ends = data.discount == 0
     assert ends.any()
-    data.transition.next_obs[ends] = float("nan")
-    algorithm.update(state, data, 0.0, [Seeds(0)])
+    data.next_obs[ends] = float("nan")
+    algorithm.update(state, data, rngs(0))
     assert torch.isfinite(state.params).all()
 
 

@@ -1,4 +1,4 @@
-"""SAC's numbers by hand, of forces and of choices."""
+"""SAC's numbers by hand, for continuous and for discrete actions."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from toys import Masked, Toy, learn
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.sac import SACAlgorithm, State
 from skillweave.networks.config import Network
+from skillweave.ops.losses import critic_loss, masked_entropy_target
 from skillweave.seeding import Seeds
-from skillweave.types import Sample, SkillweaveError
+from skillweave.experience import Sample
+from skillweave.types import SkillweaveError
 
 P, B = 2, 6
 LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2, normalize_obs=False)
@@ -49,7 +51,7 @@ def sample(space: Any, masked: bool = False) -> Sample:
         obs=torch.randn(P, B, 3, generator=g),
         action=torch.randint(3, (P, B), generator=g) if space is CHOICES else forces,
         reward=torch.randn(P, B, generator=g), discount=discount,
-        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=masks[0], mask=masks[1],
+        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=masks[0], next_obs_mask=masks[1],
         weight=torch.rand(P, B, generator=g), index=np.zeros((P, B), np.int64),
     )  # fmt: skip
 
@@ -79,13 +81,19 @@ def squashed(head: torch.Tensor, g: torch.Generator) -> tuple[torch.Tensor, torc
 
 
 def losses(algorithm: SACAlgorithm, state: State, s: Sample) -> tuple[Any, Any]:
-    alpha = state.log_alpha.exp()
-    inputs, actor = {"vector": s.obs}, algorithm.actor(state)
-    views = algorithm.critics.views(state.critic)
+    inputs = {"vector": s.obs}
     noise = algorithm.learning_noise(generators(), s.reward.shape[1], False)
-    critic = algorithm.critic_loss(views, state, s, actor, inputs, alpha, noise)
     views = algorithm.layout.views(state.params)
-    return critic, algorithm.policy_loss(views, state, s.obs_mask, inputs, alpha, noise)
+    policy = algorithm.policy_loss(views, state, s.obs_mask, inputs, noise)
+    return critic(algorithm, state, s, noise), policy
+
+
+def critic(algorithm: SACAlgorithm, state: State, s: Sample, noise: Any) -> Any:
+    params = algorithm.acting_params(state)
+    target = algorithm.critic_target(state, s, params, noise)
+    views = algorithm.critics.views(state.critic)
+    q = algorithm.critics.chosen(views, {"vector": s.obs}, s.action)
+    return critic_loss(q, target, s.weight)
 
 
 def test_forces_by_hand():
@@ -124,7 +132,7 @@ def test_choices_by_hand(masked):
         return Categorical(logits=logits if mask is None else logits.masked_fill(~mask[m], -1e9))
 
     for m in range(P):
-        after = law(m, s.next_obs[m], s.mask)
+        after = law(m, s.next_obs[m], s.next_obs_mask)
         slow = critics(algorithm, state.critic_target, m, s.next_obs[m]).min(0).values
         soft = (after.probs * slow).sum(-1) + alphas[m] * after.entropy()
         target = s.reward[m] + s.discount[m] * soft
@@ -151,7 +159,7 @@ def test_the_temperature_falls_where_the_entropy_is_above_its_aim_and_rises_belo
         state.log_alpha = before.clone()
         for name in ("alpha_mu", "alpha_nu", "alpha_count"):
             getattr(state, name).zero_()
-        algorithm.update(state, s, 0.0, generators())
+        algorithm.update(state, s, generators())
         # Adam's first step, of d/d log α of log α·(H − H̄): the rate against the sign.
         sign = torch.sign(state.entropy - aim)[:, None]
         torch.testing.assert_close(state.log_alpha, before - 1e-2 * sign)
@@ -164,8 +172,8 @@ def test_the_temperature_falls_where_the_entropy_is_above_its_aim_and_rises_belo
 def test_a_fixed_temperature_stays():
     algorithm, state = make(FORCES, learn_ent_coef=False, ent_coef=0.2)
     state.ent_coef[1] = 0.7  # members' own
-    metrics, _ = algorithm.update(state, sample(FORCES), 0.0, generators())
-    assert metrics["ent_coef"].tolist() == pytest.approx([0.2, 0.7])
+    _, report = algorithm.update(state, sample(FORCES), generators())
+    assert report.metrics["ent_coef"].tolist() == pytest.approx([0.2, 0.7])
 
 
 @pytest.mark.parametrize(
@@ -180,7 +188,7 @@ def test_the_policy_is_delayed_and_the_target_is_not():
     algorithm, state = make(FORCES, policy_delay=2, tau=0.25)
     for due in (False, True, False, True):
         before = {k: getattr(state, k).clone() for k in ("params", "log_alpha", "critic_target")}
-        algorithm.update(state, sample(FORCES), 0.0, generators())
+        algorithm.update(state, sample(FORCES), generators())
         assert torch.equal(state.params, before["params"]) != due
         assert torch.equal(state.log_alpha, before["log_alpha"]) != due
         moved = before["critic_target"] + 0.25 * (state.critic - before["critic_target"])
@@ -190,7 +198,7 @@ def test_the_policy_is_delayed_and_the_target_is_not():
 def test_greedy_is_the_squashed_mean_and_samples_follow_the_law():
     algorithm, state = make(FORCES)
     obs = torch.randn(P, 5, 3, generator=torch.Generator().manual_seed(5))
-    actor, noise = algorithm.actor(state), algorithm.noise(generators(), 1, 5)[0]
+    actor, noise = algorithm.acting_params(state), algorithm.noise(generators(), 1, 5)[0]
     greedy, head, _ = algorithm.act(actor, obs, None, None)
     mean, log_std = head.chunk(2, -1)
     torch.testing.assert_close(greedy, mean.tanh())
@@ -225,11 +233,8 @@ def test_the_entropy_between_n_steps_is_part_of_the_target_by_hand(space):
     with_between = replace(
         s, between_obs=between, between_mask=mask, between_discount=counts, weight=None
     )
-    alpha = torch.tensor(alphas)[:, None]
     noise = algorithm.learning_noise(generators(), B, False)
-    views, actor = algorithm.critics.views(state.critic), algorithm.actor(state)
-    inputs = {"vector": s.obs}
-    _, error, _ = algorithm.critic_loss(views, state, with_between, actor, inputs, alpha, noise)
+    _, error, _ = critic(algorithm, state, with_between, noise)
     extra = torch.zeros(P, B)
     own = algorithm.layout.views(state.params)
     for m in range(P):
@@ -244,7 +249,7 @@ def test_the_entropy_between_n_steps_is_part_of_the_target_by_hand(space):
             entropy = -log_prob.float()
         extra[m] = alphas[m] * (counts[m] * entropy.view(B, 2)).sum(-1)
     without = replace(s, reward=s.reward + extra, weight=None)
-    _, expected, _ = algorithm.critic_loss(views, state, without, actor, inputs, alpha, noise)
+    _, expected, _ = critic(algorithm, state, without, noise)
     torch.testing.assert_close(error, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -279,15 +284,13 @@ def test_observations_between_are_drawn_only_where_there_are_some():
 
 
 def test_fewer_choices_are_to_have_less_entropy():
-    algorithm = SACAlgorithm(LINEAR, Box(-1, 1, (3,)), Discrete(8))
     mask = torch.zeros(2, 2, 8, dtype=torch.bool)
     mask[0, 0, :2] = mask[0, 1, :4] = mask[1, :, :1] = True
-    aim, aims = algorithm.entropy_aim(mask).tolist(), 0.5 * math.log(8)
+    aim, aims = masked_entropy_target(0.5 * math.log(8), mask).tolist(), 0.5 * math.log(8)
     assert aim == pytest.approx([0.5 * (math.log(2) + math.log(4)) / 2, 0.0])
-    assert algorithm.entropy_aim(None) == pytest.approx(aims)
-    assert algorithm.entropy_aim(torch.ones_like(mask)).tolist() == pytest.approx([aims] * 2)
-    alone = SACAlgorithm(LINEAR, Box(-1, 1, (3,)), Discrete(1))
-    assert alone.entropy_aim(torch.ones(1, 2, 1, dtype=torch.bool)) == 0.0
+    assert masked_entropy_target(aims, None) == pytest.approx(aims)
+    assert masked_entropy_target(aims, torch.ones_like(mask)).tolist() == pytest.approx([aims] * 2)
+    assert masked_entropy_target(0.0, torch.ones(1, 2, 1, dtype=torch.bool)) == 0.0
 
 
 class TwoOfEight(Toy):
@@ -329,6 +332,6 @@ def test_a_collapsed_deviation_comes_back():
     bias = algorithm.layout.views(state.params)["actor.0.bias"]
     bias[..., 2:] = -9.0
     for _ in range(10):
-        algorithm.update(state, sample(FORCES), 0.0, generators())
+        algorithm.update(state, sample(FORCES), generators())
     # There a deviation costs nothing and entropy pays: every step of Adam is the whole rate.
     assert bias[..., 2:].flatten().tolist() == pytest.approx([-8.9] * 4, abs=0.01)

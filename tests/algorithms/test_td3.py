@@ -10,11 +10,13 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
+from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.td3 import State, TD3Algorithm
 from skillweave.networks.config import Network
+from skillweave.ops.losses import critic_loss as regression
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
+from skillweave.experience import Sample
 
 P, B, A = 2, 6, 2
 LINEAR = TD3(num_envs=2, network=Network(()), learning_rate=1e-2)
@@ -37,7 +39,7 @@ def sample(weighted: bool = False) -> Sample:
     return Sample(
         obs=torch.randn(P, B, 3, generator=g), action=torch.rand(P, B, A, generator=g) * 2 - 1,
         reward=torch.randn(P, B, generator=g), discount=discount,
-        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=None, mask=None,
+        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=None, next_obs_mask=None,
         weight=torch.rand(P, B, generator=g) if weighted else None,
         index=np.zeros((P, B), np.int64),
     )  # fmt: skip
@@ -60,12 +62,12 @@ def generators() -> list[torch.Generator]:
 
 
 def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample) -> Any:
-    from skillweave.algorithms.base import Actor
-
-    actor = Actor({}, None, None)
-    views = algorithm.critics.views(state.critic)
     noise = algorithm.learning_noise(generators(), B, False)
-    return algorithm.critic_loss(views, state, s, actor, {"vector": s.obs}, noise)
+    target = algorithm.critic_target(state, s, ActingParams({}, None, None), noise)
+    q = algorithm.critics.chosen(
+        algorithm.critics.views(state.critic), {"vector": s.obs}, s.action
+    )
+    return regression(q, target, s.weight)
 
 
 @pytest.mark.parametrize("twin", [True, False])
@@ -114,7 +116,7 @@ def test_actor_and_targets_follow_with_a_delay(delay):
     names = ("params", "target", "critic_target")
     for step in range(1, 7):
         before = {k: getattr(state, k).clone() for k in (*names, "critic")}
-        algorithm.update(state, sample(), 0.0, generators())
+        algorithm.update(state, sample(), generators())
         assert not torch.equal(state.critic, before["critic"])
         due = step % delay == 0
         assert [not torch.equal(getattr(state, k), before[k]) for k in names] == [due] * 3
@@ -130,8 +132,8 @@ def test_each_member_explores_with_its_own_noise_within_the_bounds():
     algorithm, state = make(exploration_noise=0.5)
     state.exploration_noise = torch.tensor([0.0, 0.5])
     obs, noise = torch.zeros(P, 4000, 3), algorithm.noise(generators(), 1, 4000)[0]
-    action, _, _ = algorithm.act(algorithm.actor(state), obs, None, noise)
-    greedy, _, _ = algorithm.act(algorithm.actor(state), obs, None, None)
+    action, _, _ = algorithm.act(algorithm.acting_params(state), obs, None, noise)
+    greedy, _, _ = algorithm.act(algorithm.acting_params(state), obs, None, None)
     assert torch.equal(action[0], greedy[0])
     expected = (greedy[1] + 0.5 * noise[1]).clamp(-1, 1)
     torch.testing.assert_close(action[1], expected)
@@ -150,7 +152,7 @@ def test_the_actors_rate_is_a_share_of_the_critics():
     for share in (1.0, 0.25):
         algorithm, state = make(actor_rate=share, policy_delay=1)
         before = state.params.clone(), state.critic.clone()
-        algorithm.update(state, sample(), 0.0, generators())
+        algorithm.update(state, sample(), generators())
         moved[share] = state.params - before[0], state.critic - before[1]
     # Adam's first step is the rate times the gradient's sign
     torch.testing.assert_close(moved[0.25][0], 0.25 * moved[1.0][0], rtol=1e-3, atol=1e-6)

@@ -66,7 +66,7 @@ def outputs(made: Member, spaces: Any) -> dict[str, torch.Tensor]:
         pixels = torch.randint(0, 256, (1, 50, *shape), generator=generator)
         inputs[f"image.{i}"] = pixels.to(torch.uint8)
     action = torch.randn(1, 50, 2, generator=generator)
-    for family in algorithm.families():
+    for family in algorithm.parameter_groups():
         for field in family.weights:
             flat = getattr(made.state, field)
             rows = flat.reshape(-1, flat.shape[-1])
@@ -75,7 +75,7 @@ def outputs(made: Member, spaces: Any) -> dict[str, torch.Tensor]:
                 for name, net in family.nets:
                     key = f"{field}.{row}.{name}"
                     if getattr(net, "memory", 0):
-                        zero = torch.zeros(1, 50, net.memory)
+                        zero = torch.zeros(1, 50, net.memory_size)
                         found[key] = net.step(views, inputs, zero)[0]
                     elif field.startswith("critic") and made.config.__class__ is not PPO:
                         found[key] = net(views, inputs, action)
@@ -150,7 +150,7 @@ def test_kernels_grow_without_changing_the_function_where_they_can(space):
 def test_what_survives_keeps_its_moments_and_what_is_new_starts_at_zero(name):
     before, spaces = member(name, "relu")
     after = rebuilt(before, Change("units", 0, 5), spaces, np.random.default_rng(0))
-    families = before.algorithm(spaces).families(), after.algorithm(spaces).families()
+    families = before.algorithm(spaces).parameter_groups(), after.algorithm(spaces).parameter_groups()
     for old, new in zip(*families, strict=True):
         for field in old.moments:
             a, b = getattr(before.state, field), getattr(after.state, field)
@@ -213,7 +213,7 @@ def test_layer_norm_and_no_layers_are_refused():
 
 def pushed(algorithm: Any, state: Any, updates: int) -> None:
     """Every parameter's gradient is 1."""
-    for f in algorithm.families():
+    for f in algorithm.parameter_groups():
         mu, nu = (getattr(state, k) for k in f.moments)
         parts = [x.flatten(1) for x in (getattr(state, f.weights[0]), mu, nu)]
         for _ in range(updates):
@@ -224,7 +224,7 @@ def pushed(algorithm: Any, state: Any, updates: int) -> None:
 def steady(name: str) -> tuple[Member, Any]:
     """A member that has felt gradients of 1 for 100,000 steps."""
     made, spaces = member(name, "relu")
-    for f in made.algorithm(spaces).families():
+    for f in made.algorithm(spaces).parameter_groups():
         for k, value in zip((*f.moments, f.count), (1, 1, 100_000), strict=True):
             getattr(made.state, k).fill_(value)
     return made, spaces
@@ -237,7 +237,7 @@ def test_what_is_new_moves_as_far_as_a_fresh_network_would(name, growth):
     grown = rebuilt(before, GROWTH[growth], spaces, np.random.default_rng(0))
     algorithm, then = grown.algorithm(spaces), copy(grown).state
     pushed(algorithm, grown.state, 50)
-    for f in algorithm.families():
+    for f in algorithm.parameter_groups():
         moved = getattr(then, f.weights[0]) - getattr(grown.state, f.weights[0])
         each = moved / grown.state.learning_rate
         # A gradient that stays the same moves a parameter by the rate at every step.

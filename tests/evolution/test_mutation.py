@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from skillweave import DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range, SkillweaveError
-from skillweave.algorithms.base import LARGEST
+from skillweave.algorithms.parameters import LARGEST
 from skillweave.evolution.config import KINDS
 from skillweave.evolution.mutation import check_mutations, mutate, random_config, with_settings
 from skillweave.evolution.stacks import Member, join

@@ -6,7 +6,8 @@ import numpy as np
 
 from skillweave.buffers.by_hand import Recorder
 from skillweave.compat.agilerl.agent import random_seed
-from skillweave.types import Array, Sample
+from skillweave.experience import Sample
+from skillweave.types import Array
 
 
 class MultiStepReplayBuffer:

@@ -1,0 +1,80 @@
+"""Which algorithms there are: those of this library, and those that users register."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import is_dataclass
+from typing import Any, cast
+
+from skillweave.algorithms.base import REQUIRED, Algorithm
+from skillweave.algorithms.config import (
+    BUILT_IN,
+    AlgorithmConfig,
+    OffPolicy,
+    OnPolicy,
+    Registration,
+    add_registration,
+    registration_of,
+)
+from skillweave.types import SkillweaveError
+
+_SETTINGS: dict[str, type[Any]] = {"rollout": OnPolicy, "replay": OffPolicy}
+
+
+def register_algorithm(config_type: type[Any], algorithm_type: type[Algorithm]) -> None:
+    """Make an algorithm known, under the name of its settings.
+
+    It can then train plain agents, skills, selectors and populations, and its settings are written
+    to and read from files. Every process that uses it must register it, so call this in the file
+    that defines it. The same name may be registered again: the latest counts.
+
+    Args:
+        config_type: a frozen dataclass on ``OnPolicy`` or ``OffPolicy``, as ``store`` asks for.
+        algorithm_type: a subclass of ``Algorithm`` that is made with
+            ``(config, observation_space, action_space)``.
+
+    Raises:
+        SkillweaveError: a method or a class attribute is missing, it is named; or the name is one
+            of this library's own.
+    """
+    name = config_type.__name__
+    where = f"register_algorithm({name}, {algorithm_type.__name__})"
+    if not issubclass(algorithm_type, Algorithm):
+        raise SkillweaveError(
+            f"{where}: {algorithm_type.__name__} is no subclass of skillweave.Algorithm"
+        )
+    lacks = [k for k in REQUIRED if getattr(algorithm_type, k) is getattr(Algorithm, k)]
+    lacks += [k for k in ("store", "action_spaces") if not hasattr(algorithm_type, k)]
+    if lacks:
+        raise SkillweaveError(
+            f"{where}: {algorithm_type.__name__} lacks {', '.join(lacks)}; see skillweave.Algorithm"
+        )
+    settings = _SETTINGS.get(algorithm_type.store)
+    if settings is None:
+        raise SkillweaveError(
+            f"{where}: {algorithm_type.__name__}.store is {algorithm_type.store!r}; it must be "
+            "'rollout' or 'replay'"
+        )
+    frozen = is_dataclass(config_type) and cast(Any, config_type).__dataclass_params__.frozen
+    if not (frozen and issubclass(config_type, settings)):
+        raise SkillweaveError(
+            f"{where}: {name} must be a frozen dataclass on {settings.__name__}, because "
+            f"{algorithm_type.__name__}.store is {algorithm_type.store!r}"
+        )
+    if name in BUILT_IN:
+        raise SkillweaveError(f"{where}: {name} is an algorithm of this library; use another name")
+    add_registration(Registration(config_type, algorithm_type, algorithm_type.action_spaces))
+
+
+def make_algorithm(config: AlgorithmConfig, observation_space: Any, action_space: Any) -> Algorithm:
+    """The algorithm that these settings belong to, on one pair of spaces.
+
+    Raises:
+        SkillweaveError: nobody registered it, or it cannot act in these spaces; the message names
+            those that can.
+    """
+    kind = registration_of(config).algorithm
+    if isinstance(kind, str):
+        module, name = kind.split(":")
+        kind = getattr(importlib.import_module(module), name)
+    return cast(Algorithm, kind(config, observation_space, action_space))

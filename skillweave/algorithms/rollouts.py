@@ -1,0 +1,164 @@
+"""Rollouts as PPO learns from them: without gaps, and in random pieces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from skillweave.experience import Rollout
+from skillweave.networks.encoders import Inputs
+from skillweave.networks.stacked import take_rows
+from skillweave.ops.device import on_host
+
+
+def without_gaps(rollout: Rollout) -> Rollout:
+    """The same trajectories, with the valid rows of each column first.
+
+    Columns without a valid row are left out; what is not valid is 0. Where no cell is empty, the
+    result has no ``valid``: it is a full rollout.
+    """
+    if (valid := rollout.valid) is None:
+        return rollout
+    width = valid.shape[2]
+    steps, columns, fewest = on_host(
+        valid.sum(1).max(), valid.any(1).sum(1).max(), valid.flatten(1).sum(1).min()
+    )
+    time = _first_true(valid, max(1, steps))  # (P, T′, B), which row stands where
+    column = _first_true(valid.any(1), max(1, columns))  # (P, B′)
+    time = time.gather(2, column[:, None].expand(-1, time.shape[1], -1))
+    rows, lead = (time * width + column[:, None]).flatten(1), time.shape[1:]
+    kept = valid.flatten(1).gather(1, rows).unflatten(1, lead)
+
+    def take(x: Tensor) -> Tensor:
+        found = take_rows(x.flatten(1, 2), rows).unflatten(1, lead)
+        return found.masked_fill(~kept.view(*kept.shape, *[1] * (x.ndim - 3)), 0)
+
+    names = ("obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts")
+    parts: dict[str, Any] = {name: getattr(rollout, name) for name in names}
+    parts = {name: None if x is None else take(x) for name, x in parts.items()}
+    following = torch.nn.functional.pad(kept[:, 1:], (0, 0, 0, 1))
+    parts["last"] = parts["last"] | (kept & ~following)  # nothing follows the last valid row
+    parts["valid"] = None if fewest == kept[0].numel() else kept
+    if rollout.memory is not None:
+        parts["memory"] = take_rows(rollout.memory, column)
+    return replace(rollout, **parts)
+
+
+def rows_where(flags: Tensor) -> Tensor:
+    """Rows of each member that are True, in order; (P, N) bool to (P, K).
+
+    K is the largest number of any member; the others' are followed by rows that are False.
+    """
+    return _first_true(flags, *on_host(flags.sum(1).max()))
+
+
+class Cells:
+    """The cells of a rollout without gaps that networks run on: the valid ones, or all.
+
+    Members with fewer valid cells than others get some that are not valid, too.
+    """
+
+    def __init__(self, rollout: Rollout, *, all_cells: bool) -> None:
+        self.shape = rollout.reward.shape[1:]
+        self._rows: Tensor | None = None
+        if rollout.valid is not None and not all_cells:
+            self._rows = rows_where(rollout.valid.flatten(1))
+
+    def flat(self, x: Tensor) -> Tensor:
+        """(P, T, B, …) to (P, N, …)."""
+        return x.flatten(1, 2) if self._rows is None else take_rows(x.flatten(1, 2), self._rows)
+
+    def flat_or_none(self, x: Tensor | None) -> Tensor | None:
+        """The same of what may be missing."""
+        return None if x is None else self.flat(x)
+
+    def unflat(self, x: Tensor) -> Tensor:
+        """(P, N, …) to (P, T, B, …), of all cells."""
+        return x.unflatten(1, self.shape)
+
+    def grid(self, x: Tensor) -> Tensor:
+        """Numbers (P, N) to (P, T, B), 0 elsewhere."""
+        if self._rows is not None:
+            x = x.new_zeros(len(x), self.shape.numel()).scatter(1, self._rows, x)
+        return self.unflat(x)
+
+
+def _first_true(flags: Tensor, count: int) -> Tensor:
+    order = flags.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+    return order[:, :count]
+
+
+@dataclass(slots=True)
+class Samples:
+    """What PPO's loss needs of samples (P, N, …).
+
+    Where there is a memory, they are sequences instead, (P, T, B, …).
+    """
+
+    inputs: Inputs
+    action: Tensor
+    log_prob: Tensor  # by the policy from which clipping and KL count
+    importance: Tensor  # probability by that policy ÷ by the one that acted
+    advantage: Tensor
+    target: Tensor  # of the value, in units of normalised returns
+    old_value: Tensor | None = None  # in the same units, where values are clipped
+    mask: Tensor | None = None  # bool, allowed actions; None: all
+    valid: Tensor | None = None  # bool, samples that count; None: all
+    starts: Tensor | None = None  # bool, memory is empty before this row
+    memory: Tensor | None = None  # (P, B, M), before the first row
+    most: int = 0
+    """The number of valid samples, of the member that has most."""
+
+    @property
+    def count(self) -> Tensor:
+        """Valid samples of each member, (P,) float."""
+        if self.valid is None:
+            size = float(self.advantage[0].numel())
+            return self.advantage.new_full((len(self.advantage),), size)
+        return self.valid.flatten(1).sum(1).to(self.advantage.dtype)
+
+    def changed(
+        self, change: Callable[[Tensor], Tensor], memory: Callable[[Tensor], Tensor] | None = None
+    ) -> Samples:
+        """The same with another form: of every tensor, and of the memory."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        found: dict[str, Any] = {k: change(v) for k, v in values.items() if isinstance(v, Tensor)}
+        found["inputs"] = {k: change(v) for k, v in self.inputs.items()}
+        if self.memory is not None:
+            found["memory"] = self.memory if memory is None else memory(self.memory)
+        return replace(self, **found)
+
+
+def minibatches(
+    samples: Samples, rng: Sequence[torch.Generator], epochs: int, batch_size: int
+) -> Iterator[Samples]:
+    """Every epoch's minibatches, each member's in an order of its own.
+
+    Args:
+        samples: where there is a memory, whole columns are shuffled, so no sequence is torn.
+        rng: one generator per member.
+        batch_size: samples in a minibatch, about: an epoch is cut into equal parts. All of a
+            smaller rollout is one minibatch.
+
+    Yields:
+        (P, b, …); with a memory (P, T, b, …), and the memory (P, b, M).
+    """
+    recurrent = samples.memory is not None
+    rows = samples.changed(lambda x: x.transpose(1, 2)) if recurrent else samples
+    size, device = rows.advantage.shape[1], rows.advantage.device
+    parts = min(size, max(1, round(samples.most / batch_size)))
+    for _ in range(epochs):
+        order = torch.stack([torch.randperm(size, generator=g) for g in rng]).to(device)
+        shuffled = rows.changed(*[lambda x, order=order: take_rows(x, order)] * 2)
+        for part in range(parts):
+            cut = slice(part * size // parts, (part + 1) * size // parts)
+            if recurrent:
+                yield shuffled.changed(
+                    lambda x, cut=cut: x[:, cut].transpose(1, 2), lambda x, cut=cut: x[:, cut]
+                )
+            else:
+                yield shuffled.changed(lambda x, cut=cut: x[:, cut])

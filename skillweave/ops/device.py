@@ -1,0 +1,63 @@
+"""Where tensors live: on the CPU, or on an accelerator that works while Python goes on.
+
+Generators stay on the CPU, so that a seed gives the same numbers on every device.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from skillweave.types import SkillweaveError
+
+DEVICES = ("cpu", "cuda", "auto")
+"""Names of devices that settings know."""
+
+
+def resolve_device(name: str) -> torch.device:
+    """The device of this name; "auto" is a GPU where there is one, else the CPU.
+
+    Raises:
+        SkillweaveError: the name is unknown, or PyTorch finds no such device here.
+    """
+    if name not in DEVICES:
+        raise SkillweaveError(f"device is {name!r}; it must be one of {', '.join(DEVICES)}")
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise SkillweaveError(
+            f"device is 'cuda', but torch {torch.__version__} finds no CUDA device here; "
+            "use 'cpu', or 'auto', which takes a GPU only where there is one"
+        )
+    return torch.device("cuda" if there and name != "cpu" else "cpu")
+
+
+class Constant:
+    """A tensor that never changes, with a copy on every device that has asked for it."""
+
+    def __init__(self, value: Tensor) -> None:
+        self._value = value
+        self._copies: dict[torch.device, Tensor] = {}
+
+    def on(self, device: torch.device) -> Tensor:
+        """The tensor on this device."""
+        if device == self._value.device:
+            return self._value
+        if device not in self._copies:
+            self._copies[device] = self._value.to(device)
+        return self._copies[device]
+
+
+def on_host(*numbers: Tensor) -> list[int]:
+    """Whole numbers of tensors () that the shape of what follows depends on.
+
+    The host waits for the device here. Nothing else in an update does.
+    """
+    return [int(n) for n in torch.stack(numbers).tolist()]
+
+
+def all_false(flags: Tensor) -> bool:
+    """Whether all are False, as far as that is known without waiting for an accelerator.
+
+    On the CPU, where looking costs nothing, it is the answer; elsewhere it is always False.
+    """
+    return flags.device.type == "cpu" and not bool(flags.any())

@@ -1,0 +1,67 @@
+"""Means and variances of each member, of all samples or of the valid ones, and over time.
+
+``valid`` is True or 1 where a sample counts; None: all do. Where nothing counts, the mean is 0.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def masked_mean(x: Tensor, valid: Tensor | None = None) -> Tensor:
+    """The mean of the valid samples; both (P, ...), to (P,)."""
+    if valid is None:
+        return x.flatten(1).mean(1)
+    total = torch.where(valid, x, 0.0).flatten(1).sum(1)
+    return total / valid.flatten(1).sum(1).clamp_min(1)
+
+
+def masked_var_mean(x: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Variance (of the samples, not of what they are drawn from) and mean; (P, ...) to (P,)."""
+    if valid is None:
+        variance, mean = torch.var_mean(x.flatten(1), dim=1, unbiased=False)
+        return variance, mean
+    mean = masked_mean(x, valid)
+    away = x - mean.view(-1, *[1] * (x.ndim - 1))
+    return masked_mean(away.square(), valid), mean
+
+
+def normalise(x: Tensor, valid: Tensor | None = None, eps: float = 1e-8) -> Tensor:
+    """Zero mean and unit deviation over all axes but the first; (P, ...) to (P, ...)."""
+    variance, mean = (m.view(-1, *[1] * (x.ndim - 1)) for m in masked_var_mean(x, valid))
+    return (x - mean) / (variance.sqrt() + eps)
+
+
+def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
+    """``1 − Var(target − value) / Var(target)`` of each member; (P, ...) to (P,)."""
+    residual, _ = masked_var_mean(target - value, valid)
+    whole, _ = masked_var_mean(target, valid)
+    return 1.0 - residual / whole.clamp_min(1e-12)
+
+
+def merge_moments(
+    mean: Tensor, var: Tensor, count: Tensor, batch: Tensor, valid: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Running mean and variance after a batch (Chan, Golub & LeVeque 1979, eq. 2.1).
+
+    Args:
+        mean, var: (P, O); count: (P,); batch: (P, B, O).
+        valid: (P, B) bool, rows that count; None: all.
+
+    Returns:
+        The new mean, variance and count.
+    """
+    n: Tensor | float = float(batch.shape[1])
+    if valid is None:
+        batch_var, batch_mean = torch.var_mean(batch, dim=1, unbiased=False)
+    else:
+        counts, n = valid[..., None], valid.sum(1).to(count.dtype)
+        rows = n.clamp_min(1.0)[:, None]
+        batch_mean = torch.where(counts, batch, 0.0).sum(1) / rows
+        away = (batch - batch_mean[:, None]).square()
+        batch_var = torch.where(counts, away, 0.0).sum(1) / rows
+    total = count + n
+    old, new = (count / total)[:, None], (n / total)[:, None]
+    delta = batch_mean - mean
+    return mean + delta * new, var * old + batch_var * new + delta.square() * old * new, total
