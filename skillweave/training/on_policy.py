@@ -180,6 +180,7 @@ class _Loop:
             rows = by_member(obs, p)
             allowed = None if mask is None else by_member(mask, p)
             action, head, after = algorithm.act(actor, rows, allowed, noise, memory)
+            assert head is not None
             step = collector.step(algorithm.to_env(action.flatten(0, 1).numpy()))
             buffer.add(obs, mask, action, head, step)
             spent += int(step.steps.sum())
