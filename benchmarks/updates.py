@@ -10,9 +10,9 @@ import torch
 
 from benchmarks.common import report, table
 from skillweave import PPO, Network
-from skillweave.algorithms.ppo import PPOAlgorithm, Rollout
+from skillweave.algorithms.ppo import PPOAlgorithm
+from skillweave.experience import Rollout
 from skillweave.seeding import Seeds
-from skillweave.types import Transition
 
 
 def rollout(members: int, samples: int) -> Rollout:
@@ -23,15 +23,15 @@ def rollout(members: int, samples: int) -> Rollout:
     last[:, -1] = True
     # What follows is the next row, except at ends.
     following = torch.where(last[..., None], ends, obs.roll(-1, dims=1))
-    transition = Transition(
+    return Rollout(
         obs=obs,
         action=torch.randint(0, 4, lead, generator=g),
         reward=torch.randn(lead, generator=g),
         discount=torch.full(lead, 0.99),
         next_obs=following,
         last=last,
+        head=torch.randn(*lead, 4, generator=g),
     )
-    return Rollout(transition, torch.randn(*lead, 4, generator=g), None)
 
 
 def seconds(members: int, samples: int, repeats: int) -> float:
@@ -45,7 +45,7 @@ def seconds(members: int, samples: int, repeats: int) -> float:
     times = []
     for _ in range(repeats):
         started = time.perf_counter()
-        algorithm.update(state, data, 0.0, seeds)
+        algorithm.update(state, data, [s.torch() for s in seeds])
         times.append(time.perf_counter() - started)
     return float(np.median(times))
 

@@ -6,11 +6,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from skillweave.algorithms.base import ActingParams, Algorithm
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3
+    from skillweave.algorithms.registry import register_algorithm
     from skillweave.api import Hierarchy, Run, train_agent
     from skillweave.envs.make import EnvSpec
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, Selection
+    from skillweave.experience import Report, Rollout, Sample
     from skillweave.hierarchy.options import OptionsEnv
     from skillweave.networks.config import CNN, RNN, Network
     from skillweave.networks.encoders import Encoder, register_encoder
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "ActingParams": "algorithms.base",
+    "Algorithm": "algorithms.base",
     "Array": "types",
     "CNN": "networks.config",
     "DQN": "algorithms.config",
@@ -37,8 +42,11 @@ _HOME = {
     "RNN": "networks.config",
     "Range": "evolution.config",
     "Reflex": "skills",
+    "Report": "experience",
+    "Rollout": "experience",
     "Run": "api",
     "SAC": "algorithms.config",
+    "Sample": "experience",
     "Selection": "evolution.selection",
     "Skill": "skills",
     "SkillweaveError": "types",
@@ -51,6 +59,7 @@ _HOME = {
     "from_onnx": "skills",
     "from_sb3": "skills",
     "from_torch": "skills",
+    "register_algorithm": "algorithms.registry",
     "register_encoder": "networks.encoders",
     "train_agent": "api",
 }
@@ -62,6 +71,8 @@ __all__ = [
     "RNN",
     "SAC",
     "TD3",
+    "ActingParams",
+    "Algorithm",
     "Array",
     "Encoder",
     "EnvSpec",
@@ -74,7 +85,10 @@ __all__ = [
     "OptionsEnv",
     "Range",
     "Reflex",
+    "Report",
+    "Rollout",
     "Run",
+    "Sample",
     "Selection",
     "Skill",
     "SkillweaveError",
@@ -86,6 +100,7 @@ __all__ = [
     "from_onnx",
     "from_sb3",
     "from_torch",
+    "register_algorithm",
     "register_encoder",
     "train_agent",
 ]

@@ -107,7 +107,7 @@ class Sample:
         whole: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         for start in range(0, size, batch):
             part = slice(start, start + batch)
-            found = {
+            found: dict[str, Any] = {
                 k: v if v is None or isinstance(v, float) else v[:, part] for k, v in whole.items()
             }
             yield Sample(**found)

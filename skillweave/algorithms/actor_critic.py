@@ -1,4 +1,4 @@
-"""What SAC and TD3 share: an actor, K critics with slow copies, and the steps that both learn by."""
+"""What SAC and TD3 share: an actor, K critics with slow copies, and how the critics learn."""
 
 from __future__ import annotations
 

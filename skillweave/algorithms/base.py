@@ -132,9 +132,7 @@ class Algorithm:
         """
         self._missing("value")
 
-    def update(
-        self, state: Any, batch: Any, rng: Sequence[torch.Generator]
-    ) -> tuple[Any, Report]:
+    def update(self, state: Any, batch: Any, rng: Sequence[torch.Generator]) -> tuple[Any, Report]:
         """Learn from a batch, in place; returns the state and what to tell.
 
         Args:
@@ -179,8 +177,8 @@ class Algorithm:
     ) -> ActingParams:
         """A copy of what acting needs; ``progress`` is the share of the budget that is spent."""
         flat = state.params[:, : self.acting.size].detach().to(device, copy=True)
-        scaling = (None if x is None else x.to(device) for x in self.scaling(state))
-        return ActingParams(self.acting.views(flat), *scaling)
+        shift, scale = (None if x is None else x.to(device) for x in self.scaling(state))
+        return ActingParams(self.acting.views(flat), shift, scale)
 
     def learning_params(self, state: Any) -> ActingParams:
         """What learning needs to act with the parameters as they are; not a copy."""
@@ -250,9 +248,7 @@ class Algorithm:
             vector, _ = self.obs.split(obs)
             state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector, valid)
 
-    def update_return_stats(
-        self, state: Any, returns: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update_return_stats(self, state: Any, returns: Tensor, valid: Tensor | None = None) -> None:
         """Take returns (P, B) into account in their running moments, in place."""
         moments = state.return_mean, state.return_var, state.return_count
         state.return_mean, state.return_var, state.return_count = merge_moments(

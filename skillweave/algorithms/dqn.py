@@ -138,9 +138,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         q = self._q(self.net(params.views, self.inputs(params, obs)))
         return self.in_rewards(state, mask_logits(q, mask).amax(-1))
 
-    def learning_noise(
-        self, rng: Sequence[torch.Generator], batch: int, due: bool
-    ) -> list[Tensor]:
+    def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
         """Of the weights: online, the target's, and those that choose its action; (P, K) each."""
         if not self.config.noisy:
             return []

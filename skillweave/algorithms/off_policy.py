@@ -33,7 +33,9 @@ class OffPolicyAlgorithm(Algorithm):
     """Learns from samples of a replay buffer, one gradient step at a time."""
 
     store = "replay"
-    member_hyperparameters = ("learning_rate", "gamma", "tau", "max_grad_norm")
+    member_hyperparameters: ClassVar[tuple[str, ...]] = (
+        "learning_rate", "gamma", "tau", "max_grad_norm",
+    )  # fmt: skip
     interval: int
     """Gradient steps between those that the slower networks take part in."""
     between: ClassVar[bool] = False
@@ -65,9 +67,7 @@ class OffPolicyAlgorithm(Algorithm):
     def _compiled(self) -> Callable[..., Any]:
         return compiled(self.learn, f"{type(self.config).__name__}.compile")
 
-    def learning_noise(
-        self, rng: Sequence[torch.Generator], batch: int, due: bool
-    ) -> list[Tensor]:
+    def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
         """The random numbers that ``learn`` needs, from one generator per member."""
         raise NotImplementedError
 

@@ -241,9 +241,7 @@ class PPOAlgorithm(Algorithm):
             samples.inputs, samples.memory, samples.starts = inputs, memory, starts
         return samples, metrics
 
-    def _acted(
-        self, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor
-    ) -> Tensor:
+    def _acted(self, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor) -> Tensor:
         """Log-probabilities (P, N) of the actions by the policy that acted."""
         assert rollout.head is not None
         log_std = None if rollout.log_std is None else rollout.log_std.flatten(1, 2)

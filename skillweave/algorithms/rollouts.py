@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -13,6 +14,10 @@ from skillweave.experience import Rollout
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.stacked import take_rows
 from skillweave.ops.device import on_host
+
+_CELLS = (
+    "obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts",
+)  # fmt: skip
 
 
 def without_gaps(rollout: Rollout) -> Rollout:
@@ -31,13 +36,23 @@ def without_gaps(rollout: Rollout) -> Rollout:
     column = _first_true(valid.any(1), max(1, columns))  # (P, B′)
     time = time.gather(2, column[:, None].expand(-1, time.shape[1], -1))
     rows, lead = (time * width + column[:, None]).flatten(1), time.shape[1:]
-    kept = valid.flatten(1).gather(1, rows).unflatten(1, lead)
+    kept: Tensor = valid.flatten(1).gather(1, rows).unflatten(1, lead)
 
     def take(x: Tensor) -> Tensor:
-        found = take_rows(x.flatten(1, 2), rows).unflatten(1, lead)
+        found: Tensor = take_rows(x.flatten(1, 2), rows).unflatten(1, lead)
         return found.masked_fill(~kept.view(*kept.shape, *[1] * (x.ndim - 3)), 0)
 
-    names = ("obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts")
+    names = (
+        "obs",
+        "action",
+        "reward",
+        "discount",
+        "next_obs",
+        "last",
+        "obs_mask",
+        "head",
+        "starts",
+    )
     parts: dict[str, Any] = {name: getattr(rollout, name) for name in names}
     parts = {name: None if x is None else take(x) for name, x in parts.items()}
     following = torch.nn.functional.pad(kept[:, 1:], (0, 0, 0, 1))
@@ -78,7 +93,8 @@ class Cells:
 
     def unflat(self, x: Tensor) -> Tensor:
         """(P, N, …) to (P, T, B, …), of all cells."""
-        return x.unflatten(1, self.shape)
+        found: Tensor = x.unflatten(1, self.shape)
+        return found
 
     def grid(self, x: Tensor) -> Tensor:
         """Numbers (P, N) to (P, T, B), 0 elsewhere."""
@@ -153,12 +169,15 @@ def minibatches(
     parts = min(size, max(1, round(samples.most / batch_size)))
     for _ in range(epochs):
         order = torch.stack([torch.randperm(size, generator=g) for g in rng]).to(device)
-        shuffled = rows.changed(*[lambda x, order=order: take_rows(x, order)] * 2)
+        shuffle = functools.partial(take_rows, rows=order)
+        shuffled = rows.changed(shuffle, shuffle)
         for part in range(parts):
-            cut = slice(part * size // parts, (part + 1) * size // parts)
-            if recurrent:
-                yield shuffled.changed(
-                    lambda x, cut=cut: x[:, cut].transpose(1, 2), lambda x, cut=cut: x[:, cut]
-                )
-            else:
-                yield shuffled.changed(lambda x, cut=cut: x[:, cut])
+            cut = functools.partial(
+                _cut, rows=slice(part * size // parts, (part + 1) * size // parts)
+            )
+            found = shuffled.changed(cut, cut)
+            yield found.changed(lambda x: x.transpose(1, 2)) if recurrent else found
+
+
+def _cut(x: Tensor, rows: slice) -> Tensor:
+    return x[:, rows]

@@ -126,9 +126,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
         q = self.smallest(state.critic, inputs, mean.tanh())
         return self.in_rewards(state, q + alpha * squashed_entropy(mean, log_std))
 
-    def learning_noise(
-        self, rng: Sequence[torch.Generator], batch: int, due: bool
-    ) -> list[Tensor]:
+    def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
         """Of the next actions, of those between, and of the actor's; (P, B or B·(n − 1), A)."""
         if self.codec.discrete:
             return []

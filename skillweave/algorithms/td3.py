@@ -94,9 +94,7 @@ class TD3Algorithm(ActorCriticAlgorithm):
         action = self.net(params.views, inputs).tanh()
         return self.in_rewards(state, self.smallest(state.critic, inputs, action))
 
-    def learning_noise(
-        self, rng: Sequence[torch.Generator], batch: int, due: bool
-    ) -> list[Tensor]:
+    def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
         """Of the target's actions, (P, B, A), where there is any."""
         return [normal(rng, batch, self.codec.size)] if self.config.target_noise else []
 

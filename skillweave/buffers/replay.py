@@ -165,7 +165,7 @@ class ReplayBuffer(Store):
         start = self._offset[first : first + len(rngs)]
         return drawn + drawn // width * (self._num_envs - width) + start, weight
 
-    def _seen_between(self, between: list[tuple[Array, Array]]) -> dict[str, Tensor | None]:
+    def _seen_between(self, between: list[tuple[Array, Array]]) -> dict[str, Any]:
         """Of n steps, the observations after the first: of their slots (P, B) and discounts."""
         if not self._between:
             return {}

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.algorithms.parameters import setting_number
 from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.parameters import setting_number
 from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
 from skillweave.evolution.stacks import Member, Origin, copy, networks_of

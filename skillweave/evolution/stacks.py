@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import Network
 from skillweave.networks.stacked import Layout
@@ -104,7 +104,9 @@ def join(
         made[config] = make_algorithm(config, *spaces)
     algorithm = made[config]
     wide, padded = algorithm.layouts(), []
-    uneven = [f for f in algorithm.parameter_groups() if any(_count(m, f).ndim > 1 for m in members)]
+    uneven = [
+        f for f in algorithm.parameter_groups() if any(_count(m, f).ndim > 1 for m in members)
+    ]
     for member in members:
         own = member.algorithm(spaces).layouts()
         tensors = {f.name: getattr(member.state, f.name) for f in fields(member.state)}

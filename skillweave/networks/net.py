@@ -10,8 +10,8 @@ from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_enc
 from skillweave.networks.recurrent import (
     cell,
     project,
-    rnn_memory_size,
     rnn_init_,
+    rnn_memory_size,
     rnn_shapes,
     sequence,
 )

@@ -78,7 +78,7 @@ def approximate_kl(
     """``E[w·((ρ − 1) − log ρ)]``, the low-variance estimator k3 of KL(old‖new); (P, B) to (P,).
 
     Schulman 2020, "Approximating KL divergence". ``weight`` and ``valid`` as of
-    ``ppo_policy_loss``: samples of another policy count as often as the old one would have drawn them.
+    ``ppo_policy_loss``: samples of another policy count as often as the old one would draw them.
     """
     log_ratio = log_prob - old_log_prob
     kl = torch.expm1(log_ratio) - log_ratio

@@ -18,8 +18,8 @@ import torch
 
 from skillweave import DQN, SAC, TD3, Network, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.seeding import Seeds
 from skillweave.experience import Sample
+from skillweave.seeding import Seeds
 
 P, B = 2, 16
 OBS = gym.spaces.Box(-1.0, 1.0, (3,))

@@ -479,7 +479,11 @@ def test_the_first_minibatches_ratio_is_one(kind):
 def test_the_value_after_an_end_remembers_what_led_to_it():
     algorithm = watched(MEMORIES["lstm"], updates=2)
     tr, views = algorithm.seen[1][0], algorithm.layout.views(algorithm.seen[1][1])
-    state, cut, net = algorithm.init([Seeds(0)]), algorithm.actor_net.memory_size, algorithm.critic_net
+    state, cut, net = (
+        algorithm.init([Seeds(0)]),
+        algorithm.actor_net.memory_size,
+        algorithm.critic_net,
+    )
     state.params = algorithm.seen[1][1]
     with torch.no_grad():
         own = tr.memory[..., cut:]

@@ -13,9 +13,9 @@ from toys import Toy, learn
 
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.dqn import DQNAlgorithm, State
+from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
-from skillweave.experience import Sample
 
 P, B, A = 2, 7, 3
 LINEAR = DQN(num_envs=2, network=Network(()), loss="mse", learning_rate=1e-2)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from skillweave.algorithms.parameters import LARGEST
+from skillweave.algorithms.actor_critic import Critics
 from skillweave.algorithms.config import (
     DQN,
     PPO,
@@ -19,14 +19,14 @@ from skillweave.algorithms.config import (
     config_from_json,
     config_to_json,
 )
-from skillweave.algorithms.actor_critic import Critics
+from skillweave.algorithms.parameters import LARGEST
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.experience import Sample
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.ops.losses import weighted_mean
 from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
-from skillweave.experience import Sample
 from skillweave.types import SkillweaveError
 
 NAN, INF = float("nan"), float("inf")
@@ -37,6 +37,8 @@ RANGES: list[tuple[type, str, object, str]] = [
         "gamma", "tau", "priority_alpha", "priority_beta") for bad in (-0.1, 1.1, NAN)),
     *((OffPolicy, name, bad, "positive and finite") for name in (
         "learning_rate", "max_grad_norm", "adam_eps", "update_ratio") for bad in (0.0, INF, NAN)),
+    (OffPolicy, "device", "tpu", "one of cpu, cuda, auto"),
+    (PPO, "device", "tpu", "one of cpu, cuda, auto"),
     (OffPolicy, "buffer_size", 0, "at least 1"),
     (OffPolicy, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)"),
     (OffPolicy, "learning_starts", -1, "at least 0 and finite"),

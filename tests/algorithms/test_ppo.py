@@ -224,7 +224,9 @@ def test_sampling_follows_the_heads_distribution():
     algorithm, state = make()
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([0.0, 1.0, 2.0, 3.0])
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(algorithm.acting_params(state), torch.zeros(1, 50_000, 3), None, noise)
+    action, head, _ = algorithm.act(
+        algorithm.acting_params(state), torch.zeros(1, 50_000, 3), None, noise
+    )
     frequency = action.flatten().bincount(minlength=4) / 50_000
     torch.testing.assert_close(frequency, head[0, 0].softmax(-1), atol=0.008, rtol=0)
 
@@ -232,7 +234,9 @@ def test_sampling_follows_the_heads_distribution():
 def test_continuous_sampling_has_the_initial_deviation():
     algorithm, state = make(Box(-1, 1, (2,)), action_std_init=0.3)
     noise = algorithm.noise([Seeds(0).torch()], 1, 50_000)[0]
-    action, head, _ = algorithm.act(algorithm.acting_params(state), torch.ones(1, 50_000, 3), None, noise)
+    action, head, _ = algorithm.act(
+        algorithm.acting_params(state), torch.ones(1, 50_000, 3), None, noise
+    )
     torch.testing.assert_close(action[0].std(0), torch.full((2,), 0.3), rtol=0.02, atol=0)
     torch.testing.assert_close(action[0].mean(0), head[0, 0], rtol=0, atol=0.01)
 
@@ -265,7 +269,9 @@ def test_an_actor_is_a_copy_that_learning_does_not_change(normalize_obs):
     before = algorithm.act(actor, obs, None, None)[1].clone()
     algorithm.update(state, rollout(algorithm, state), rngs(0))
     assert torch.equal(algorithm.act(actor, obs, None, None)[1], before)
-    assert not torch.equal(algorithm.act(algorithm.acting_params(state), obs, None, None)[1], before)
+    assert not torch.equal(
+        algorithm.act(algorithm.acting_params(state), obs, None, None)[1], before
+    )
 
 
 def test_observations_are_normalised_by_all_that_were_seen():
@@ -290,7 +296,9 @@ def test_metrics_of_an_update_that_stops_early_are_means_over_the_steps_it_took(
     algorithm, state = make(target_kl=1e-4, update_epochs=10, learning_rate=1e-2)
     _, report = algorithm.update(state, rollout(algorithm, state), rngs(0))
     assert 0 < state.count.item() < 30
-    assert report.metrics["entropy"].item() == pytest.approx(np.log(4), rel=0.05)  # still almost uniform
+    assert report.metrics["entropy"].item() == pytest.approx(
+        np.log(4), rel=0.05
+    )  # still almost uniform
 
 
 @pytest.mark.parametrize("settings", [{}, {"normalize_obs": True}])

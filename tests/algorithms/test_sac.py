@@ -15,10 +15,10 @@ from toys import Masked, Toy, learn
 
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.sac import SACAlgorithm, State
+from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.ops.losses import critic_loss, masked_entropy_target
 from skillweave.seeding import Seeds
-from skillweave.experience import Sample
 from skillweave.types import SkillweaveError
 
 P, B = 2, 6

@@ -13,10 +13,10 @@ from gymnasium.spaces import Box
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.td3 import State, TD3Algorithm
+from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.ops.losses import critic_loss as regression
 from skillweave.seeding import Seeds
-from skillweave.experience import Sample
 
 P, B, A = 2, 6, 2
 LINEAR = TD3(num_envs=2, network=Network(()), learning_rate=1e-2)
@@ -64,9 +64,7 @@ def generators() -> list[torch.Generator]:
 def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample) -> Any:
     noise = algorithm.learning_noise(generators(), B, False)
     target = algorithm.critic_target(state, s, ActingParams({}, None, None), noise)
-    q = algorithm.critics.chosen(
-        algorithm.critics.views(state.critic), {"vector": s.obs}, s.action
-    )
+    q = algorithm.critics.chosen(algorithm.critics.views(state.critic), {"vector": s.obs}, s.action)
     return regression(q, target, s.weight)
 
 

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from skillweave.buffers import memory
 from skillweave.buffers.replay import ReplayBuffer
+from skillweave.experience import Sample
 from skillweave.spaces import obs_dtype
-from skillweave.types import Sample, SkillweaveError, VecStep
+from skillweave.types import SkillweaveError, VecStep
 
 SPACE = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
 GAMMA = torch.tensor([0.9, 0.5, 0.99])
@@ -330,7 +331,7 @@ def test_boxes_of_actions_stay_as_they_are_and_choices_become_int64():
     boxes.add(step.obs, None, action, step)
     sample = boxes.sample(1, GAMMA[:2], generators(2))
     assert torch.equal(sample.action[:, 0], torch.from_numpy(action))
-    assert sample.mask is None
+    assert sample.next_obs_mask is None
     assert sample.weight is None
     for choices, bytes_each in (256, 1), (257, 2), (40_000, 4):
         buffer = ReplayBuffer(10, 2, 2, SPACE, (), np.int64, mask_size=choices)

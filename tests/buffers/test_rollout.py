@@ -35,7 +35,8 @@ GAMMA = torch.tensor([0.9, 0.5])
 
 
 def test_columns_are_member_after_member():
-    transition, head = filled([vec_step(t) for t in range(T)]).read(GAMMA)
+    transition = filled([vec_step(t) for t in range(T)]).read(GAMMA)
+    head = transition.head
     expected = torch.tensor([[[0.0, 1], [10, 11], [20, 21]], [[2, 3], [12, 13], [22, 23]]])
     assert torch.equal(transition.reward, expected)
     assert torch.equal(transition.action, (expected + 90 * (expected // 10)).long())
@@ -45,11 +46,11 @@ def test_columns_are_member_after_member():
     )
     assert torch.equal(transition.next_obs, transition.obs + torch.tensor([0.5, 0]))
     assert torch.equal(head, transition.action[..., None].expand(P, T, B, A).float())
-    assert transition.mask is None
+    assert transition.obs_mask is None
 
 
 def test_each_members_discount_is_its_gamma_to_the_calls_length():
-    transition, _ = filled([vec_step(0, steps=1), vec_step(1, steps=3)]).read(GAMMA)
+    transition = filled([vec_step(0, steps=1), vec_step(1, steps=3)]).read(GAMMA)
     torch.testing.assert_close(
         transition.discount,
         torch.tensor([[[0.9, 0.9], [0.729, 0.729]], [[0.5, 0.5], [0.125, 0.125]]]),
@@ -58,7 +59,7 @@ def test_each_members_discount_is_its_gamma_to_the_calls_length():
 
 def test_a_termination_has_discount_zero_and_a_truncation_has_not_and_both_are_last():
     steps = [vec_step(0, terminated=[0]), vec_step(1, truncated=[3]), vec_step(2)]
-    transition, _ = filled(steps).read(GAMMA)
+    transition = filled(steps).read(GAMMA)
     assert transition.discount[0, :, 0].tolist() == pytest.approx([0.0, 0.9, 0.9])
     assert transition.discount[1, :, 1].tolist() == pytest.approx([0.5] * 3)
     assert transition.last[0, :, 0].tolist() == [True, False, True]
@@ -66,7 +67,7 @@ def test_a_termination_has_discount_zero_and_a_truncation_has_not_and_both_are_l
 
 
 def test_the_end_of_the_rollout_cuts_every_trajectory_but_keeps_its_discount():
-    transition, _ = filled([vec_step(t) for t in range(T)]).read(GAMMA)
+    transition = filled([vec_step(t) for t in range(T)]).read(GAMMA)
     assert transition.last[:, -1].all()
     assert not transition.last[:, :-1].any()
     assert (transition.discount > 0).all()
@@ -74,17 +75,17 @@ def test_the_end_of_the_rollout_cuts_every_trajectory_but_keeps_its_discount():
 
 def test_masks_travel_with_their_observations():
     masks = [np.eye(A, dtype=bool)[[0, 1, 2, t]] for t in range(T)]
-    transition, _ = filled([vec_step(t) for t in range(T)], masks).read(GAMMA)
+    transition = filled([vec_step(t) for t in range(T)], masks).read(GAMMA)
     for t in range(T):
-        assert torch.equal(transition.mask[:, t].flatten(0, 1), torch.from_numpy(masks[t]))
+        assert torch.equal(transition.obs_mask[:, t].flatten(0, 1), torch.from_numpy(masks[t]))
 
 
 def test_a_step_without_a_mask_allows_everything_though_others_have_one():
     some = np.eye(A, dtype=bool)[[0, 1, 2, 0]]
-    transition, _ = filled([vec_step(t) for t in range(T)], [some, None, some]).read(GAMMA)
-    assert transition.mask.shape == (P, T, B, A)
-    assert transition.mask[:, 1].all()
-    assert torch.equal(transition.mask[:, 2].flatten(0, 1), torch.from_numpy(some))
+    transition = filled([vec_step(t) for t in range(T)], [some, None, some]).read(GAMMA)
+    assert transition.obs_mask.shape == (P, T, B, A)
+    assert transition.obs_mask[:, 1].all()
+    assert torch.equal(transition.obs_mask[:, 2].flatten(0, 1), torch.from_numpy(some))
 
 
 def test_the_buffer_keeps_copies():
@@ -94,7 +95,7 @@ def test_the_buffer_keeps_copies():
     obs += 99
     step.next_obs += 99
     step.reward += 99
-    transition, _ = buffer.read(GAMMA)
+    transition = buffer.read(GAMMA)
     assert transition.obs.max() < 99
     assert transition.next_obs.max() < 99
     assert transition.reward.max() < 99

@@ -63,7 +63,7 @@ def test_acting_in_numpy_says_what_torch_says(activation, layer_norm):
     agent = KINDS["ppo"](net_config={"arch": "mlp", "hidden_size": [32, 16], **how})
     for _ in range(2):  # before and after learning
         native = agent.native
-        actor = native.learner.actor(native.member.state)
+        actor = native.learner.acting_params(native.member.state)
         obs = torch.from_numpy(OBS)[None]
         _, head, _ = native.learner.act(actor, obs, None, None)
         np.testing.assert_allclose(native.quick.output(OBS), head[0].numpy(), atol=1e-5)

@@ -150,7 +150,10 @@ def test_kernels_grow_without_changing_the_function_where_they_can(space):
 def test_what_survives_keeps_its_moments_and_what_is_new_starts_at_zero(name):
     before, spaces = member(name, "relu")
     after = rebuilt(before, Change("units", 0, 5), spaces, np.random.default_rng(0))
-    families = before.algorithm(spaces).parameter_groups(), after.algorithm(spaces).parameter_groups()
+    families = (
+        before.algorithm(spaces).parameter_groups(),
+        after.algorithm(spaces).parameter_groups(),
+    )
     for old, new in zip(*families, strict=True):
         for field in old.moments:
             a, b = getattr(before.state, field), getattr(after.state, field)

@@ -15,8 +15,8 @@ from skillweave.algorithms.parameters import LARGEST
 from skillweave.evolution.config import KINDS
 from skillweave.evolution.mutation import check_mutations, mutate, random_config, with_settings
 from skillweave.evolution.stacks import Member, join
+from skillweave.experience import Sample
 from skillweave.seeding import Seeds
-from skillweave.types import Sample
 
 OBS = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
 CHOICE, FORCE = gym.spaces.Discrete(3), gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -201,8 +201,8 @@ def test_a_mutated_temperature_is_the_one_that_is_learnt_by():
         rows, torch.zeros(2, 4, 2), torch.zeros(2, 4), torch.zeros(2, 4), rows, None, None, None,
         np.zeros((2, 4), int),
     )  # fmt: skip
-    metrics, _ = algorithm.update(state, sample, 0.0, [Seeds(m).torch() for m in range(2)])
-    assert metrics["ent_coef"].tolist() == pytest.approx([0.05, child.config.ent_coef])
+    _, report = algorithm.update(state, sample, [Seeds(m).torch() for m in range(2)])
+    assert report.metrics["ent_coef"].tolist() == pytest.approx([0.05, child.config.ent_coef])
 
 
 def test_a_temperature_that_is_learnt_does_not_mutate():

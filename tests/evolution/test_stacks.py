@@ -11,11 +11,10 @@ import pytest
 import torch
 
 from skillweave import DQN, PPO, RNN, SAC, TD3, Network
-from skillweave.algorithms.ppo import Rollout
 from skillweave.evolution.stacks import Member, crop, join, pad, split, stack_key
+from skillweave.experience import Rollout, Sample
 from skillweave.networks.stacked import Layout
 from skillweave.seeding import Seeds
-from skillweave.types import Sample, Transition
 
 OBS = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)
 CHOICE, FORCE = gym.spaces.Discrete(3), gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -60,10 +59,12 @@ def learn(algorithm: Any, state: Any, action_space: Any, rows: list[int], update
             last[:, -1] = True  # what follows is the next row, except at ends
             next_obs[:, :-1] = torch.where(last[:, :-1, :, None], next_obs[:, :-1], obs[:, 1:])
             discount = torch.full((len(rows), 8, 2), 0.9)
-            transition = Transition(obs, action, each((), 3), discount, next_obs, last)
             log_std = None if discrete else torch.zeros(len(rows), 1, 1, 2)
-            rollout = Rollout(transition, each((3 if discrete else 2,), 6), log_std)
-            algorithm.update(state, rollout, 0.0, [Seeds(u) / r for r in rows])
+            head = each((3 if discrete else 2,), 6)
+            rollout = Rollout(
+                obs, action, each((), 3), discount, next_obs, last, head=head, log_std=log_std
+            )
+            algorithm.update(state, rollout, [(Seeds(u) / r).torch() for r in rows])
             continue
 
         def batch(shape: Any, key: int, u: int = u) -> torch.Tensor:
@@ -74,7 +75,7 @@ def learn(algorithm: Any, state: Any, action_space: Any, rows: list[int], update
             batch((5,), 2), action, batch((), 3), torch.full((len(rows), 16), 0.9), batch((5,), 4),
             None, None, None, np.zeros((len(rows), 16), np.int64),
         )  # fmt: skip
-        algorithm.update(state, sample, 0.0, [(Seeds(u) / r).torch() for r in rows])
+        algorithm.update(state, sample, [(Seeds(u) / r).torch() for r in rows])
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh", "silu"])

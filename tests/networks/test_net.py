@@ -8,7 +8,8 @@ from gymnasium.spaces import Box
 from torch.nn import functional as F
 
 from skillweave.networks.config import RNN, Network
-from skillweave.networks.net import Net, QNet
+from skillweave.networks.net import Net
+from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Layout
 from skillweave.spaces import obs_codec
 

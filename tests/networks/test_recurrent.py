@@ -5,9 +5,9 @@ from torch import nn
 from skillweave.networks.config import RNN
 from skillweave.networks.recurrent import (
     cell,
-    memory_size,
     project,
     rnn_init_,
+    rnn_memory_size,
     rnn_shapes,
     sequence,
 )
@@ -24,7 +24,7 @@ def made(kind: str):
     g = torch.Generator().manual_seed(9)
     flat += 0.1 * torch.randn(flat.shape, generator=g)
     x = torch.randn(P, T, B, IN, generator=g)
-    memory = torch.randn(P, B, memory_size(rnn), generator=g)
+    memory = torch.randn(P, B, rnn_memory_size(rnn), generator=g)
     start = torch.rand(P, T, B, generator=g) < 0.3
     return rnn, layout, flat, x, memory, start
 
@@ -98,7 +98,7 @@ def test_gradients_through_time_are_torchs_and_stop_where_an_episode_starts(kind
 @pytest.mark.parametrize(("kind", "size"), [("lstm", 2 * H), ("gru", H)])
 def test_the_memory_holds_what_comes_out_first(kind, size):
     rnn, layout, flat, x, memory, _ = made(kind)
-    assert memory_size(rnn) == size == memory.shape[-1]
+    assert rnn_memory_size(rnn) == size == memory.shape[-1]
     views = layout.views(flat)
     after = sequence(views, "rnn", rnn, x, torch.zeros_like(memory), x.new_zeros(P, T, B).bool())
     assert after[..., :H].abs().max() < 1.0

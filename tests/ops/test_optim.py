@@ -4,7 +4,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate, merge_moments
+from skillweave.ops.moments import merge_moments
+from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
 
 
 def adam_state(members: int, size: int, dtype: torch.dtype = torch.float32):

@@ -4,7 +4,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skillweave.ops.returns import explained_variance, gae, normalise
+from skillweave.ops.moments import explained_variance, normalise
+from skillweave.ops.returns import gae
 
 
 def one(*numbers: float) -> torch.Tensor:

@@ -46,11 +46,11 @@ class Spy(DQNAlgorithm):
         self.log.append("act")
         return super().act(*args, **kwargs)
 
-    def update(self, state: Any, sample: Any, progress: float, generators: Any) -> Any:
+    def update(self, state: Any, batch: Any, rng: Any) -> Any:
         self.log.append("learn")
-        self.samples.append(sample)
-        self.spent.append(progress)
-        return super().update(state, sample, progress, generators)
+        self.samples.append(batch)
+        self.spent.append(batch.progress)
+        return super().update(state, batch, rng)
 
 
 def spied(config: DQN, budget: int, env: Any = None, members: int = 1, **where: Any) -> Spy:
@@ -219,7 +219,7 @@ def test_observations_and_returns_are_scaled_by_all_that_was_seen(kind):
     assert state.obs_mean.abs().max() < 0.3  # signs, about as often −1 as 1
     assert state.obs_var.flatten().tolist() == pytest.approx([1.0, 1.0], abs=0.1)
     rows = torch.from_numpy(env.show(np.arange(4)))[None]
-    shown = algorithm.inputs(algorithm.actor(state), rows)["vector"]
+    shown = algorithm.inputs(algorithm.acting_params(state), rows)["vector"]
     expected = (rows - state.obs_mean[:, None]) / (state.obs_var[:, None] + 1e-8).sqrt()
     torch.testing.assert_close(shown, expected)
 

@@ -52,7 +52,7 @@ def greedy(algorithm: PPOAlgorithm, state: State, obs: np.ndarray, mask=None) ->
         torch.from_numpy(obs)[None],
         None if mask is None else torch.from_numpy(mask)[None],
     )
-    action, *_ = algorithm.act(algorithm.actor(state), rows, allowed, None)
+    action, *_ = algorithm.act(algorithm.acting_params(state), rows, allowed, None)
     return algorithm.to_env(action[0].numpy())
 
 
@@ -60,7 +60,7 @@ def greedy(algorithm: PPOAlgorithm, state: State, obs: np.ndarray, mask=None) ->
 def test_ppo_learns_that_the_action_must_equal_the_observation(overlap):
     algorithm, state = train(Identity(16), 40, replace(CONFIG, overlap=overlap))
     assert greedy(algorithm, state, np.arange(4)).tolist() == [0, 1, 2, 3]
-    head = algorithm.act(algorithm.actor(state), torch.arange(4)[None], None, None)[1]
+    head = algorithm.act(algorithm.acting_params(state), torch.arange(4)[None], None, None)[1]
     assert head.softmax(-1)[0].diagonal().min() > 0.9
 
 
@@ -69,7 +69,7 @@ def test_ppo_learns_that_a_continuous_action_must_equal_the_observation(overlap)
     algorithm, state = train(BoxIdentity(16), 80, replace(CONFIG, overlap=overlap))
     obs = np.linspace(-0.9, 0.9, 7, dtype=np.float32)[:, None]
     assert np.abs(greedy(algorithm, state, obs) - obs).max() < 0.2
-    assert algorithm.actor(state).views["actor.log_std"].exp().item() < 0.3
+    assert algorithm.acting_params(state).views["actor.log_std"].exp().item() < 0.3
 
 
 def test_a_forbidden_action_is_never_taken_and_the_best_of_the_others_is_learnt():
@@ -175,14 +175,14 @@ class Spy(PPOAlgorithm):
         super().__init__(*args)
         self.versions, self.lags = [], []
 
-    def update(self, state, rollout, progress, seeds):
-        self.versions.append(self.actor(state))
-        obs, head = rollout.transition.obs.flatten(1, 2), rollout.head.flatten(1, 2)
+    def update(self, state, batch, rng):
+        self.versions.append(self.acting_params(state))
+        obs, head = batch.obs.flatten(1, 2), batch.head.flatten(1, 2)
         with torch.no_grad():
             heads = [self.act(a, obs, None, None)[1] for a in self.versions]
             acted = [torch.allclose(h, head) for h in heads]
         self.lags.append(acted[::-1].index(True))
-        return super().update(state, rollout, progress, seeds)
+        return super().update(state, batch, rng)
 
 
 @pytest.mark.parametrize(("overlap", "lags"), [(True, [0, 1, 1, 0, 1, 1]), (False, [0] * 6)])
