@@ -25,7 +25,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
-from skillweave.training.phase import check_replay
+from skillweave.training.stage import check_replay
 from skillweave.types import Memory, Policy, SkillweaveError
 
 
@@ -53,8 +53,8 @@ class Hierarchy(Declaration):
             flat: train one plain agent on the same number of steps instead: the baseline.
             quiet: no progress.
             track: "tensorboard", "wandb".
-            evolve: a population for every agent, or by phase (a skill's name, "selector", "flat")
-                for some. Its budget is the phase's for each member, measuring fitness included.
+            evolve: a population for every agent, or by stage (a skill's name, "selector", "flat")
+                for some. Its budget is the stage's for each member, measuring fitness included.
 
         Raises:
             SkillweaveError: the declaration does not fit the environment, or training diverged.
@@ -63,12 +63,12 @@ class Hierarchy(Declaration):
         run_dir = _as_path(run_dir, "run_dir")
         observation_space, action_space = self.check_spaces()
         content = training.manifest(self, seed=seed, flat=flat)
-        plan(content["phases"], evolve)
-        check_budgets(content["phases"])
-        for phase in content["phases"]:
-            chooses = phase["name"] == "selector"
+        plan(content["stages"], evolve)
+        check_budgets(content["stages"])
+        for stage in content["stages"]:
+            chooses = stage["name"] == "selector"
             acts = gym.spaces.Discrete(len(self.skills)) if chooses else action_space
-            check_replay(phase, observation_space, acts)
+            check_replay(stage, observation_space, acts)
         if isinstance(track, str) or not isinstance(track, Sequence):
             raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
         track = tuple(track)

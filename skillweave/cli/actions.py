@@ -137,9 +137,9 @@ def _info(command: commands.Info) -> None:
         f"  recipe: {m.get('recipe') or '(declared in Python)'}, call_steps {m['call_steps']}"
     ]
     lines += [
-        f"  {'phase':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
+        f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
     ]
-    for p in m["phases"]:
+    for p in m["stages"]:
         final = p.get("final", {}).get("return")
         lines.append(
             f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
@@ -215,9 +215,9 @@ def _tell_trained(
     command: commands.Train | commands.Resume, trained: Run, episodes: int, render: bool = False
 ) -> None:
     manifest = trained.info()
-    result: dict[str, Any] = {"run": str(trained.path), "phases": manifest["phases"]}
-    seconds = sum(p["seconds"] for p in manifest["phases"])
-    steps = sum(p["steps"] for p in manifest["phases"])
+    result: dict[str, Any] = {"run": str(trained.path), "stages": manifest["stages"]}
+    seconds = sum(p["seconds"] for p in manifest["stages"])
+    steps = sum(p["steps"] for p in manifest["stages"])
     lines = [
         f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"
     ]
@@ -247,7 +247,7 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
         hint = f" --recipe {recipe or 'FILE.py'}"
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]
-        saved = f"saved at {at['steps']:,} steps of {at['phase']}"
+        saved = f"saved at {at['steps']:,} steps of {at['stage']}"
     except SkillweaveError:
         saved = "saved at the start"
     return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}{hint}")

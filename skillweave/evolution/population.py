@@ -87,7 +87,7 @@ class Population:
     def steps(self) -> int:
         """Environment steps of all members and of their ancestors, each as often as it has heirs.
 
-        What was really spent is counted by the phase.
+        What was really spent is counted by the stage.
         """
         return sum(m.steps for m in self.members)
 

@@ -20,7 +20,7 @@ from skillweave.spaces import action_codec, obs_codec, obs_dtype, obs_shape
 from skillweave.types import Policy, SkillweaveError
 
 RESERVED = ("selector", "flat")
-"""Names of phases that are not skills."""
+"""Names of stages that are not skills."""
 
 
 @dataclass
@@ -122,7 +122,7 @@ class Declaration:
                     f"two skills are named {name!r}; give one another name: class attribute 'name'"
                 )
             if name in RESERVED:
-                raise SkillweaveError(f"a skill cannot be named {name!r}, which names a phase")
+                raise SkillweaveError(f"a skill cannot be named {name!r}, which names a stage")
 
     @property
     def spec(self) -> EnvSpec:
@@ -250,16 +250,16 @@ def _check_algorithm(value: object, where: str, *, optional: bool) -> None:
     raise SkillweaveError(f"{where} is {short(value)}, which is no algorithm's settings{hint}")
 
 
-def check_budgets(phases: Sequence[dict[str, Any]]) -> None:
-    """Raise a SkillweaveError where a phase of a manifest would end before it learns anything."""
-    for phase in phases:
-        starts = phase["algorithm"].get("learning_starts", 0)
-        population = (phase.get("evolution") or {}).get("population", 1)
-        budget = phase["budget"] // population
+def check_budgets(stages: Sequence[dict[str, Any]]) -> None:
+    """Raise a SkillweaveError where a stage of a manifest would end before it learns anything."""
+    for stage in stages:
+        starts = stage["algorithm"].get("learning_starts", 0)
+        population = (stage.get("evolution") or {}).get("population", 1)
+        budget = stage["budget"] // population
         if budget <= starts:
             each = " for each member" if population > 1 else ""
             raise SkillweaveError(
-                f"phase {phase['name']!r}: its budget is {budget:,} steps{each}, but it begins to "
+                f"stage {stage['name']!r}: its budget is {budget:,} steps{each}, but it begins to "
                 f"learn only after {starts:,} (learning_starts). Give it more steps, or start "
                 "earlier"
             )

@@ -16,14 +16,14 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign import source_of
-from skillweave.training.phase import Listener, Phase, Trainer, train_phase
+from skillweave.training.stage import Listener, Stage, Trainer, train_stage
 from skillweave.training.probe import MakeEnv
 from skillweave.types import Policy, VecEnv
 
 
 def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
     """What a new run's ``run.json`` says."""
-    phases = [flat_phase(declaration)] if flat else phases_of(declaration)
+    stages = [flat_stage(declaration)] if flat else stages_of(declaration)
     return {
         "kind": "flat" if flat else "hierarchy",
         "env": declaration.spec.name,
@@ -39,14 +39,14 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "resume_needs_recipe": not declaration.trains_from_data,
         "reflexes": [r.name for r in declaration.reflexes],
         "needs_recipe": not (declaration.spec.is_data if flat else declaration.is_data),
-        "phases": [p.entry() for p in phases],
+        "stages": [p.entry() for p in stages],
     }
 
 
-def phases_of(declaration: Declaration) -> list[Phase]:
+def stages_of(declaration: Declaration) -> list[Stage]:
     """The skills that are to be trained, then the selector (which cannot train before them)."""
-    phases = [
-        Phase(
+    stages = [
+        Stage(
             s.name,
             s.algorithm or declaration.algorithm,
             declaration.budget(s),
@@ -60,16 +60,16 @@ def phases_of(declaration: Declaration) -> list[Phase]:
         raise AssertionError("the selector's environment needs the skills' policies")
 
     return [
-        *phases,
-        Phase("selector", declaration.selector, declaration.selector_steps, too_early),
+        *stages,
+        Stage("selector", declaration.selector, declaration.selector_steps, too_early),
     ]
 
 
-def flat_phase(declaration: Declaration) -> Phase:
+def flat_stage(declaration: Declaration) -> Stage:
     """One agent on the task itself: the baseline, or all that is asked for."""
     config = declaration.flat or declaration.algorithm
     budget = declaration.flat_steps or declaration.total_steps
-    return Phase("flat", config, budget, _skill_env(declaration, None))
+    return Stage("flat", config, budget, _skill_env(declaration, None))
 
 
 @torch_threads(1)  # a loop sets its own; all else must not depend on how many there are
@@ -77,26 +77,26 @@ def train(
     declaration: Declaration,
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
-    train_phase: Trainer = train_phase,
+    train_stage: Trainer = train_stage,
 ) -> Policy:
     """Train, or finish training, what the run says; returns the policy."""
     seeds = Seeds(int(run.manifest["seed"]))
     if run.manifest["kind"] == "flat":
-        return train_phase(flat_phase(declaration), run, seeds / "flat", listeners)
+        return train_stage(flat_stage(declaration), run, seeds / "flat", listeners)
     policies = _ready(declaration, run)
     for name, ready in policies.items():
         run.keep_policy(name, ready)
-    *skill_phases, selector = phases_of(declaration)
-    for phase in skill_phases:
-        policies[phase.name] = train_phase(phase, run, seeds / phase.name, listeners)
+    *skill_stages, selector = stages_of(declaration)
+    for stage in skill_stages:
+        policies[stage.name] = train_stage(stage, run, seeds / stage.name, listeners)
     skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
 
     def make_env(num_envs: int, gamma: Any) -> VecEnv:
         engine = make_engine(declaration.spec, num_envs)
         return FromVectorEnv(OptionsEnv(engine, skills, gamma))
 
-    phase = Phase("selector", selector.config, selector.budget, make_env)
-    policy = train_phase(phase, run, seeds / "selector", listeners)
+    stage = Stage("selector", selector.config, selector.budget, make_env)
+    policy = train_stage(stage, run, seeds / "selector", listeners)
     return HierarchyPolicy(policy, skills)
 
 

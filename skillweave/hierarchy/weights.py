@@ -81,9 +81,9 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors, header = read_tensors(path)
     if header.get("kind") == "agent" and "algorithm" in header:
         fit(AgentHeader, header, str(path))
-        if (phase := header.get("phase", "flat")) != "flat":
+        if (stage := header.get("stage", "flat")) != "flat":
             raise SkillweaveError(
-                f"{path} holds the policy of phase {shown(phase)} alone; write the whole "
+                f"{path} holds the policy of stage {shown(stage)} alone; write the whole "
                 "hierarchy's weights: skillweave weights RUN"
             )
         return tensors, header

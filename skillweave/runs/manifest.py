@@ -36,7 +36,7 @@ class SkillEntry(TypedDict):
 
 
 class Winner(TypedDict):
-    """The member that a population's phase ended with."""
+    """The member that a population's stage ended with."""
 
     member: Count
     fitness: float
@@ -44,8 +44,8 @@ class Winner(TypedDict):
     generations: Count
 
 
-class PhaseEntry(TypedDict):
-    """A phase: what it is to train, and how far it is."""
+class StageEntry(TypedDict):
+    """A stage: what it is to train, and how far it is."""
 
     name: Name
     budget: Positive
@@ -76,7 +76,7 @@ class Manifest(TypedDict):
     call_steps: Positive | None
     greedy_skills: bool
     needs_recipe: bool
-    phases: list[PhaseEntry]
+    stages: list[StageEntry]
     created: str
     versions: dict[str, str]
     id: NotRequired[str]
@@ -118,7 +118,7 @@ class BestEntry(TypedDict):
 class LineageLine(TypedDict):
     """A line of ``lineage.jsonl``: a member in a generation."""
 
-    phase: Name
+    stage: Name
     generation: Count
     member: Count
     parent: Count | None
@@ -132,7 +132,7 @@ class LineageLine(TypedDict):
 MetricsLine = TypedDict(
     "MetricsLine",
     {
-        "phase": NotRequired[Name],
+        "stage": NotRequired[Name],
         "update": NotRequired[Count],
         "steps": NotRequired[Count],
         "seconds": NotRequired[Seconds],
@@ -145,7 +145,7 @@ MetricsLine = TypedDict(
 class Checkpoint(TypedDict):
     """A checkpoint's header."""
 
-    phase: Name
+    stage: Name
     update: Count
     steps: Count
     evaluation_steps: Count
@@ -170,15 +170,15 @@ class Generation(Checkpoint):
 def check_manifest(data: Mapping[str, Any], file: str) -> None:
     """Raise a SkillweaveError that names the file and the field where a manifest is wrong."""
     manifest = fit(Manifest, data, file)
-    for kind in ("skills", "phases"):
+    for kind in ("skills", "stages"):
         names = [entry["name"] for entry in manifest[kind]]
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise SkillweaveError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
-    for i, phase in enumerate(manifest["phases"]):
-        where = f"phases[{i}]"
-        config_from_json(phase["algorithm"], file, f"{where}.algorithm")
-        if phase["status"] == "done" and not {"steps", "seconds"} <= set(phase):
+    for i, stage in enumerate(manifest["stages"]):
+        where = f"stages[{i}]"
+        config_from_json(stage["algorithm"], file, f"{where}.algorithm")
+        if stage["status"] == "done" and not {"steps", "seconds"} <= set(stage):
             raise SkillweaveError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
     if "id" in data and "sha256" not in data:
         raise SkillweaveError(f"{file} is damaged: no field 'sha256', the checksum of it all")

@@ -57,7 +57,7 @@ class Collector:
         if kept.shape != like.shape or kept.dtype != like.dtype:
             raise SkillweaveError(
                 f"the checkpoint's {name!r} of open episodes is {kept.dtype} {kept.shape}, where "
-                f"{like.dtype} {like.shape} belongs: it is not of this phase, or damaged"
+                f"{like.dtype} {like.shape} belongs: it is not of this stage, or damaged"
             )
         return kept
 

@@ -1,4 +1,4 @@
-"""A phase: one agent trained from its start, or from its latest clean cut, to its end."""
+"""A stage: one agent trained from its start, or from its latest clean cut, to its end."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from skillweave.training.probe import MakeEnv, Probe
 from skillweave.types import SkillweaveError, unprefixed
 
 START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
-"""Where a phase stands before its first update."""
+"""Where a stage stands before its first update."""
 
 
 class Listener(Protocol):
     """Is told how training goes: a progress bar, TensorBoard, Weights & Biases."""
 
-    def phase(self, name: str, budget: int) -> None:
-        """A phase begins, or goes on."""
+    def stage(self, name: str, budget: int) -> None:
+        """A stage begins, or goes on."""
         ...
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
@@ -37,7 +37,7 @@ class Listener(Protocol):
         ...
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A phase is over."""
+        """A stage is over."""
         ...
 
     def message(self, text: str) -> None:
@@ -46,17 +46,17 @@ class Listener(Protocol):
 
 
 class Trainer(Protocol):
-    """How a phase is trained: by one agent, or by a population."""
+    """How a stage is trained: by one agent, or by a population."""
 
     def __call__(
-        self, phase: Phase, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
+        self, stage: Stage, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
     ) -> AgentPolicy:
         """Train it to its end, or return its policy where it is done already."""
         ...
 
 
 @dataclass(frozen=True)
-class Phase:
+class Stage:
     """What to train: a name, settings, a budget in environment steps, and an environment."""
 
     name: str
@@ -75,7 +75,7 @@ class Phase:
 
 
 def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
-    """Raise a SkillweaveError where a phase's replay buffer cannot be made.
+    """Raise a SkillweaveError where a stage's replay buffer cannot be made.
 
     Args:
         entry: the manifest's; "evolution" says of how many members.
@@ -91,28 +91,28 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
     try:
         make_buffer(algorithm, env, members, shared=True)  # what is not written takes no memory
     except SkillweaveError as error:
-        raise SkillweaveError(f"phase {entry['name']!r}: {error}") from error
+        raise SkillweaveError(f"stage {entry['name']!r}: {error}") from error
 
 
 class Record:
-    """What a phase under way writes and tells: its entry, its metrics, its listeners."""
+    """What a stage under way writes and tells: its entry, its metrics, its listeners."""
 
     def __init__(
         self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: dict[str, Any]
     ) -> None:
-        self.run, self.listeners, self.entry, self.at = run, listeners, run.phase(name), at
+        self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), at
         run.rewind_metrics(at.get("metrics_bytes", self.entry.get("metrics_bytes")))
         self.entry.setdefault("metrics_bytes", run.metrics_size())
         self.entry["status"] = "training"
         run.save()
         for listener in listeners:
-            listener.phase(name, int(self.entry["budget"]))
+            listener.stage(name, int(self.entry["budget"]))
 
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """An update was made."""
         name = self.entry["name"]
         self.at.update(update=update, steps=steps, seconds=seconds, metrics=metrics)
-        now = {"phase": name, "update": update, "steps": steps}
+        now = {"stage": name, "update": update, "steps": steps}
         self.run.log(now | {"seconds": round(seconds, 4)} | metrics)
         for listener in self.listeners:
             listener.tick(name, steps, seconds, metrics)
@@ -123,13 +123,13 @@ class Record:
             listener.message(f"{self.entry['name']}: {text}")
 
     def header(self) -> dict[str, Any]:
-        """Where the phase stands, for its checkpoint."""
-        return {"phase": self.entry["name"]} | {
+        """Where the stage stands, for its checkpoint."""
+        return {"stage": self.entry["name"]} | {
             k: self.at[k] for k in ("update", "steps", "evaluation_steps", "seconds", "metrics")
         }
 
     def done(self, policy: AgentPolicy) -> None:
-        """The phase is over: keep its policy, and say how it went."""
+        """The stage is over: keep its policy, and say how it went."""
         entry, at = self.entry, self.at
         self.run.save_policy(entry["name"], policy)
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
@@ -152,7 +152,7 @@ def resume_episodes(
         collector.restore(saved, seeds / "restart" / record.at["update"])
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
         raise SkillweaveError(
-            f"{record.run.path}: the checkpoint of phase {record.entry['name']!r} does not hold "
+            f"{record.run.path}: the checkpoint of stage {record.entry['name']!r} does not hold "
             f"episodes of these environments: {error!r}"
         ) from error
     if count := len(collector.begun_anew):
@@ -163,26 +163,26 @@ def resume_episodes(
         )
 
 
-def train_phase(
-    phase: Phase, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
+def train_stage(
+    stage: Stage, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
 ) -> AgentPolicy:
-    """Train a phase to its end, or return its policy where it is done already.
+    """Train a stage to its end, or return its policy where it is done already.
 
-    The settings in the run count, not those of ``phase``: a resumed run goes on as it began.
+    The settings in the run count, not those of ``stage``: a resumed run goes on as it began.
     """
-    entry = run.phase(phase.name)
+    entry = run.stage(stage.name)
     if entry["status"] == "done":
-        return run.load_policy(phase.name)
+        return run.load_policy(stage.name)
     config, budget = config_from_json(entry["algorithm"]), int(entry["budget"])
-    env = phase.make_env(config.num_envs, config.gamma)
+    env = stage.make_env(config.num_envs, config.gamma)
     every, episodes = run.manifest.get("eval_every"), run.manifest.get("eval_episodes", 0)
-    probe = Probe(phase.make_env, config.gamma, seeds, every, episodes)
+    probe = Probe(stage.make_env, config.gamma, seeds, every, episodes)
     try:
         algorithm = make_algorithm(config, env.observation_space, env.action_space)
         fresh = algorithm.init([seeds / "member" / 0])
-        found = run.load_checkpoint(algorithm.state_type, phase.name, like=fresh)
+        found = run.load_checkpoint(algorithm.state_type, stage.name, like=fresh)
         state, at, extra = found or (fresh, dict(START), {})
-        record = Record(phase.name, run, listeners, at)
+        record = Record(stage.name, run, listeners, at)
         collector = Collector(env)
         resume_episodes(collector, unprefixed("collector", extra), seeds, record)
         probe.start(at["steps"])

@@ -1,6 +1,6 @@
-"""A phase in which a population evolves, generation by generation, in a run directory.
+"""A stage in which a population evolves, generation by generation, in a run directory.
 
-Beside what every phase writes, ``lineage.jsonl`` gets a line for each member of each generation.
+Beside what every stage writes, ``lineage.jsonl`` gets a line for each member of each generation.
 A generation is one piece: a run that was killed goes on from the last complete one.
 """
 
@@ -23,13 +23,13 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
-from skillweave.training.phase import (
+from skillweave.training.stage import (
     START,
     Listener,
-    Phase,
+    Stage,
     Record,
     resume_episodes,
-    train_phase,
+    train_stage,
 )
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -41,7 +41,7 @@ class Nothing:
 
 @dataclass
 class Best:
-    """The best member so far: its policy is what the phase ends with.
+    """The best member so far: its policy is what the stage ends with.
 
     Fitness is that of the latest generation's episodes.
     """
@@ -52,16 +52,16 @@ class Best:
     policy: AgentPolicy
 
 
-def evolve_phase(
-    phase: Phase,
+def evolve_stage(
+    stage: Stage,
     run: RunDirectory,
     seeds: Seeds,
     listeners: tuple[Listener, ...],
     selection: Any = None,
 ) -> AgentPolicy:
-    """Like ``train_phase``; where the run's entry says so, a population evolves instead.
+    """Like ``train_stage``; where the run's entry says so, a population evolves instead.
 
-    The settings in the run count, not those of ``phase``: a resumed run goes on as it began.
+    The settings in the run count, not those of ``stage``: a resumed run goes on as it began.
 
     Args:
         selection: the user's own, which the run knows by name only.
@@ -69,14 +69,14 @@ def evolve_phase(
     Raises:
         SkillweaveError: every member diverged, or the selection is missing or wrong.
     """
-    entry = run.phase(phase.name)
+    entry = run.stage(stage.name)
     if entry.get("evolution") is None:
-        return train_phase(phase, run, seeds, listeners)
+        return train_stage(stage, run, seeds, listeners)
     if entry["status"] == "done":
-        return run.load_policy(phase.name)
-    where = f"{run.path}: phase {phase.name!r}"
+        return run.load_policy(stage.name)
+    where = f"{run.path}: stage {stage.name!r}"
     evolution = evolution_from_json(entry["evolution"], where, selection)
-    evolving = _Evolving(phase, run, seeds, listeners, evolution)
+    evolving = _Evolving(stage, run, seeds, listeners, evolution)
     try:
         while not evolving.over:
             evolving.generation()
@@ -86,23 +86,23 @@ def evolve_phase(
 
 
 class _Evolving:
-    """One phase's population under way."""
+    """One stage's population under way."""
 
     def __init__(
         self,
-        phase: Phase,
+        stage: Stage,
         run: RunDirectory,
         seeds: Seeds,
         listeners: tuple[Listener, ...],
         evolution: Evolution,
     ) -> None:
-        self.phase, self.run, self.seeds, self.evolution = phase, run, seeds, evolution
-        self.listeners, entry = listeners, run.phase(phase.name)
+        self.stage, self.run, self.seeds, self.evolution = stage, run, seeds, evolution
+        self.listeners, entry = listeners, run.stage(stage.name)
         self.config = config_from_json(entry["algorithm"])
         self.budget = int(entry["budget"])
         # It may be damaged: before there is an arena.
-        found = run.load_checkpoint(Nothing, phase.name, schema=Generation)
-        self.arena = phase.make_env(evolution.episodes, self.config.gamma)
+        found = run.load_checkpoint(Nothing, stage.name, schema=Generation)
+        self.arena = stage.make_env(evolution.episodes, self.config.gamma)
         """Where fitness is measured."""
         self.spaces = self.arena.observation_space, self.arena.action_space
         self.best: Best | None = None
@@ -113,14 +113,14 @@ class _Evolving:
         if found is None:
             at: dict[str, Any] = dict(START)
             self.population = Population.fresh(
-                self.config, evolution, phase.make_env, self.spaces, seeds
+                self.config, evolution, stage.make_env, self.spaces, seeds
             )
         else:
             _, at, tensors = found
             self._restore(at, tensors)
         run.lineage.rewind(at.get("lineage_bytes", entry.get("lineage_bytes")))
         entry.setdefault("lineage_bytes", run.lineage.size)
-        self.record = Record(phase.name, run, listeners, at)
+        self.record = Record(stage.name, run, listeners, at)
         if found is not None:
             self._resume_episodes(found[2])
         self._started: float = time.perf_counter() - at["seconds"]
@@ -158,7 +158,7 @@ class _Evolving:
         self._save()
 
     def finish(self) -> AgentPolicy:
-        """The phase is over."""
+        """The stage is over."""
         assert self.best is not None
         asked, target = self.evolution.generations, self.evolution.target
         if self.done < asked and (target is None or self.best.fitness < target):
@@ -207,7 +207,7 @@ class _Evolving:
         members = self.population.members
         best = self.best.number if self.best and self.best.generation == self.done else None
         self.run.lineage.append(
-            lineage_of(self.phase.name, self.done, members, fitness, self.evolution, best)
+            lineage_of(self.stage.name, self.done, members, fitness, self.evolution, best)
         )
         lost = [str(m.number) for m, f in zip(members, fitness, strict=True) if f == -np.inf]
         if lost:
@@ -224,7 +224,7 @@ class _Evolving:
 
     def _tell(self, text: str) -> None:
         for listener in self.listeners:
-            listener.message(f"{self.phase.name}: {text}")
+            listener.message(f"{self.stage.name}: {text}")
 
     def _save(self) -> None:
         """A checkpoint of the whole population, as it is to go on."""
@@ -269,7 +269,7 @@ class _Evolving:
             member.state = state_from(own, fresh, where, algorithm.families())
             members.append(member)
         self.population = Population(
-            members, self.evolution, self.phase.make_env, self.spaces, self.seeds
+            members, self.evolution, self.stage.make_env, self.spaces, self.seeds
         )
         self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
         self.done, self.fitness_steps = at["generation"], at["fitness_steps"]
