@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3
-    from skillweave.api import Hierarchy, Run, train_agent
+    from skillweave.api import Agent, Hierarchy, Run, train_agent
     from skillweave.envs.make import EnvSpec
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, Selection
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "Agent": "api",
     "Array": "types",
     "CNN": "networks.config",
     "DQN": "algorithms.config",
@@ -62,6 +63,7 @@ __all__ = [
     "RNN",
     "SAC",
     "TD3",
+    "Agent",
     "Array",
     "Encoder",
     "EnvSpec",

@@ -22,7 +22,8 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.settings import apply_settings
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
-from skillweave.training.stage import Stage, train_stage
+from skillweave.training.stage import Stage
+from skillweave.training.trainer import train_stage
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
 
@@ -369,12 +370,12 @@ REPLAYERS = {
 def stage_of(name: str, save_buffer: bool = True) -> Stage:
     config, shows, asks = REPLAYERS[name]
     config = dataclasses.replace(config, save_buffer=save_buffer)
-    return Stage("echo", config, 1300, lambda *_: Echo(4, shows, asks))
+    return Stage("echo", "agent", config, 1300, lambda _: lambda *_: Echo(4, shows, asks))
 
 
 def new_run(path: Path, stage: Stage) -> RunDirectory:
     manifest = {
-        "kind": "flat", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 250, "skills": [],
+        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 250, "skills": [],
         "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "stages": [stage.entry()],
     }  # fmt: skip
     return RunDirectory.create(path, manifest)

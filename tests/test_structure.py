@@ -38,7 +38,7 @@ ROOMS: dict[str, set[str]] = {
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
-    "reporting": BASE | {"skills", "envs", "runs", "hierarchy"},
+    "reporting": BASE | {"skills", "envs", "runs", "training", "hierarchy"},
     "recipes": {"skillweave", "api"},
     "api": EVERYTHING,
     "cli": EVERYTHING | {"skillweave"},

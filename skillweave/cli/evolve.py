@@ -9,7 +9,7 @@ from typing import Any
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.settings import replaced
-from skillweave.hierarchy.training import flat_stage, stages_of
+from skillweave.hierarchy.training import stages_of
 from skillweave.types import SkillweaveError
 
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
@@ -28,7 +28,7 @@ def parse_evolve(
     """
     if not settings:
         return None
-    stages = [flat_stage(declaration)] if flat else stages_of(declaration)
+    stages = declaration.plain_agent().stages() if flat else stages_of(declaration)
     names = [p.name for p in stages]
     everyone, own = [], {name: list[tuple[str, str, str]]() for name in names}
     for setting in settings:

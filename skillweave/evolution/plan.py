@@ -6,14 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from skillweave.algorithms.config import config_from_json
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
-from skillweave.evolution.stage import evolve_stage
+from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short
-from skillweave.runs.directory import RunDirectory
-from skillweave.seeding import Seeds
-from skillweave.training.stage import Listener, Stage, Trainer
+from skillweave.training.trainer import MakeLearner, OneAgent, StageLearner, StageRun
 from skillweave.types import SkillweaveError
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
@@ -30,20 +27,28 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
         entry = next(p for p in stages if p["name"] == name)
         check_mutations(config_from_json(entry["algorithm"]), how, f"stage {name!r}: ")
         entry["evolution"] = evolution_to_json(how)
+        if how.target is not None:
+            entry["target"] = {"of": "return", "at_least": how.target}
         entry["budget"] *= how.population
 
 
-def trainer(run: RunDirectory, evolve: Evolve) -> Trainer:
-    """Trains a stage as the run says; ``evolve`` holds selections of the user's own, if any."""
-    asked = _by_stage([p["name"] for p in run.manifest["stages"]], evolve)
+def make_learner(stages: list[dict[str, Any]], evolve: Evolve) -> MakeLearner:
+    """Who learns in a stage: a population where its entry says so, else one agent.
 
-    def train(
-        stage: Stage, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
-    ) -> AgentPolicy:
-        selection = asked[stage.name].selection if stage.name in asked else None
-        return evolve_stage(stage, run, seeds, listeners, selection)
+    ``evolve`` holds selections of the user's own, which a run knows by name only.
 
-    return train
+    Raises:
+        SkillweaveError: ``evolve`` names a stage that is not among ``stages``.
+    """
+    asked = _by_stage([s["name"] for s in stages], evolve)
+
+    def make(stage: StageRun) -> StageLearner:
+        if stage.entry.get("evolution") is None:
+            return OneAgent(stage)
+        how = asked.get(stage.name)
+        return EvolvingPopulation(stage, None if how is None else how.selection)
+
+    return make
 
 
 def _by_stage(stages: list[str], evolve: Evolve) -> dict[str, Evolution]:

@@ -28,7 +28,7 @@ from skillweave.training.episodes import Tick
 from skillweave.training.members import Stack
 from skillweave.training.off_policy import make_buffer, train_stacks
 from skillweave.training.on_policy import train_on_policy
-from skillweave.training.probe import MakeEnv, episode_returns
+from skillweave.training.periodic import MakeEnv, first_episodes
 from skillweave.types import Array, Policy, VecEnv
 
 NEVER = 2**62
@@ -230,7 +230,7 @@ def _count(members: list[Member], steps: int) -> None:
 def score(policy: Policy, env: VecEnv, seeds: Seeds) -> float:
     """Mean return of an episode in each environment; −inf if it is not finite."""
     with torch_threads(1):  # several wait for each other, for ever on a busy machine
-        returns = episode_returns(policy, env, seeds)
+        returns, _ = first_episodes(policy, env, seeds)
     return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
 
 

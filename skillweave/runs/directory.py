@@ -146,15 +146,18 @@ class RunDirectory:
         return all(p["status"] == "done" for p in self.manifest["stages"])
 
     def save_checkpoint(
-        self, state: Any, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
+        self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
     ) -> None:
-        """Write a dataclass of tensors as the latest clean cut; the one before stays beside it.
+        """Write a stage's latest clean cut; the one before stays beside it.
 
-        ``extra`` holds what else resuming needs: a replay buffer.
+        Args:
+            state: a dataclass of tensors; None: all is in ``extra``.
+            extra: what else resuming needs: environments, a replay buffer.
         """
-        tensors = {f.name: getattr(state, f.name) for f in fields(state)}
+        tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
-        header = self._place(header["stage"]) | header | {"metrics_bytes": self.metrics_size()}
+        header = self._place(header["stage"]) | header
+        header |= {"metrics_bytes": self.metrics_size(), "lineage_bytes": self.lineage.size}
         self._check()
         self._checkpoints.save(tensors, header)
 
@@ -164,11 +167,12 @@ class RunDirectory:
         self._checkpoints.drop()
 
     def load_checkpoint(
-        self, kind: type[S], stage: str, like: S | None = None, schema: Any = Checkpoint
-    ) -> tuple[S, dict[str, Any], dict[str, Tensor]] | None:
+        self, kind: type[S] | None, stage: str, like: S | None = None, schema: Any = Checkpoint
+    ) -> tuple[S | None, dict[str, Any], dict[str, Tensor]] | None:
         """State, header and extra of a stage's latest good clean cut; None: there is none yet.
 
         Args:
+            kind: of the state, a dataclass of tensors; None: there is none.
             like: a state of the shapes and types that it must have.
             schema: of the header.
 
@@ -181,10 +185,12 @@ class RunDirectory:
         tensors, header, path = found
         extra = unprefixed("extra", tensors)
         tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
-        names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
+        names = set() if kind is None else {f.name for f in fields(kind)}  # type: ignore[arg-type]
         if names != set(tensors):
             what = "finish the run with the version that began it, or delete the file to begin anew"
             raise SkillweaveError(f"{path} does not hold what this Skillweave resumes from: {what}")
+        if kind is None:
+            return None, header, extra
         state = kind(**tensors) if like is None else state_from(tensors, like, str(path))
         return state, header, extra
 

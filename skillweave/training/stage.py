@@ -1,77 +1,115 @@
-"""A stage: one agent trained from its start, or from its latest clean cut, to its end."""
+"""A stage as data: who learns, who decides, with which algorithm, for how many steps."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from types import SimpleNamespace
-from typing import Any, Protocol
-
-from torch import Tensor
+from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.algorithms.ppo import PPOAlgorithm
-from skillweave.runs.directory import RunDirectory
-from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
-from skillweave.training.episodes import Tick
-from skillweave.training.off_policy import make_buffer, train_off_policy
-from skillweave.training.on_policy import train_on_policy
-from skillweave.training.probe import MakeEnv, Probe
-from skillweave.types import SkillweaveError, unprefixed
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.messages import short
+from skillweave.training.off_policy import make_buffer
+from skillweave.training.periodic import MakeEnv
+from skillweave.types import Policy, SkillweaveError
 
-START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
-"""Where a stage stands before its first update."""
+Policies = Mapping[str, Policy]
+"""By name, everyone who can act already: ready skills, and who learnt in earlier stages."""
 
 
-class Listener(Protocol):
-    """Is told how training goes: a progress bar, TensorBoard, Weights & Biases."""
+@dataclass(frozen=True)
+class Target:
+    """Where a stage may end before its budget is spent, by its periodic evaluation."""
 
-    def stage(self, name: str, budget: int) -> None:
-        """A stage begins, or goes on."""
-        ...
+    of: Literal["return", "success"]
+    """The mean return, or the share of episodes that succeed."""
+    at_least: float
+    """The value that is good enough."""
 
-    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """An update was made."""
-        ...
-
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A stage is over."""
-        ...
-
-    def message(self, text: str) -> None:
-        """Something that people should know."""
-        ...
+    def reached(self, metrics: Mapping[str, float]) -> float | None:
+        """The value in an evaluation's metrics, where it is good enough."""
+        value = metrics.get(f"eval_{self.of}")
+        return value if value is not None and value >= self.at_least else None
 
 
-class Trainer(Protocol):
-    """How a stage is trained: by one agent, or by a population."""
+def target_of(target_return: Any, target_success: Any, where: str) -> Target | None:
+    """The target that two settings, of which one may be given, ask for.
 
-    def __call__(
-        self, stage: Stage, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
-    ) -> AgentPolicy:
-        """Train it to its end, or return its policy where it is done already."""
-        ...
+    Raises:
+        SkillweaveError: both are given, or one is no number in its range.
+    """
+    given = {"return": target_return, "success": target_success}
+    given = {k: v for k, v in given.items() if v is not None}
+    if len(given) > 1:
+        raise SkillweaveError(f"{where}: give target_return or target_success, not both")
+    for of, value in given.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value):
+            raise SkillweaveError(f"{where}: target_{of} is {short(value)}; it must be a number")
+        if of == "success" and not 0.0 < value <= 1.0:
+            raise SkillweaveError(
+                f"{where}: target_success is {short(value)}; it is a share of episodes, more than "
+                "0 and at most 1"
+            )
+        return Target("success" if of == "success" else "return", float(value))
+    return None
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What to train: a name, settings, a budget in environment steps, and an environment."""
+    """What to train, and in which environment."""
 
     name: str
+    kind: Literal["agent", "skill", "selector"]
     config: AlgorithmConfig
+    """The algorithm's settings."""
     budget: int
-    make_env: MakeEnv
+    """Environment steps."""
+    env: Callable[[Policies], MakeEnv]
+    """Where it learns, given everyone who can act already."""
+    target: Target | None = None
+    """Where it may end early."""
 
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
         return {
             "name": self.name,
+            "kind": self.kind,
+            "learns": [self.name],
+            "decides": self.name if self.kind == "selector" else None,
             "budget": self.budget,
             "algorithm": config_to_json(self.config),
+            "target": None if self.target is None else asdict(self.target),
             "status": "waiting",
         }
+
+
+def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> None:
+    """Raise a SkillweaveError where a stage of a manifest could not do what it is to do."""
+    for entry in entries:
+        where, population = f"stage {entry['name']!r}", entry.get("evolution")
+        members = 1 if population is None else population["population"]
+        starts, budget = entry["algorithm"].get("learning_starts", 0), entry["budget"] // members
+        if budget <= starts:
+            each = " for each member" if members > 1 else ""
+            raise SkillweaveError(
+                f"{where}: its budget is {budget:,} steps{each}, but it begins to learn only after "
+                f"{starts:,} (learning_starts). Give it more steps, or start earlier"
+            )
+        target = entry.get("target")
+        if target is not None and population is not None and target["of"] != "return":
+            raise SkillweaveError(
+                f"{where}: it evolves, and members are compared by their mean return, so its "
+                "target must be target_return"
+            )
+        if target is not None and population is None and eval_every is None:
+            raise SkillweaveError(
+                f"{where}: it has a target, but is not evaluated while it trains: set eval_every "
+                "to the environment steps between evaluations"
+            )
 
 
 def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
@@ -92,119 +130,3 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
         make_buffer(algorithm, env, members, shared=True)  # what is not written takes no memory
     except SkillweaveError as error:
         raise SkillweaveError(f"stage {entry['name']!r}: {error}") from error
-
-
-class Record:
-    """What a stage under way writes and tells: its entry, its metrics, its listeners."""
-
-    def __init__(
-        self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: dict[str, Any]
-    ) -> None:
-        self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), at
-        run.rewind_metrics(at.get("metrics_bytes", self.entry.get("metrics_bytes")))
-        self.entry.setdefault("metrics_bytes", run.metrics_size())
-        self.entry["status"] = "training"
-        run.save()
-        for listener in listeners:
-            listener.stage(name, int(self.entry["budget"]))
-
-    def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """An update was made."""
-        name = self.entry["name"]
-        self.at.update(update=update, steps=steps, seconds=seconds, metrics=metrics)
-        now = {"stage": name, "update": update, "steps": steps}
-        self.run.log(now | {"seconds": round(seconds, 4)} | metrics)
-        for listener in self.listeners:
-            listener.tick(name, steps, seconds, metrics)
-
-    def tell(self, text: str) -> None:
-        """Something that people should know."""
-        for listener in self.listeners:
-            listener.message(f"{self.entry['name']}: {text}")
-
-    def header(self) -> dict[str, Any]:
-        """Where the stage stands, for its checkpoint."""
-        return {"stage": self.entry["name"]} | {
-            k: self.at[k] for k in ("update", "steps", "evaluation_steps", "seconds", "metrics")
-        }
-
-    def done(self, policy: AgentPolicy) -> None:
-        """The stage is over: keep its policy, and say how it went."""
-        entry, at = self.entry, self.at
-        self.run.save_policy(entry["name"], policy)
-        entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
-        entry["evaluation_steps"] = at["evaluation_steps"]
-        entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
-        entry["final"] = at["metrics"]
-        self.run.save()
-        self.run.drop_checkpoints()
-        for listener in self.listeners:
-            listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
-
-
-def resume_episodes(
-    collector: Collector, saved: dict[str, Tensor], seeds: Seeds, record: Record
-) -> None:
-    """Bring the environments back to where a checkpoint left them; say where that cannot be."""
-    if not saved:
-        return
-    try:
-        collector.restore(saved, seeds / "restart" / record.at["update"])
-    except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
-        raise SkillweaveError(
-            f"{record.run.path}: the checkpoint of stage {record.entry['name']!r} does not hold "
-            f"episodes of these environments: {error!r}"
-        ) from error
-    if count := len(collector.begun_anew):
-        record.tell(
-            f"{count} of {collector.num_envs} open episodes begin anew, so the end may differ from "
-            "that of an undisturbed run: given the same seed and the same actions, the environment "
-            "does not repeat itself"
-        )
-
-
-def train_stage(
-    stage: Stage, run: RunDirectory, seeds: Seeds, listeners: tuple[Listener, ...]
-) -> AgentPolicy:
-    """Train a stage to its end, or return its policy where it is done already.
-
-    The settings in the run count, not those of ``stage``: a resumed run goes on as it began.
-    """
-    entry = run.stage(stage.name)
-    if entry["status"] == "done":
-        return run.load_policy(stage.name)
-    config, budget = config_from_json(entry["algorithm"]), int(entry["budget"])
-    env = stage.make_env(config.num_envs, config.gamma)
-    every, episodes = run.manifest.get("eval_every"), run.manifest.get("eval_episodes", 0)
-    probe = Probe(stage.make_env, config.gamma, seeds, every, episodes)
-    try:
-        algorithm = make_algorithm(config, env.observation_space, env.action_space)
-        fresh = algorithm.init([seeds / "member" / 0])
-        found = run.load_checkpoint(algorithm.state_type, stage.name, like=fresh)
-        state, at, extra = found or (fresh, dict(START), {})
-        record = Record(stage.name, run, listeners, at)
-        collector = Collector(env)
-        resume_episodes(collector, unprefixed("collector", extra), seeds, record)
-        probe.start(at["steps"])
-
-        def on_tick(tick: Tick) -> None:
-            metrics = tick.metrics
-            metrics |= probe.look(tick.steps, lambda: AgentPolicy.of(algorithm, tick.state))
-            record.at["evaluation_steps"] += probe.spent()
-            record.tick(tick.update, tick.steps, tick.seconds, metrics)
-            if tick.cut:
-                run.save_checkpoint(tick.state, record.header(), tick.extra)
-
-        where: dict[str, Any] = {k: at[k] for k in ("update", "steps", "seconds")}
-        where |= {"cut_every": int(run.manifest["cut_every"]), "on_tick": on_tick}
-        if isinstance(algorithm, PPOAlgorithm):
-            train_on_policy(algorithm, collector, state, seeds, budget, **where)
-        elif isinstance(algorithm, OffPolicyAlgorithm):
-            saved = unprefixed("buffer", extra)
-            train_off_policy(algorithm, collector, state, seeds, budget, saved=saved, **where)
-    finally:
-        env.close()
-        probe.close()
-    policy = AgentPolicy.of(algorithm, state)
-    record.done(policy)
-    return policy

@@ -264,7 +264,7 @@ def test_the_flat_baseline_trains_on_as_many_steps_as_the_hierarchy(trained: Tra
     hierarchy = json.loads((trained.coded_run / "run.json").read_text())
     flat = json.loads((trained.flat_run / "run.json").read_text())
     (stage,) = flat["stages"]
-    assert flat["kind"] == "flat"
+    assert flat["kind"] == "agent"
     assert stage["budget"] == sum(p["budget"] for p in hierarchy["stages"]) == 256 + 256 + 512
     assert stage["budget"] <= stage["steps"] < stage["budget"] + 64
 
@@ -449,7 +449,7 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "episodes": (["evaluate", "RUN", "--episodes", "0"], 1, ["episodes", "at least 1"]),
     "final episodes": (["train", "PLAIN", "--evaluate", "-1"], 1, ["evaluate", "-1"]),
     "skill": (["evaluate", "RUN", "--skill", "lift"], 1, ["'lift'", "left, balance"]),
-    "flat skill": (["evaluate", "FLAT", "--skill", "left"], 1, ["flat"]),
+    "flat skill": (["evaluate", "FLAT", "--skill", "left"], 1, ["plain agent"]),
     "target": (["evaluate", "nothing"], 1, ["nothing is neither a run nor a weights file"]),
     "target is a recipe": (["evaluate", "lunar-lander"], 1, ["--pretrained"]),
     "no run": (["info", "."], 1, ["holds no run"]),

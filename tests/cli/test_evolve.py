@@ -64,7 +64,7 @@ def test_settings_become_a_plan_for_each_stage():
     assert only is not None
     assert only["left"] is None
     assert only["selector"].selection == Tournament(3)  # type: ignore[union-attr]
-    assert list(parse_evolve(["population=3"], declared(), True) or ()) == ["flat"]
+    assert list(parse_evolve(["population=3"], declared(), True) or ()) == ["agent"]
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_a_run_without_populations_shows_how_its_agents_learnt(tmp_path):
     out = tmp_path / "run"
     flags = ["-o", str(out), "--flat", "--evaluate", "0", "--quiet"]
     assert main(["train", str(tmp_path / "walk.py"), *flags]) == 0
-    assert [p.name for p in plot_run(RunDirectory.open(out))] == ["flat.png", "flat.svg"]
+    assert [p.name for p in plot_run(RunDirectory.open(out))] == ["agent.png", "agent.svg"]
 
 
 def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):

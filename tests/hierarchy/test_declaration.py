@@ -509,7 +509,7 @@ def test_a_hierarchy_as_a_skill_needs_a_proper_name(tmp_path, name):
 def test_a_budget_that_ends_before_learning_begins_is_refused(tmp_path, flat):
     late = DQN(learning_starts=500)
     h = Hierarchy("CartPole-v1", [Plain()], algorithm=late, skill_steps=500, flat_steps=500)
-    name = "flat" if flat else "plain"
+    name = "agent" if flat else "plain"
     says = f"stage '{name}': its budget is 500 steps, but it begins to learn only after 500"
     with pytest.raises(SkillweaveError, match=says):
         h.train(tmp_path / "run", flat=flat)

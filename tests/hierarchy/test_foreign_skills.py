@@ -203,7 +203,7 @@ def test_a_policy_of_ones_own_class_is_only_named(tmp_path):
 
 def test_the_flat_baseline_leaves_foreign_skills_alone(tmp_path):
     run = declare(skill("a", linear())).train(tmp_path / "run", flat=True, quiet=True)
-    assert {p.name for p in (run.path / "policies").iterdir()} == {"flat.safetensors"}
+    assert {p.name for p in (run.path / "policies").iterdir()} == {"agent.safetensors"}
     declare(skill("a", linear(-WEIGHT))).load(run.path)
 
 

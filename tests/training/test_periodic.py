@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from skillweave.training.probe import Probe, episode_returns
 
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.training.probe import Probe, episode_returns
 from tests.toys import Calls, Clockwork, Countdown, Identity
 
 
