@@ -33,9 +33,9 @@ def learn(seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", seed=seed, quiet=True)
         scores = {s.name: run.evaluate(100, skill=s.name).mean for s in hierarchy.skills}
-        whole, phases = run.evaluate(100).mean, run.info()["phases"]
+        whole, stages = run.evaluate(100).mean, run.info()["stages"]
     alone = {name: round(score, 1) for name, score in scores.items()}
-    seconds = round(sum(p["seconds"] for p in phases), 1)
+    seconds = round(sum(p["seconds"] for p in stages), 1)
     return {"seed": seed, **alone, "hierarchy": round(whole, 1), "seconds": seconds}
 
 

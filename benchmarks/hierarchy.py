@@ -3,7 +3,7 @@
     python -m benchmarks.hierarchy [--recipe lunar-lander] [--seeds 0 1 2 3 4] [--no-flat]
 
 Every run is a process of its own, so that its peak memory is its own. Training time is the sum
-of the phases' seconds, without imports; scores are greedy over 100 episodes of Gymnasium's
+of the stages' seconds, without imports; scores are greedy over 100 episodes of Gymnasium's
 environment with seeds that training never saw.
 """
 
@@ -29,18 +29,18 @@ def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, ob
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", seed=seed, flat=flat, quiet=True)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        phases = run.info()["phases"]
+        stages = run.info()["stages"]
         score = run.evaluate(100).to_json()
     return {
         "seed": seed,
-        "steps": sum(p["steps"] for p in phases),
-        "seconds": sum(p["seconds"] for p in phases),
+        "steps": sum(p["steps"] for p in stages),
+        "seconds": sum(p["seconds"] for p in stages),
         "score": score["mean"],
         "solved": score["solved_fraction"],
         "length": score["length_mean"],
         "peak_mb": peak,
         "usage": score["skill_usage"],
-        "phases": {p["name"]: [p["steps"], p["seconds"]] for p in phases},
+        "stages": {p["name"]: [p["steps"], p["seconds"]] for p in stages},
     }
 
 
@@ -71,7 +71,7 @@ def main() -> None:
         rows = []
         for seed in given.seeds:
             rows.append(child(given.recipe, seed, kind == "flat", given.set))
-            shown = [k for k in rows[0] if k not in ("usage", "phases")]
+            shown = [k for k in rows[0] if k not in ("usage", "stages")]
             print(
                 f"{kind}:\n" + table(shown, [[_short(r[k]) for k in shown] for r in rows]),
                 flush=True,

@@ -172,7 +172,7 @@ def learn(name: str, seed: int) -> dict[str, Any]:
             figure.env, figure.algorithm, figure.steps, Path(folder) / "run", seed=seed, quiet=True
         )
         score = run.evaluate(figure.episodes)
-        seconds = run.info()["phases"][0]["seconds"]
+        seconds = run.info()["stages"][0]["seconds"]
     return {
         "figure": name,
         "seed": seed,

@@ -52,14 +52,14 @@ def search(way: str, seed: int) -> dict[str, Any]:
             evolve=evolve,
         )  # fmt: skip
         score = run.evaluate(100)
-        (phase,) = run.info()["phases"]
+        (stage,) = run.info()["stages"]
     return {
         "way": way,
         "seed": seed,
         "score": round(score.mean, 1),
         "solved": score.solved_fraction,
-        "steps": phase["steps"],
-        "seconds": round(phase["seconds"]),
+        "steps": stage["steps"],
+        "seconds": round(stage["seconds"]),
     }
 
 

@@ -59,7 +59,7 @@ def trained(hierarchy: Hierarchy, seed: int, flat: bool) -> tuple[float, float]:
     patched = mock.patch.object(training, "make_engine", engine_maker(record))
     with tempfile.TemporaryDirectory() as folder, patched:
         run = hierarchy.train(Path(folder) / "run", seed=seed, flat=flat, quiet=True)
-        speed = run.info()["phases"][-1]["steps_per_second"]
+        speed = run.info()["stages"][-1]["steps_per_second"]
     record[-1].replay()  # once to warm up
     steps, seconds = record[-1].replay()
     return speed, steps / seconds

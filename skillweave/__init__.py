@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from skillweave.algorithms.base import ActingParams, Algorithm
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3
     from skillweave.algorithms.registry import register_algorithm
-    from skillweave.api import Hierarchy, Run, train_agent
+    from skillweave.api import Agent, Hierarchy, Run, train_agent
     from skillweave.envs.make import EnvSpec
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, Selection
@@ -26,6 +26,7 @@ __version__ = "0.1.0"
 _HOME = {
     "ActingParams": "algorithms.base",
     "Algorithm": "algorithms.base",
+    "Agent": "api",
     "Array": "types",
     "CNN": "networks.config",
     "DQN": "algorithms.config",
@@ -73,6 +74,7 @@ __all__ = [
     "TD3",
     "ActingParams",
     "Algorithm",
+    "Agent",
     "Array",
     "Encoder",
     "EnvSpec",

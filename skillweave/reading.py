@@ -150,7 +150,7 @@ def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
 
     Args:
         file: where it was read, for messages; "" where that is said elsewhere.
-        path: the field in it: ``phases[0].algorithm``.
+        path: the field in it: ``stages[0].algorithm``.
 
     Raises:
         SkillweaveError: a field is missing, unknown, of another type or out of range.

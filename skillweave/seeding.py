@@ -1,6 +1,6 @@
 """One tree of seeds: every random stream is derived by name from the run's seed (contract 8).
 
-Streams are derived afresh wherever they are needed ("the noise of update 17 of phase landing"),
+Streams are derived afresh wherever they are needed ("the noise of update 17 of stage landing"),
 so no generator's state has to be saved for a run to resume exactly.
 """
 

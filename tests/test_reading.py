@@ -117,12 +117,12 @@ def test_a_setting_of_any_wrong_type_is_told_by_its_field(config: Any, value: An
     refused = {}
     for name in data.keys() - {"algorithm"}:
         try:
-            config_from_json(data | {name: value}, "run.json", "phases[0].algorithm")
+            config_from_json(data | {name: value}, "run.json", "stages[0].algorithm")
         except SkillweaveError as error:
             refused[name] = str(error)
     assert len(refused) > len(data) // 2
     for name, told in refused.items():
-        assert told.startswith("run.json: phases[0].algorithm")
+        assert told.startswith("run.json: stages[0].algorithm")
         assert f".{name}" in told
 
 

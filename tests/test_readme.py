@@ -43,8 +43,8 @@ def test_the_readme_examples_run_as_they_stand(
     names["hierarchy"].check_spaces()
 
     exec(compile(code[2], "README.md", "exec"), names)
-    phases = names["run"].info()["phases"]
-    assert [p["name"] for p in phases if "winner" in p] == ["land"]
+    stages = names["run"].info()["stages"]
+    assert [p["name"] for p in stages if "winner" in p] == ["land"]
 
     made: list[Any] = []  # the files of foreign skills are tested where they are made
     for name in ("from_sb3", "from_onnx"):

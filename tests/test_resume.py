@@ -22,7 +22,8 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.settings import apply_settings
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
-from skillweave.training.phase import Phase, train_phase
+from skillweave.training.stage import Stage
+from skillweave.training.trainer import train_stage
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
 
@@ -75,7 +76,7 @@ class StopAt:
     def __init__(self, tick: int) -> None:
         self.left = tick
 
-    def phase(self, name: str, budget: int) -> None:
+    def stage(self, name: str, budget: int) -> None:
         pass
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
@@ -120,17 +121,17 @@ def assert_same(run: Path, reference: Path) -> None:
 def assert_metrics_fit(run: Path, reference: Path) -> None:
     """No line twice, none missing, updates and steps rising; learning's numbers the same."""
     mine, theirs = lines(run), lines(reference)
-    keys = [(r["phase"], r["update"]) for r in mine]
+    keys = [(r["stage"], r["update"]) for r in mine]
     assert len(set(keys)) == len(keys), "a line stands twice"
-    assert keys == [(r["phase"], r["update"]) for r in theirs]
-    for phase in {r["phase"] for r in mine}:
-        rows = [r for r in mine if r["phase"] == phase]
+    assert keys == [(r["stage"], r["update"]) for r in theirs]
+    for stage in {r["stage"] for r in mine}:
+        rows = [r for r in mine if r["stage"] == stage]
         for field in ("update", "steps"):
             values = [r[field] for r in rows]
-            assert values == sorted(set(values)), f"{field} of {phase} does not rise"
+            assert values == sorted(set(values)), f"{field} of {stage} does not rise"
     for a, b in zip(mine, theirs, strict=True):
         for key in ("steps", "policy_loss", "value_loss", "entropy", "learning_rate"):
-            assert a[key] == b[key], f"{key} of {a['phase']} at update {a['update']}"
+            assert a[key] == b[key], f"{key} of {a['stage']} at update {a['update']}"
 
 
 def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> RunDirectory:
@@ -193,11 +194,11 @@ def test_the_files_of_two_equal_runs_are_equal_byte_by_byte(
 def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
     _, whole = reference("sync")
     found = lines(whole)
-    assert {r["phase"] for r in found} == {"left", "balance", "selector"}
-    for phase in ("left", "balance", "selector"):
-        steps = [r["steps"] for r in found if r["phase"] == phase]
+    assert {r["stage"] for r in found} == {"left", "balance", "selector"}
+    for stage in ("left", "balance", "selector"):
+        steps = [r["steps"] for r in found if r["stage"] == stage]
         assert len({s // 150 for s in steps}) >= 4, "too few clean cuts"
-    one, two = [r["learning_rate"] for r in found if r["phase"] == "left"][:2]
+    one, two = [r["learning_rate"] for r in found if r["stage"] == "left"][:2]
     assert one != two
 
 
@@ -289,7 +290,7 @@ def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
     monkeypatch.undo()
     recipes.load(str(recipe)).resume(path, quiet=True)
     assert_same(path, whole)
-    mine, theirs = (RunDirectory.open(p).phase("left") for p in (path, whole))
+    mine, theirs = (RunDirectory.open(p).stage("left") for p in (path, whole))
     assert mine["steps"] == theirs["steps"]
     assert mine["final"].keys() == theirs["final"].keys()
     assert mine["final"]["policy_loss"] == theirs["final"]["policy_loss"]
@@ -366,23 +367,23 @@ REPLAYERS = {
 }
 
 
-def phase_of(name: str, save_buffer: bool = True) -> Phase:
+def stage_of(name: str, save_buffer: bool = True) -> Stage:
     config, shows, asks = REPLAYERS[name]
     config = dataclasses.replace(config, save_buffer=save_buffer)
-    return Phase("echo", config, 1300, lambda *_: Echo(4, shows, asks))
+    return Stage("echo", "agent", config, 1300, lambda _: lambda *_: Echo(4, shows, asks))
 
 
-def new_run(path: Path, phase: Phase) -> RunDirectory:
+def new_run(path: Path, stage: Stage) -> RunDirectory:
     manifest = {
-        "kind": "flat", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 250, "skills": [],
-        "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "phases": [phase.entry()],
+        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 250, "skills": [],
+        "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "stages": [stage.entry()],
     }  # fmt: skip
     return RunDirectory.create(path, manifest)
 
 
-def train_echo(run: RunDirectory, phase: Phase, *listeners: Any) -> None:
+def train_echo(run: RunDirectory, stage: Stage, *listeners: Any) -> None:
     try:
-        train_phase(phase, run, Seeds(3) / phase.name, listeners)
+        train_stage(stage, run, Seeds(3) / stage.name, listeners)
     finally:
         run.close()
 
@@ -391,15 +392,15 @@ def train_echo(run: RunDirectory, phase: Phase, *listeners: Any) -> None:
 def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
     tmp_path: Path, name: str
 ) -> None:
-    phase = phase_of(name)
-    train_echo(new_run(tmp_path / "whole", phase), phase)
-    run = new_run(tmp_path / "run", phase)
+    stage = stage_of(name)
+    train_echo(new_run(tmp_path / "whole", stage), stage)
+    run = new_run(tmp_path / "run", stage)
     for stop in (3, 4):  # a tick at each cut, every 250 steps
         with pytest.raises(Stopped):
-            train_echo(run, phase, StopAt(stop))
+            train_echo(run, stage, StopAt(stop))
         run = RunDirectory.open(run.path)
         assert (run.path / "checkpoint.safetensors").exists()
-    train_echo(run, phase)
+    train_echo(run, stage)
     assert policies(run.path) == policies(tmp_path / "whole")
     mine, theirs = lines(run.path), lines(tmp_path / "whole")
     assert [r["steps"] for r in mine] == [252, 500, 752, 1000, 1252, 1300]
@@ -412,17 +413,17 @@ def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
 def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
     tmp_path: Path, name: str
 ) -> None:
-    phase = phase_of(name, save_buffer=False)
-    train_echo(new_run(tmp_path / "whole", phase), phase)
-    run = new_run(tmp_path / "run", phase)
+    stage = stage_of(name, save_buffer=False)
+    train_echo(new_run(tmp_path / "whole", stage), stage)
+    run = new_run(tmp_path / "run", stage)
     with pytest.raises(Stopped):
-        train_echo(run, phase, StopAt(3))
-    with_buffer = new_run(tmp_path / "bigger", phase_of(name))
+        train_echo(run, stage, StopAt(3))
+    with_buffer = new_run(tmp_path / "bigger", stage_of(name))
     with pytest.raises(Stopped):
-        train_echo(with_buffer, phase_of(name), StopAt(3))
+        train_echo(with_buffer, stage_of(name), StopAt(3))
     sizes = [(r.path / "checkpoint.safetensors").stat().st_size for r in (run, with_buffer)]
     assert sizes[0] < sizes[1]
-    train_echo(RunDirectory.open(run.path), phase)
+    train_echo(RunDirectory.open(run.path), stage)
     assert RunDirectory.open(run.path).finished
     mine, theirs = policies(run.path), policies(tmp_path / "whole")
     assert mine["echo.safetensors"][1] != theirs["echo.safetensors"][1]
@@ -442,7 +443,7 @@ def test_a_hierarchy_that_learns_from_replay_ends_as_if_it_had_not_been_stopped(
     recipe = str(tmp_path / "replay.py")
     recipes.load(recipe).train(tmp_path / "whole", seed=3, quiet=True)
     run = stopped_run(recipes.load(recipe), tmp_path / "run", 13)
-    assert [run.phase(n)["status"] for n in ("left", "balance", "selector")] == [
+    assert [run.stage(n)["status"] for n in ("left", "balance", "selector")] == [
         "done", "done", "training",
     ]  # fmt: skip
     recipes.load(recipe).resume(run.path, quiet=True)
@@ -465,7 +466,7 @@ def wait_for_lines(process: subprocess.Popen[str], run: Path, count: int) -> Non
 
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A training process that was sent SIGINT (Ctrl-C) in its first phase."""
+    """A training process that was sent SIGINT (Ctrl-C) in its first stage."""
     folder = tmp_path_factory.mktemp("interrupted")
     recipe = write_recipe(folder)
     command = [sys.executable, "-m", "skillweave", "train", str(recipe), "-o", str(folder / "run")]

@@ -61,7 +61,7 @@ def _lines(mine: Path, theirs: Path) -> list[str]:
     found: dict[str, int] = {}
     for number, (x, y) in enumerate(zip(a, b, strict=True), 1):
         if other := sorted(k for k in {*x, *y} - TIMES if x.get(k) != y.get(k)):
-            found.setdefault(f"{mine.name} ({y.get('phase')}): {', '.join(other)}", number)
+            found.setdefault(f"{mine.name} ({y.get('stage')}): {', '.join(other)}", number)
     return [f"{what}, first in line {number}" for what, number in found.items()]
 
 

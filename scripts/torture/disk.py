@@ -196,11 +196,11 @@ def _path_of(path: Any) -> Any:
 
 
 def position(run: Path) -> tuple[int, int, int]:
-    """How much of a run is saved: whether there is one, phases that are done, updates."""
+    """How much of a run is saved: whether there is one, stages that are done, updates."""
     if not (run / "run.json").exists():
         return 0, 0, 0
     found = RunDirectory.open(run)
-    done = [p["name"] for p in found.manifest["phases"] if p["status"] == "done"]
+    done = [p["name"] for p in found.manifest["stages"] if p["status"] == "done"]
     for name in done:
         found.load_policy(name)
     for file in ("checkpoint", "checkpoint.previous"):
@@ -208,7 +208,7 @@ def position(run: Path) -> tuple[int, int, int]:
             header = read_tensors(run / f"{file}.safetensors")[1]
         except SkillweaveError:
             continue
-        if header["phase"] not in done:
+        if header["stage"] not in done:
             return 1, len(done), header["update"]
     return 1, len(done), 0
 

@@ -192,4 +192,4 @@ KINDS: dict[str, Kind] = {
         evolve=Evolution(**EVOLVES),
     ),
 }  # fmt: skip
-"""Every kind of phase and engine that could lose something."""
+"""Every kind of stage and engine that could lose something."""

@@ -84,8 +84,8 @@ def looked_at(run: Path, changed: str) -> None:
     found = RunDirectory.open(run)
     if changed.endswith(".jsonl"):
         list(found.metrics())
-        for phase in found.manifest["phases"]:
-            read_lineage(found, phase["name"])
+        for stage in found.manifest["stages"]:
+            read_lineage(found, stage["name"])
         plot_run(found, run / "plots")
 
 

@@ -217,7 +217,7 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
 
     Args:
         file: where it was read, for messages.
-        path: the field in it: ``phases[0].algorithm``.
+        path: the field in it: ``stages[0].algorithm``.
 
     Raises:
         SkillweaveError: an unknown algorithm or field, named, or a value of another type or out

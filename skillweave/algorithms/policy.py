@@ -122,7 +122,7 @@ class AgentHeader(TypedDict):
     kind: NotRequired[str]
     run: NotRequired[str]
     """The run that it was trained in."""
-    phase: NotRequired[str]
+    stage: NotRequired[str]
     env: NotRequired[str]
     env_kwargs: NotRequired[dict[str, Any]]
     recipe: NotRequired[str | None]

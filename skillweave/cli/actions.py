@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
-from skillweave.api import Hierarchy, Run
+from skillweave.api import Agent, Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.hierarchy.settings import apply_settings, list_settings
@@ -68,9 +68,9 @@ def _train(command: commands.Train) -> None:
 
 
 def _resume(command: commands.Resume) -> None:
-    hierarchy = _hierarchy_of_run(command.run, command.recipe, "resume_needs_recipe")
+    declared = _declared_by_run(command.run, command.recipe, "resume_needs_recipe")
     try:
-        trained = hierarchy.resume(command.run, quiet=command.quiet)
+        trained = declared.resume(command.run, quiet=command.quiet)
     except KeyboardInterrupt:
         raise _interrupted(command.run) from None
     _tell_trained(command, trained, command.evaluate)
@@ -84,7 +84,7 @@ def _evaluate(command: commands.Evaluate) -> None:
         deterministic=command.deterministic,
         skill=command.skill,
     )
-    result = {"target": command.target, "env": target.hierarchy.spec.name, "seed": command.seed}
+    result = {"target": command.target, "env": target.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}
     _tell(command, result | score.to_json(), str(score))
 
@@ -133,19 +133,23 @@ def _info(command: commands.Info) -> None:
     found = RunDirectory.open(command.target)
     m = found.manifest
     lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
+    calls = f", call_steps {m['call_steps']}" if m["kind"] == "hierarchy" else ""
+    lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}{calls}"]
     lines += [
-        f"  recipe: {m.get('recipe') or '(declared in Python)'}, call_steps {m['call_steps']}"
+        f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
     ]
-    lines += [
-        f"  {'phase':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
-    ]
-    for p in m["phases"]:
+    for p in m["stages"]:
         final = p.get("final", {}).get("return")
         lines.append(
             f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
             f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
             f"{'' if final is None else f'{final:.1f}':>8}"
         )
+        if reached := p.get("reached"):
+            lines.append(
+                f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "
+                f"{p['target']['of']} {reached['value']:g}"
+            )
         if winner := p.get("winner"):
             lines.append(
                 f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
@@ -156,7 +160,7 @@ def _info(command: commands.Info) -> None:
 
 
 def _weights(command: commands.Weights) -> None:
-    trained = _hierarchy_of_run(command.run, command.recipe).load(command.run)
+    trained = _declared_by_run(command.run, command.recipe).load(command.run)
     path = trained.save_weights(command.out)
     _tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
 
@@ -180,11 +184,11 @@ def _target(command: commands.Watched) -> Run:
     if command.pretrained:
         return Hierarchy.pretrained(command.target)
     if path.is_dir():
-        return _hierarchy_of_run(path, command.recipe).load(path)
+        return _declared_by_run(path, command.recipe).load(path)
     if path.suffix == ".safetensors":
         header = open_weights(path)[1]
         if header.get("kind") == "agent" and "env" in header:
-            return Hierarchy.from_manifest(header | {"kind": "flat"}).load_weights(path)
+            return Agent.from_weights(path)
         recipe = command.recipe or header.get("recipe")
         return _declared(recipe, command.recipe, path).load_weights(path)
     hint = (
@@ -193,11 +197,14 @@ def _target(command: commands.Watched) -> Run:
     raise SkillweaveError(f"{command.target} is neither a run nor a weights file{hint}")
 
 
-def _hierarchy_of_run(path: Path, recipe: str | None, needs: str = "needs_recipe") -> Hierarchy:
-    """The hierarchy that a run was trained from; code never comes from inside the run."""
+def _declared_by_run(
+    path: Path, recipe: str | None, needs: str = "needs_recipe"
+) -> Hierarchy | Agent:
+    """What a run was trained from; code never comes from inside the run."""
     manifest = RunDirectory.open(path).manifest
     if recipe is None and not manifest.get(needs, True):
-        return Hierarchy.from_manifest(manifest)
+        kind = Agent if manifest["kind"] == "agent" else Hierarchy
+        return kind.from_manifest(manifest)
     return _declared(recipe or manifest.get("recipe"), recipe, path)
 
 
@@ -215,9 +222,9 @@ def _tell_trained(
     command: commands.Train | commands.Resume, trained: Run, episodes: int, render: bool = False
 ) -> None:
     manifest = trained.info()
-    result: dict[str, Any] = {"run": str(trained.path), "phases": manifest["phases"]}
-    seconds = sum(p["seconds"] for p in manifest["phases"])
-    steps = sum(p["steps"] for p in manifest["phases"])
+    result: dict[str, Any] = {"run": str(trained.path), "stages": manifest["stages"]}
+    seconds = sum(p["seconds"] for p in manifest["stages"])
+    steps = sum(p["steps"] for p in manifest["stages"])
     lines = [
         f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"
     ]
@@ -247,7 +254,7 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
         hint = f" --recipe {recipe or 'FILE.py'}"
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]
-        saved = f"saved at {at['steps']:,} steps of {at['phase']}"
+        saved = f"saved at {at['steps']:,} steps of {at['stage']}"
     except SkillweaveError:
         saved = "saved at the start"
     return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}{hint}")

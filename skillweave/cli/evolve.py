@@ -9,7 +9,7 @@ from typing import Any
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.settings import replaced
-from skillweave.hierarchy.training import flat_phase, phases_of
+from skillweave.hierarchy.training import stages_of
 from skillweave.types import SkillweaveError
 
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
@@ -18,9 +18,9 @@ SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation
 def parse_evolve(
     settings: Sequence[str], declaration: Declaration, flat: bool
 ) -> dict[str, Evolution | None] | None:
-    """Each phase's evolution, or None where nothing is to evolve.
+    """Each stage's evolution, or None where nothing is to evolve.
 
-    A name may begin with a phase; settings without one hold for all. ``selection=truncation``
+    A name may begin with a stage; settings without one hold for all. ``selection=truncation``
     takes that selection, ``ranges.gamma=0.9,0.999,complement`` lets a setting mutate.
 
     Raises:
@@ -28,8 +28,8 @@ def parse_evolve(
     """
     if not settings:
         return None
-    phases = [flat_phase(declaration)] if flat else phases_of(declaration)
-    names = [p.name for p in phases]
+    stages = declaration.plain_agent().stages() if flat else stages_of(declaration)
+    names = [p.name for p in stages]
     everyone, own = [], {name: list[tuple[str, str, str]]() for name in names}
     for setting in settings:
         name, sign, text = (part.strip() for part in setting.partition("="))

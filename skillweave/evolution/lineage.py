@@ -15,7 +15,7 @@ from skillweave.types import Array
 
 
 def lineage_of(
-    phase: str,
+    stage: str,
     generation: int,
     members: Sequence[Member],
     fitness: Array,
@@ -25,7 +25,7 @@ def lineage_of(
     """A generation's lines; ``best``: the number of the best so far, if it is one of these."""
     return [
         {
-            "phase": phase,
+            "stage": stage,
             "generation": generation,
             "member": member.number,
             "parent": member.origin.parent,

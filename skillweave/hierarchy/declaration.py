@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, check_spaces
-from skillweave.buffers.memory import check_memory
+from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
 from skillweave.envs.make import EnvSpec
 from skillweave.collecting.calls import SkillSet
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.foreign import fitted
-from skillweave.spaces import action_codec, obs_codec, obs_dtype, obs_shape
+from skillweave.spaces import action_codec, obs_codec
+from skillweave.training.plain_agent import (
+    AGENT,
+    PlainAgent,
+    check_algorithm,
+    check_env,
+    check_fields,
+    check_rollout,
+)
+from skillweave.training.stage import Target, target_of
 from skillweave.types import Policy, SkillweaveError
 
-RESERVED = ("selector", "flat")
-"""Names of phases that are not skills."""
+RESERVED = ("selector", AGENT, "flat")
+"""Names of stages that are not skills; "flat" in runs of older versions."""
 
 
 @dataclass
@@ -47,6 +54,8 @@ class Declaration:
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000
     """Training budget of the selector, in environment steps."""
+    selector_target_return: float | None = None
+    """The selector's stage ends early at this mean return of the periodic evaluation."""
     flat: AlgorithmConfig | None = None
     """Trains the flat baseline; None: as ``algorithm``."""
     flat_steps: int | None = None
@@ -58,12 +67,12 @@ class Declaration:
     cut_every: int = 100_000
     """Environment steps between checkpoints."""
     eval_every: int | None = None
-    """Environment steps between looks at an agent's own return while it trains; None: none."""
+    """Environment steps between evaluations of who trains, by its own reward; None: none."""
     eval_episodes: int = 20
-    """Episodes of each look."""
+    """Episodes of each of these evaluations."""
 
     def __post_init__(self) -> None:
-        self._check_env()
+        check_env(self.env)
         self._check_skills()
         if isinstance(self.reflexes, str) or not isinstance(self.reflexes, Sequence):
             raise SkillweaveError(
@@ -77,15 +86,9 @@ class Declaration:
                     "action)"
                 )
         for name in ("algorithm", "selector", "flat"):
-            _check_algorithm(getattr(self, name), f"{name}", optional=name == "flat")
-        for f in fields(self):
-            value, none = getattr(self, f.name), f.type == "int | None"
-            whole = f.type in ("int", "int | None") and not (value is None and none)
-            if whole and (type(value) is not int or value < 1):
-                what = "at least 1, or None" if none else "a whole number, at least 1"
-                raise SkillweaveError(f"{f.name} is {short(value)}; it must be {what}")
-            if f.type == "bool" and not isinstance(value, bool):
-                raise SkillweaveError(f"{f.name} is {short(value)}; it must be True or False")
+            check_algorithm(getattr(self, name), name, optional=name == "flat")
+        target_of(self.selector_target_return, None, "selector")
+        check_fields(self)
         if self.call_steps is None:
             for skill in self.skills:
                 if skill.max_steps is None and not skill.defines("termination"):
@@ -93,14 +96,6 @@ class Declaration:
                         f"call_steps is None, but skill {skill.name!r} never stops by itself: give "
                         "it max_steps or termination()"
                     )
-
-    def _check_env(self) -> None:
-        made = isinstance(self.env, gym.Env)
-        if made or not (isinstance(self.env, str | EnvSpec) or callable(self.env)):
-            raise SkillweaveError(
-                f"env is {short(self.env)}; it must be a Gymnasium id, a function that makes an "
-                "environment, or an EnvSpec (environments are made many times over)"
-            )
 
     def _check_skills(self) -> None:
         if isinstance(self.skills, str) or not isinstance(self.skills, Sequence):
@@ -113,7 +108,8 @@ class Declaration:
                 hint = " (write Center(), not Center)" if isinstance(skill, type) else ""
                 raise SkillweaveError(f"skills holds {short(skill)}, which is not a Skill{hint}")
             skill.validate()
-            _check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
+            check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
+            check_target(skill)
             ready_policy(skill)  # says so where it cannot act
         names = [s.name for s in self.skills]
         for name in names:
@@ -122,7 +118,7 @@ class Declaration:
                     f"two skills are named {name!r}; give one another name: class attribute 'name'"
                 )
             if name in RESERVED:
-                raise SkillweaveError(f"a skill cannot be named {name!r}, which names a phase")
+                raise SkillweaveError(f"a skill cannot be named {name!r}, which names a stage")
 
     @property
     def spec(self) -> EnvSpec:
@@ -172,6 +168,17 @@ class Declaration:
         if self.flat_steps is not None:
             self.flat_steps = max(1, round(self.flat_steps * factor))
 
+    def plain_agent(self) -> PlainAgent:
+        """The flat baseline: one agent on the task itself, without skills and reflexes."""
+        return PlainAgent(
+            self.env,
+            self.flat or self.algorithm,
+            self.flat_steps or self.total_steps,
+            cut_every=self.cut_every,
+            eval_every=self.eval_every,
+            eval_episodes=self.eval_episodes,
+        )
+
     def skill_set(self, policies: Sequence[Policy]) -> SkillSet:
         """The skills with their policies, ready to be called."""
         return SkillSet(
@@ -193,7 +200,9 @@ class Declaration:
             obs_codec(env.observation_space)
             action_codec(env.action_space)
             self._check_algorithms(env.action_space)
-            self._check_rollouts(env.observation_space)
+            own = (s.algorithm for s in self.skills)
+            for config in (self.algorithm, self.selector, self.flat, *own):
+                check_rollout(config, env.observation_space)
             for reflex in self.reflexes:
                 reflex.check(env.action_space)
             self._fitted(env)
@@ -210,19 +219,6 @@ class Declaration:
         check_spaces(self.selector, gym.spaces.Discrete(len(self.skills)), "selector: ")
         if self.flat is not None:
             check_spaces(self.flat, space, "flat: ")
-
-    def _check_rollouts(self, space: gym.Space[Any]) -> None:
-        """Whether the rollouts of every on-policy algorithm fit into memory."""
-        each = 2 * obs_dtype(space).itemsize * math.prod(obs_shape(space))
-        for config in (
-            self.algorithm,
-            self.selector,
-            self.flat,
-            *(s.algorithm for s in self.skills),
-        ):
-            if isinstance(config, OnPolicy):
-                size = config.num_envs * config.n_steps
-                check_memory(size, each + 32, str(short(space)), "rollout", "num_envs or n_steps")
 
     def ready_policies(self) -> dict[str, Policy]:
         """By skill, the policies that are not trained, on the environment's spaces."""
@@ -243,23 +239,16 @@ class Declaration:
         }
 
 
-def _check_algorithm(value: object, where: str, *, optional: bool) -> None:
-    if (value is None and optional) or isinstance(value, AlgorithmConfig):
-        return
-    hint = f" (write {value.__name__}(), not {value.__name__})" if isinstance(value, type) else ""
-    raise SkillweaveError(f"{where} is {short(value)}, which is no algorithm's settings{hint}")
+def check_target(skill: Skill) -> Target | None:
+    """The target of a skill's stage.
 
-
-def check_budgets(phases: Sequence[dict[str, Any]]) -> None:
-    """Raise a SkillweaveError where a phase of a manifest would end before it learns anything."""
-    for phase in phases:
-        starts = phase["algorithm"].get("learning_starts", 0)
-        population = (phase.get("evolution") or {}).get("population", 1)
-        budget = phase["budget"] // population
-        if budget <= starts:
-            each = " for each member" if population > 1 else ""
-            raise SkillweaveError(
-                f"phase {phase['name']!r}: its budget is {budget:,} steps{each}, but it begins to "
-                f"learn only after {starts:,} (learning_starts). Give it more steps, or start "
-                "earlier"
-            )
+    Raises:
+        SkillweaveError: it is no number in its range, or asks for a success that is not defined.
+    """
+    where = f"skill {skill.name!r}"
+    target = target_of(skill.target_return, skill.target_success, where)
+    if target is not None and target.of == "success" and not skill.defines("success"):
+        raise SkillweaveError(
+            f"{where} has a target_success, but does not say what success is: define success()"
+        )
+    return target

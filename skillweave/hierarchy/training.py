@@ -1,4 +1,4 @@
-"""Training a hierarchy: every skill, then the selector; or the flat baseline."""
+"""A hierarchy's schedule: every skill apart, then the selector; or one plain agent."""
 
 from __future__ import annotations
 
@@ -6,26 +6,31 @@ from typing import Any
 
 from skillweave.envs.foreign import FromVectorEnv
 from skillweave.envs.make import make_engine
-from skillweave.envs.skill_env import SkillEnv
-from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.declaration import Declaration, check_target
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign import source_of
-from skillweave.training.phase import Listener, Phase, Trainer, train_phase
-from skillweave.training.probe import MakeEnv
+from skillweave.training.periodic import MakeEnv
+from skillweave.training.plain_agent import PlainAgent, load_agent_of, task_env
+from skillweave.training.stage import Policies, Stage, target_of
+from skillweave.training.stage_log import Listener
+from skillweave.training.trainer import MakeLearner, OneAgent, train_stages
 from skillweave.types import Policy, VecEnv
+
+SELECTOR = "selector"
+"""What the selector's stage is named."""
 
 
 def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
     """What a new run's ``run.json`` says."""
-    phases = [flat_phase(declaration)] if flat else phases_of(declaration)
+    if flat:
+        return declaration.plain_agent().manifest(seed)
     return {
-        "kind": "flat" if flat else "hierarchy",
+        "kind": "hierarchy",
         "env": declaration.spec.name,
         "env_kwargs": declaration.spec.kwargs,
         "seed": seed,
@@ -38,76 +43,67 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "reflexes_in_training": declaration.reflexes_in_training,
         "resume_needs_recipe": not declaration.trains_from_data,
         "reflexes": [r.name for r in declaration.reflexes],
-        "needs_recipe": not (declaration.spec.is_data if flat else declaration.is_data),
-        "phases": [p.entry() for p in phases],
+        "needs_recipe": not declaration.is_data,
+        "stages": [stage.entry() for stage in stages_of(declaration)],
     }
 
 
-def phases_of(declaration: Declaration) -> list[Phase]:
-    """The skills that are to be trained, then the selector (which cannot train before them)."""
-    phases = [
-        Phase(
-            s.name,
-            s.algorithm or declaration.algorithm,
-            declaration.budget(s),
-            _skill_env(declaration, s),
-        )
-        for s in declaration.skills
-        if s.policy is None
-    ]
+def stages_of(declaration: Declaration) -> list[Stage]:
+    """The skills that are to be trained, each apart, then the selector."""
+    reflexes = declaration.reflexes if declaration.reflexes_in_training else ()
 
-    def too_early(num_envs: int, gamma: Any) -> VecEnv:
-        raise AssertionError("the selector's environment needs the skills' policies")
+    def skill_stage(skill: Skill) -> Stage:
+        config, budget = skill.algorithm or declaration.algorithm, declaration.budget(skill)
+        make_env = task_env(declaration.spec, skill, reflexes)
+        return Stage(skill.name, "skill", config, budget, lambda _: make_env, check_target(skill))
 
+    def selector_env(policies: Policies) -> MakeEnv:
+        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
+
+        def make_env(num_envs: int, gamma: Any) -> VecEnv:
+            engine = make_engine(declaration.spec, num_envs)
+            return FromVectorEnv(OptionsEnv(engine, skills, gamma))
+
+        return make_env
+
+    config, budget = declaration.selector, declaration.selector_steps
+    target = target_of(declaration.selector_target_return, None, SELECTOR)
     return [
-        *phases,
-        Phase("selector", declaration.selector, declaration.selector_steps, too_early),
+        *(skill_stage(s) for s in declaration.skills if s.policy is None),
+        Stage(SELECTOR, "selector", config, budget, selector_env, target),
     ]
-
-
-def flat_phase(declaration: Declaration) -> Phase:
-    """One agent on the task itself: the baseline, or all that is asked for."""
-    config = declaration.flat or declaration.algorithm
-    budget = declaration.flat_steps or declaration.total_steps
-    return Phase("flat", config, budget, _skill_env(declaration, None))
 
 
 @torch_threads(1)  # a loop sets its own; all else must not depend on how many there are
 def train(
-    declaration: Declaration,
+    declaration: Declaration | PlainAgent,
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
-    train_phase: Trainer = train_phase,
+    make_learner: MakeLearner = OneAgent,
 ) -> Policy:
     """Train, or finish training, what the run says; returns the policy."""
-    seeds = Seeds(int(run.manifest["seed"]))
-    if run.manifest["kind"] == "flat":
-        return train_phase(flat_phase(declaration), run, seeds / "flat", listeners)
-    policies = _ready(declaration, run)
-    for name, ready in policies.items():
-        run.keep_policy(name, ready)
-    *skill_phases, selector = phases_of(declaration)
-    for phase in skill_phases:
-        policies[phase.name] = train_phase(phase, run, seeds / phase.name, listeners)
-    skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
-
-    def make_env(num_envs: int, gamma: Any) -> VecEnv:
-        engine = make_engine(declaration.spec, num_envs)
-        return FromVectorEnv(OptionsEnv(engine, skills, gamma))
-
-    phase = Phase("selector", selector.config, selector.budget, make_env)
-    policy = train_phase(phase, run, seeds / "selector", listeners)
-    return HierarchyPolicy(policy, skills)
+    if run.manifest["kind"] == "agent":
+        agent = declaration if isinstance(declaration, PlainAgent) else declaration.plain_agent()
+        (stage,) = agent.stages(run.manifest["stages"][0]["name"])
+        return train_stages([stage], run, listeners, {}, make_learner)[stage.name]
+    assert isinstance(declaration, Declaration)
+    ready = _ready(declaration, run)
+    for name, policy in ready.items():
+        run.keep_policy(name, policy)
+    found = train_stages(stages_of(declaration), run, listeners, ready, make_learner)
+    skills = declaration.skill_set([found[s.name] for s in declaration.skills])
+    return HierarchyPolicy(found[SELECTOR], skills)
 
 
-def load(declaration: Declaration, run: RunDirectory) -> Policy:
+def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     """The policy of a finished run."""
-    if run.manifest["kind"] == "flat":
-        return run.load_policy("flat")
+    if run.manifest["kind"] == "agent":
+        return load_agent_of(run)
+    assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
     names = [s.name for s in declaration.skills]
     policies = [ready[n] if n in ready else run.load_policy(n) for n in names]
-    selector = run.load_policy("selector")
+    selector = run.load_policy(SELECTOR)
     check_parts(declaration, policies, selector, str(run.path))
     return HierarchyPolicy(selector, declaration.skill_set(policies))
 
@@ -116,17 +112,6 @@ def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
     """The ready policies as they were when the run began."""
     ready = declaration.ready_policies()
     return {name: run.ready_policy(name, policy) for name, policy in ready.items()}
-
-
-def _skill_env(declaration: Declaration, skill: Skill | None) -> MakeEnv:
-    # The flat baseline is the plain task: no reflexes either.
-    with_reflexes = declaration.reflexes_in_training and skill is not None
-    reflexes = tuple(declaration.reflexes) if with_reflexes else ()
-
-    def make_env(num_envs: int, gamma: Any) -> VecEnv:
-        return SkillEnv(make_engine(declaration.spec, num_envs), skill, reflexes)
-
-    return make_env
 
 
 def _skill_entry(skill: Skill) -> dict[str, Any]:

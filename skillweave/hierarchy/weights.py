@@ -13,23 +13,26 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
+from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.reading import Positive, fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.skills.foreign import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
+from skillweave.training.plain_agent import AGENT, PlainAgent
 from skillweave.types import Policy, SkillweaveError
 
 
-def write_weights(path: Path, declaration: Declaration, policy: Policy, recipe: str | None) -> None:
-    """Write skills and selector, or a flat agent; of ready policies what a run copies too."""
+def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Policy) -> None:
+    """Write skills and selector, or a plain agent; of ready policies what a run copies too."""
     place = {"env": declaration.spec.name, "env_kwargs": declaration.spec.kwargs}
     if isinstance(policy, AgentPolicy):
         weights, description = policy.to_file()
         write_tensors(path, weights, description | place)
         return
     assert isinstance(policy, HierarchyPolicy)
+    assert isinstance(declaration, Declaration)
     tensors: dict[str, Tensor] = {}
     parts: dict[str, Any] = {}
     named: list[tuple[str, Policy]] = [("selector", policy.selector)]
@@ -47,7 +50,7 @@ def write_weights(path: Path, declaration: Declaration, policy: Policy, recipe: 
         tensors |= {f"{name}/{k}": v for k, v in weights.items()}
     header = {
         "kind": "hierarchy",
-        "recipe": recipe,
+        "recipe": getattr(declaration, "recipe", None),
         **place,
         "skills": [s.name for s in declaration.skills],
         "call_steps": declaration.call_steps,
@@ -73,7 +76,7 @@ class HierarchyHeader(TypedDict):
 
 
 def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header of a file of a hierarchy's weights, or of a flat agent's.
+    """Tensors and header of a file of a hierarchy's weights, or of a plain agent's.
 
     Raises:
         SkillweaveError: the file is damaged, or holds something else.
@@ -81,9 +84,9 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors, header = read_tensors(path)
     if header.get("kind") == "agent" and "algorithm" in header:
         fit(AgentHeader, header, str(path))
-        if (phase := header.get("phase", "flat")) != "flat":
+        if (stage := header.get("stage", AGENT)) not in (AGENT, "flat"):  # its older name
             raise SkillweaveError(
-                f"{path} holds the policy of phase {shown(phase)} alone; write the whole "
+                f"{path} holds the policy of stage {shown(stage)} alone; write the whole "
                 "hierarchy's weights: skillweave weights RUN"
             )
         return tensors, header
@@ -93,20 +96,30 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, header
 
 
-def read_weights(declaration: Declaration, path: Path) -> Policy:
-    """The inverse of ``write_weights``; the declaration takes over the file's call length.
+def read_agent(
+    spec: EnvSpec, tensors: dict[str, Tensor], header: dict[str, Any], path: Path
+) -> AgentPolicy:
+    """A plain agent from what ``open_weights`` found in ``path``.
+
+    Raises:
+        SkillweaveError: the file is damaged, or belongs to another environment.
+    """
+    if (env := header.get("env", spec.name)) != spec.name:
+        raise SkillweaveError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
+    return AgentPolicy.from_file(tensors, header, str(path))
+
+
+def read_weights(
+    declaration: Declaration, tensors: dict[str, Tensor], header: dict[str, Any], path: Path
+) -> Policy:
+    """A hierarchy from what ``open_weights`` found in ``path``.
+
+    The declaration takes over the file's call length.
 
     Raises:
         SkillweaveError: the file is damaged, or belongs to other skills or another environment.
     """
-    tensors, header = open_weights(path)
     names = [s.name for s in declaration.skills]
-    if header["kind"] == "agent":
-        if (env := header.get("env", declaration.spec.name)) != declaration.spec.name:
-            raise SkillweaveError(
-                f"{path} is of an agent on {shown(env)}, but this is on {declaration.spec.name}"
-            )
-        return AgentPolicy.from_file(tensors, header, str(path))
     if header["skills"] != names or header["env"] != declaration.spec.name:
         theirs = ", ".join(header["skills"])
         raise SkillweaveError(

@@ -27,7 +27,7 @@ class Born:
 
 @dataclass(frozen=True)
 class Lineage:
-    """One phase's population over the generations."""
+    """One stage's population over the generations."""
 
     born: dict[tuple[int, int], Born]
     """By generation and number."""
@@ -53,8 +53,8 @@ class Lineage:
         return found[::-1]
 
 
-def read_lineage(run: RunDirectory, phase: str) -> Lineage | None:
-    """The lineage of a phase, or None where nothing evolved in it.
+def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
+    """The lineage of a stage, or None where nothing evolved in it.
 
     Raises:
         SkillweaveError: the file is damaged.
@@ -62,7 +62,7 @@ def read_lineage(run: RunDirectory, phase: str) -> Lineage | None:
     names, born = [f.name for f in fields(Born)], {}
     sorts: dict[str, str] = {}
     for told in run.lineage.read():
-        if told["phase"] == phase:
+        if told["stage"] == stage:
             each = Born(**{k: told[k] for k in names})
             own = {k: _sort(v) for k, v in each.settings.items()}
             sorts = sorts or own

@@ -17,9 +17,9 @@ COMPLEMENT = ("gamma", "gae_lambda")
 
 
 def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
-    """Draw every phase that has something to show, as PNG and SVG; returns the files.
+    """Draw every stage that has something to show, as PNG and SVG; returns the files.
 
-    A phase that evolved: fitness by generation with the winner's family tree, and the path of each
+    A stage that evolved: fitness by generation with the winner's family tree, and the path of each
     setting. Any other: its return over the steps.
 
     Args:
@@ -34,8 +34,8 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
         raise MissingExtra("plotting", "plot") from error
     folder, written = out or run.path / "plots", []
     metrics = list(run.metrics())
-    for i, phase in enumerate(run.manifest["phases"]):
-        name, color = phase["name"], _hex(i)
+    for i, stage in enumerate(run.manifest["stages"]):
+        name, color = stage["name"], _hex(i)
         if lineage := read_lineage(run, name):
             figure = draw_lineage(Figure, lineage, name, color)
         else:
@@ -153,8 +153,8 @@ def _varies(born: Sequence[Born], setting: str) -> bool:
     return len({str(b.settings.get(setting)) for b in born}) > 1
 
 
-def _tells(metrics: dict[str, Any], phase: str) -> bool:
-    return metrics.get("phase") == phase and {"return", "steps"} <= metrics.keys()
+def _tells(metrics: dict[str, Any], stage: str) -> bool:
+    return metrics.get("stage") == stage and {"return", "steps"} <= metrics.keys()
 
 
 def _change(setting: str, old: Any, new: Any) -> str:

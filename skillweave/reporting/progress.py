@@ -19,10 +19,10 @@ RECENT = 10.0  # seconds of training over which the speed is taken
 
 
 class Progress:
-    """Shows each phase's steps, return (mean of the last 100 episodes), speed and time left.
+    """Shows each stage's steps, return (mean of the last 100 episodes), speed and time left.
 
     A context manager and a listener of the training loops. Without a terminal, in CI, and with
-    NO_COLOR or TERM=dumb, it writes a line when a phase begins, one about every 5 s, and one when
+    NO_COLOR or TERM=dumb, it writes a line when a stage begins, one about every 5 s, and one when
     it ends. With ``quiet`` it writes nothing.
     """
 
@@ -46,8 +46,8 @@ class Progress:
             self._bars.stop()
             self._bars = None
 
-    def phase(self, name: str, budget: int) -> None:
-        """A phase begins, or goes on; ``budget`` in environment steps."""
+    def stage(self, name: str, budget: int) -> None:
+        """A stage begins, or goes on; ``budget`` in environment steps."""
         self._budgets[name], self._shown = budget, time.monotonic()
         self._recent.clear()
         if self._bars is None:
@@ -73,11 +73,11 @@ class Progress:
         self._show(name, steps, metrics, f"{speed:,.0f} steps/s", f"{left} left")
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A phase is over."""
+        """A stage is over."""
         if self._quiet:
             return
         if name not in self._budgets:
-            self.phase(name, steps)
+            self.stage(name, steps)
         speed = f"{steps / max(seconds, 1e-9):,.0f} steps/s"
         self._show(name, steps, metrics, speed, f"done in {_clock(seconds)}")
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,12 +20,14 @@ from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds
-from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+from skillweave.training.play import Played, SeededEpisodes, play
+from skillweave.types import Array, Memory, Policy, SkillweaveError
 
 __all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
 HOLD = 1.0  # seconds that the last frame of an episode stands
+Label = Callable[[Memory], tuple[str, RGB]] | None
 
 
 def render_policy(
@@ -38,7 +39,7 @@ def render_policy(
     seed: int = 0,
     deterministic: bool = True,
     max_steps: int | None = None,
-    label: Callable[[Memory], tuple[str, RGB]] | None = None,
+    label: Label = None,
     fps: float | None = None,
     every: int = 2,
     rng: np.random.Generator | None = None,
@@ -66,62 +67,59 @@ def render_policy(
     limit = LONGEST_FILM if max_steps is None else whole_number(max_steps, "max_steps", 1)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen
-    act = functools.partial(
-        policy.act, deterministic=deterministic, rng=rng or (Seeds(seed) / "render").numpy()
-    )
-    env, told = env_spec.make(render_mode="rgb_array"), []
+    rng = rng or (Seeds(seed) / "render").numpy()
+    env = env_spec.make(render_mode="rgb_array")
     # Observations, infos and masks are those of an evaluation.
     engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
     try:
         with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
-            for i in range(episodes):
-                who, color, skills = "", BLACK, Counter[str]()
-                for now in _play(engine, policy, act, seed + i, limit):
-                    if label is not None and not now.over:
-                        who, color = label(now.memory)
-                        skills[who] += 1
-                    if now.over or now.elapsed % every == 0:
-                        word = "final return" if now.over else "return"
-                        text = f"step {now.elapsed}   {word} {now.total:+.1f}"
-                        frame = caption(_frame(env), who, color, text)
-                        video.add(frame, HOLD if now.over else None)
-                told.append(now.told(skills))
+            film = _Film(env, video, every, label)
+            whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
+            how: Any = {"deterministic": deterministic, "rng": rng}
+            for played in play(policy, whole, before_step=film.before_step, **how):
+                film.after_step(played)
     finally:
         engine.close()
-    return {"path": str(path), "frames": video.frames, "episodes": told}
+    return {"path": str(path), "frames": video.frames, "episodes": film.episodes}
 
 
-class _Moment(NamedTuple):
-    memory: Memory  # after acting, where the episode is not over
-    elapsed: int  # steps
-    total: float  # the return so far
-    over: bool
-    ended: bool = False  # the environment ended it
+class _Film:
+    """Frames of episodes as they are played, and what is told of each."""
 
-    def told(self, skills: Counter[str]) -> dict[str, Any]:
-        """The episode, at its end."""
-        how = {"return": self.total, "length": self.elapsed, "cut": not self.ended}
-        return how | {"skills": dict(skills)}
+    def __init__(
+        self, env: gym.Env[Any, Any], video: VideoWriter, every: int, label: Label
+    ) -> None:
+        self.env, self.video, self.every, self.label = env, video, every, label
+        self.episodes: list[dict[str, Any]] = []
+        self._begin()
 
+    def _begin(self) -> None:
+        self._elapsed, self._total = 0, 0.0
+        self._who, self._color, self._skills = "", BLACK, Counter[str]()
 
-def _play(
-    engine: GymnasiumEngine, policy: Policy, act: Callable[..., Any], seed: int, limit: int
-) -> Iterator[_Moment]:
-    """An episode: a moment before each step, when the action is chosen, and one at the end."""
-    obs = engine.reset_some(np.zeros(1, np.int64), [seed])
-    memory, total, elapsed, over = policy.start(1), 0.0, 0, False
-    while not over and elapsed < limit:
-        action, memory = act(memory, obs, engine.mask())
-        yield _Moment(memory, elapsed, total, False)
-        raw = engine.step(action)
-        elapsed, total = elapsed + 1, total + float(raw.reward[0])
-        over = bool(raw.terminated[0] | raw.truncated[0])
-        step = Step(
-            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            np.zeros(1, bool), np.array([elapsed]), raw.info,
-        )  # fmt: skip
-        obs, memory = raw.next_obs, policy.observe(memory, step)
-    yield _Moment(memory, elapsed, total, True, over)
+    def before_step(self, memory: Memory) -> None:
+        """Show what the policy is about to do."""
+        if self.label is not None:
+            self._who, self._color = self.label(memory)
+            self._skills[self._who] += 1
+        if self._elapsed % self.every == 0:
+            self._show("return")
+
+    def after_step(self, played: Played) -> None:
+        """Count the step, and show an episode's end."""
+        self._elapsed += 1
+        self._total += float(played.reward[0])
+        if played.over[0]:
+            self._show("final return", HOLD)
+            self.episodes.append({
+                "return": self._total, "length": self._elapsed, "cut": bool(played.cut[0]),
+                "skills": dict(self._skills),
+            })  # fmt: skip
+            self._begin()
+
+    def _show(self, word: str, seconds: float | None = None) -> None:
+        text = f"step {self._elapsed}   {word} {self._total:+.1f}"
+        self.video.add(caption(_frame(self.env), self._who, self._color, text), seconds)
 
 
 def _frame(env: gym.Env[Any, Any]) -> Array:

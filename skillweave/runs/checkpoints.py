@@ -1,4 +1,4 @@
-"""The checkpoints of the phase under way: the latest, and the one before it."""
+"""The checkpoints of the stage under way: the latest, and the one before it."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ class Checkpoints:
             raise
 
     def load(
-        self, phase: str, schema: Any, check: Callable[[dict[str, Any], Path], None]
+        self, stage: str, schema: Any, check: Callable[[dict[str, Any], Path], None]
     ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
-        """Tensors and header of a phase's latest good one, and its file; None: there is none yet.
+        """Tensors and header of a stage's latest good one, and its file; None: there is none yet.
 
         Args:
             schema: of its header.
             check: given a header and its file, raises where they do not belong here.
 
         Raises:
-            SkillweaveError: there are some of this phase, but none is good.
+            SkillweaveError: there are some of this stage, but none is good.
         """
         problems = []
         for path in self._files[1:]:
@@ -57,7 +57,7 @@ class Checkpoints:
                 continue
             try:
                 tensors, header = read_tensors(path)
-                if header.get("phase") != phase:
+                if header.get("stage") != stage:
                     continue
                 check(fit(schema, header, str(path)), path)
                 return tensors, header, path
@@ -65,23 +65,23 @@ class Checkpoints:
                 problems.append(str(error))
         if problems:
             raise SkillweaveError(
-                "; ".join(problems) + f". Delete it to train the phase {phase!r} from its start"
+                "; ".join(problems) + f". Delete it to train the stage {stage!r} from its start"
             )
         return None
 
     def drop(self) -> None:
-        """Remove them: their phase is done, and ``run.json`` says so."""
+        """Remove them: their stage is done, and ``run.json`` says so."""
         for path in self._files:
             remove(path)
 
     def clear(self, done: Sequence[str]) -> None:
-        """Put in order what a killed process left; ``done`` are the phases that need none."""
+        """Put in order what a killed process left; ``done`` are the stages that need none."""
         fresh, latest, _ = self._files
         if fresh.exists() and not latest.exists():  # killed between two renames: it is whole
             move(fresh, latest)
         remove(fresh)
         for path in self._files:
             with suppress(SkillweaveError):  # a damaged one is told when it is needed
-                if path.exists() and read_header(path).get("phase") in done:
+                if path.exists() and read_header(path).get("stage") in done:
                     read_tensors(path)  # not on the word of a damaged header
                     remove(path)

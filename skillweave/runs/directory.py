@@ -1,10 +1,10 @@
 """The run directory: what training writes and everything else reads (contract 9).
 
-run.json                     what is trained, with which settings, seeds and versions; phases
+run.json                     what is trained, with which settings, seeds and versions; stages
 metrics.jsonl                a line for every update
 lineage.jsonl                a line for every member of every generation, where populations evolve
-checkpoint.safetensors       the phase under way, at its latest clean cut (and the one before)
-policies/<phase>.safetensors finished phases
+checkpoint.safetensors       the stage under way, at its latest clean cut (and the one before)
+policies/<stage>.safetensors finished stages
 policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights
 .lock                        empty; locked by the process that trains the run
 
@@ -118,7 +118,7 @@ class RunDirectory:
         for directory in (self.path, self.path / "policies"):
             for path in directory.glob(TEMPORARY):
                 remove(path)
-        done = [p["name"] for p in self.manifest["phases"] if p["status"] == "done"]
+        done = [p["name"] for p in self.manifest["stages"] if p["status"] == "done"]
         self._checkpoints.clear(done)
 
     def save(self) -> None:
@@ -131,99 +131,105 @@ class RunDirectory:
         if self._lock is not None:
             self._lock.check()
 
-    def phase(self, name: str) -> dict[str, Any]:
-        """The manifest's entry of a phase: budget, algorithm, status, steps, seconds."""
-        for phase in self.manifest["phases"]:
-            if phase["name"] == name:
-                found: dict[str, Any] = phase
+    def stage(self, name: str) -> dict[str, Any]:
+        """The manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
+        for stage in self.manifest["stages"]:
+            if stage["name"] == name:
+                found: dict[str, Any] = stage
                 return found
-        names = ", ".join(p["name"] for p in self.manifest["phases"])
-        raise SkillweaveError(f"{self.path} has no phase {shown(name)}; it has: {names}")
+        names = ", ".join(p["name"] for p in self.manifest["stages"])
+        raise SkillweaveError(f"{self.path} has no stage {shown(name)}; it has: {names}")
 
     @property
     def finished(self) -> bool:
-        """Whether every phase is done."""
-        return all(p["status"] == "done" for p in self.manifest["phases"])
+        """Whether every stage is done."""
+        return all(p["status"] == "done" for p in self.manifest["stages"])
 
     def save_checkpoint(
-        self, state: Any, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
+        self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
     ) -> None:
-        """Write a dataclass of tensors as the latest clean cut; the one before stays beside it.
+        """Write a stage's latest clean cut; the one before stays beside it.
 
-        ``extra`` holds what else resuming needs: a replay buffer.
+        Args:
+            state: a dataclass of tensors; None: all is in ``extra``.
+            extra: what else resuming needs: environments, a replay buffer.
         """
-        tensors = {f.name: getattr(state, f.name) for f in fields(state)}
+        tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
-        header = self._place(header["phase"]) | header | {"metrics_bytes": self.metrics_size()}
+        header = self._place(header["stage"]) | header
+        header |= {"metrics_bytes": self.metrics_size(), "lineage_bytes": self.lineage.size}
         self._check()
         self._checkpoints.save(tensors, header)
 
     def drop_checkpoints(self) -> None:
-        """Remove the checkpoints of a phase that is done, and said to be so in ``run.json``."""
+        """Remove the checkpoints of a stage that is done, and said to be so in ``run.json``."""
         self._check()
         self._checkpoints.drop()
 
     def load_checkpoint(
-        self, kind: type[S], phase: str, like: S | None = None, schema: Any = Checkpoint
-    ) -> tuple[S, dict[str, Any], dict[str, Tensor]] | None:
-        """State, header and extra of a phase's latest good clean cut; None: there is none yet.
+        self, kind: type[S] | None, stage: str, like: S | None = None, schema: Any = Checkpoint
+    ) -> tuple[S | None, dict[str, Any], dict[str, Tensor]] | None:
+        """State, header and extra of a stage's latest good clean cut; None: there is none yet.
 
         Args:
+            kind: of the state, a dataclass of tensors; None: there is none.
             like: a state of the shapes and types that it must have.
             schema: of the header.
 
         Raises:
-            SkillweaveError: checkpoints of this phase exist, but none is good.
+            SkillweaveError: checkpoints of this stage exist, but none is good.
         """
-        found = self._checkpoints.load(phase, schema, self._must_be_ours)
+        found = self._checkpoints.load(stage, schema, self._must_be_ours)
         if found is None:
             return None
         tensors, header, path = found
         extra = unprefixed("extra", tensors)
         tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
-        names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
+        names = set() if kind is None else {f.name for f in fields(kind)}  # type: ignore[arg-type]
         if names != set(tensors):
             what = "finish the run with the version that began it, or delete the file to begin anew"
             raise SkillweaveError(f"{path} does not hold what this Skillweave resumes from: {what}")
+        if kind is None:
+            return None, header, extra
         state = kind(**tensors) if like is None else state_from(tensors, like, str(path))
         return state, header, extra
 
-    def save_policy(self, phase: str, policy: AgentPolicy) -> None:
-        """Write the policy of a finished phase; ``save`` then binds it to the run."""
+    def save_policy(self, stage: str, policy: AgentPolicy) -> None:
+        """Write the policy of a finished stage; ``save`` then binds it to the run."""
         self._check()
         tensors, header = policy.to_file()
-        path = self.policy_path(phase)
+        path = self.policy_path(stage)
         self._make(path.parent)
-        sha256 = write_tensors(path, tensors, header | self._place(phase), make_directories=False)
-        self.phase(phase)["sha256"] = sha256
+        sha256 = write_tensors(path, tensors, header | self._place(stage), make_directories=False)
+        self.stage(stage)["sha256"] = sha256
 
-    def _place(self, phase: str) -> dict[str, str]:
-        """What the header of a phase's file says of where it belongs."""
+    def _place(self, stage: str) -> dict[str, str]:
+        """What the header of a stage's file says of where it belongs."""
         run = self.manifest.get("id")  # runs of older versions have none
-        return {"phase": phase} | ({} if run is None else {"run": run})
+        return {"stage": stage} | ({} if run is None else {"run": run})
 
     def _must_be_ours(self, header: dict[str, Any], path: Path) -> None:
         run = self.manifest.get("id")
         if header.get("run", run) != run:
             raise SkillweaveError(f"{path} belongs to another run")
 
-    def load_policy(self, phase: str) -> AgentPolicy:
-        """The policy of a finished phase.
+    def load_policy(self, stage: str) -> AgentPolicy:
+        """The policy of a finished stage.
 
         Raises:
-            SkillweaveError: the phase is not finished, or its file is damaged.
+            SkillweaveError: the stage is not finished, or its file is damaged.
         """
-        entry = self.phase(phase)
+        entry = self.stage(stage)
         if entry["status"] != "done":
             raise SkillweaveError(
-                f"{self.path}: the phase {phase!r} is not finished; skillweave resume {self.path}"
+                f"{self.path}: the stage {stage!r} is not finished; skillweave resume {self.path}"
             )
-        path = self.policy_path(phase)
+        path = self.policy_path(stage)
         tensors, header, sha256 = read_signed(path)
         if header.get("kind") != "agent":
             raise SkillweaveError(f"{path} holds no agent's policy")
-        if header.get("phase", phase) != phase:
-            raise SkillweaveError(f"{path} holds the policy of phase {shown(header['phase'])}")
+        if header.get("stage", stage) != stage:
+            raise SkillweaveError(f"{path} holds the policy of stage {shown(header['stage'])}")
         self._must_be_ours(header, path)
         if entry.get("sha256", sha256) != sha256:
             raise SkillweaveError(
@@ -266,9 +272,9 @@ class RunDirectory:
     def _copy_path(self, skill: str, policy: Foreign) -> Path:
         return self.path / "policies" / f"{skill}{policy.suffix}"
 
-    def policy_path(self, phase: str) -> Path:
-        """Where a phase's policy lies."""
-        return self.path / "policies" / f"{phase}.safetensors"
+    def policy_path(self, stage: str) -> Path:
+        """Where a stage's policy lies."""
+        return self.path / "policies" / f"{stage}.safetensors"
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""

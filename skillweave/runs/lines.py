@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.reading import check_file, fit, shown
+from skillweave.runs.older import header_today
 from skillweave.types import SkillweaveError
 
 
@@ -83,6 +84,7 @@ class JsonLines:
                     raise SkillweaveError(
                         f"{self.path} is damaged in line {number}: {shown(record)} is no object"
                     )
+                record = header_today(record)
                 if self._schema is not None:
                     fit(self._schema, record, f"{self.path}, line {number}")
                 yield record

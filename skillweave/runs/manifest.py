@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from skillweave.algorithms.config import config_from_json
 from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
 from skillweave.runs.files import read_json
+from skillweave.runs.older import manifest_today
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign import Source
 from skillweave.types import SkillweaveError
@@ -36,7 +37,7 @@ class SkillEntry(TypedDict):
 
 
 class Winner(TypedDict):
-    """The member that a population's phase ended with."""
+    """The member that a population's stage ended with."""
 
     member: Count
     fitness: float
@@ -44,14 +45,35 @@ class Winner(TypedDict):
     generations: Count
 
 
-class PhaseEntry(TypedDict):
-    """A phase: what it is to train, and how far it is."""
+class TargetEntry(TypedDict):
+    """Where a stage may end before its budget is spent."""
+
+    of: Literal["return", "success"]
+    at_least: float
+
+
+class Reached(TypedDict):
+    """That a stage has reached its target: when, and with which value."""
+
+    steps: Count
+    value: float
+
+
+class StageEntry(TypedDict):
+    """A stage: who learns in it and who decides, for how many steps, and how far it is."""
 
     name: Name
+    kind: Literal["agent", "skill", "selector"]
+    learns: Annotated[list[Name], Asked("at least one name", bool)]
+    """Whose weights the stage changes: "agent", "selector" or a skill's name."""
+    decides: Name | None
+    """Who chooses among the skills; None: one acts all the time."""
     budget: Positive
     algorithm: dict[str, Any]
     status: Literal["waiting", "training", "done"]
     evolution: NotRequired[dict[str, Any] | None]
+    target: NotRequired[TargetEntry | None]
+    reached: NotRequired[Reached]
     metrics_bytes: NotRequired[Count]
     lineage_bytes: NotRequired[Count]
     steps: NotRequired[Count]
@@ -67,26 +89,31 @@ class PhaseEntry(TypedDict):
 class Manifest(TypedDict):
     """``run.json``."""
 
-    kind: Literal["hierarchy", "flat"]
+    kind: Literal["hierarchy", "agent"]
     env: Annotated[str, Asked("at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
     seed: Count
     cut_every: Positive
-    skills: list[SkillEntry]
-    call_steps: Positive | None
-    greedy_skills: bool
     needs_recipe: bool
-    phases: list[PhaseEntry]
+    stages: list[StageEntry]
     created: str
     versions: dict[str, str]
     id: NotRequired[str]
     eval_every: NotRequired[Positive | None]
     eval_episodes: NotRequired[Positive]
-    reflexes: NotRequired[list[str]]
-    reflexes_in_training: NotRequired[bool]
     resume_needs_recipe: NotRequired[bool]
     recipe: NotRequired[str | None]
     track: NotRequired[list[str]]
+
+
+class HierarchyManifest(Manifest):
+    """``run.json`` of a hierarchy."""
+
+    skills: list[SkillEntry]
+    call_steps: Positive | None
+    greedy_skills: bool
+    reflexes: NotRequired[list[str]]
+    reflexes_in_training: NotRequired[bool]
 
 
 class MemberEntry(TypedDict):
@@ -118,7 +145,7 @@ class BestEntry(TypedDict):
 class LineageLine(TypedDict):
     """A line of ``lineage.jsonl``: a member in a generation."""
 
-    phase: Name
+    stage: Name
     generation: Count
     member: Count
     parent: Count | None
@@ -132,7 +159,7 @@ class LineageLine(TypedDict):
 MetricsLine = TypedDict(
     "MetricsLine",
     {
-        "phase": NotRequired[Name],
+        "stage": NotRequired[Name],
         "update": NotRequired[Count],
         "steps": NotRequired[Count],
         "seconds": NotRequired[Seconds],
@@ -145,13 +172,14 @@ MetricsLine = TypedDict(
 class Checkpoint(TypedDict):
     """A checkpoint's header."""
 
-    phase: Name
+    stage: Name
     update: Count
     steps: Count
     evaluation_steps: Count
     seconds: Seconds
     metrics: dict[str, float | None]
     metrics_bytes: Count
+    lineage_bytes: NotRequired[Count]
     run: NotRequired[str]
 
 
@@ -159,7 +187,6 @@ class Generation(Checkpoint):
     """The header of a population's checkpoint."""
 
     fitness_steps: Count
-    lineage_bytes: Count
     generation: Count
     rounds: Count
     next_number: Count
@@ -170,15 +197,17 @@ class Generation(Checkpoint):
 def check_manifest(data: Mapping[str, Any], file: str) -> None:
     """Raise a SkillweaveError that names the file and the field where a manifest is wrong."""
     manifest = fit(Manifest, data, file)
-    for kind in ("skills", "phases"):
-        names = [entry["name"] for entry in manifest[kind]]
+    if manifest["kind"] == "hierarchy":
+        manifest = fit(HierarchyManifest, data, file)
+    for kind in ("skills", "stages"):
+        names = [entry["name"] for entry in manifest.get(kind, [])]
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise SkillweaveError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
-    for i, phase in enumerate(manifest["phases"]):
-        where = f"phases[{i}]"
-        config_from_json(phase["algorithm"], file, f"{where}.algorithm")
-        if phase["status"] == "done" and not {"steps", "seconds"} <= set(phase):
+    for i, stage in enumerate(manifest["stages"]):
+        where = f"stages[{i}]"
+        config_from_json(stage["algorithm"], file, f"{where}.algorithm")
+        if stage["status"] == "done" and not {"steps", "seconds"} <= set(stage):
             raise SkillweaveError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
     if "id" in data and "sha256" not in data:
         raise SkillweaveError(f"{file} is damaged: no field 'sha256', the checksum of it all")
@@ -187,7 +216,8 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
 def read_manifest(run: Path) -> dict[str, Any]:
     """The content of a run's ``run.json``, checked."""
     file = run / "run.json"
-    return read_json(file, lambda data: check_manifest(data, str(file)))
+    told = read_json(file, lambda data: check_manifest(manifest_today(data), str(file)))
+    return manifest_today(told)
 
 
 def identity(manifest: Mapping[str, Any]) -> str:

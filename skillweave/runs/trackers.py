@@ -22,7 +22,7 @@ class TensorBoard:
 
         self._writer: Any = SummaryWriter(str(run.path / "tensorboard"))
 
-    def phase(self, name: str, budget: int) -> None:
+    def stage(self, name: str, budget: int) -> None:
         """Nothing to say."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
@@ -57,8 +57,8 @@ class WandB:
             settings=wandb.Settings(silent=True),
         )
 
-    def phase(self, name: str, budget: int) -> None:
-        """Metrics of this phase are drawn over its own steps."""
+    def stage(self, name: str, budget: int) -> None:
+        """Metrics of this stage are drawn over its own steps."""
         self._run.define_metric(f"{name}/*", step_metric=f"{name}/steps")
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:

@@ -33,6 +33,9 @@ class Skill:
         steps: training budget in environment steps; None: the hierarchy's ``skill_steps``.
         algorithm: settings of the algorithm that trains it (its network is among them);
             None: the hierarchy's.
+        target_return: its training ends early at this mean return of the periodic evaluation (the
+            hierarchy's ``eval_every``); None: it takes all its steps.
+        target_success: the same for the share of successful episodes, from 0 to 1.
         policy: what acts without being trained: a function of observations (n, *obs_shape), which
             needs no ``staticmethod``, or a method ``policy(self, obs)``; a torch module;
             ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained. Where an
@@ -45,6 +48,8 @@ class Skill:
     max_steps: int | None = None
     steps: int | None = None
     algorithm: Any = None
+    target_return: float | None = None
+    target_success: float | None = None
     policy: Any = None
     color: tuple[int, int, int] | None = None
 

@@ -1,1 +1,1 @@
-"""The loops, phases, and evaluation."""
+"""The loops, stages, and evaluation."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from dataclasses import replace as replaced
 from typing import Any
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
-from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.messages import whole_number
 from skillweave.spaces import same_space
-from skillweave.types import Array, Policy, SkillweaveError, Step
+from skillweave.training.play import Played, SeededEpisodes, play
+from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
@@ -132,62 +131,31 @@ def evaluate(
     engine = make_engine(replaced(env, engine="sync"), n)
     try:
         _check_spaces(policy, engine.observation_space, engine.action_space, env.name)
-        rng = np.random.default_rng([seed, 1])
-        act = functools.partial(policy.act, deterministic=deterministic, rng=rng)
+        engine.reset(0)
         seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
-        return replaced(_play(policy, act, engine, seeds, limit), threshold=threshold)
+        moments = play(
+            policy,
+            SeededEpisodes(engine, seeds, limit),
+            deterministic=deterministic,
+            rng=np.random.default_rng([seed, 1]),
+        )
+        return replaced(_scored(policy, episodes, moments), threshold=threshold)
     finally:
         engine.close()
 
 
-def _play(
-    policy: Policy, act: Callable[..., Any], engine: Any, seeds: list[int], limit: int
-) -> Evaluation:
-    n, episodes, cut = engine.num_envs, len(seeds), 0
-    episode = np.arange(n)  # which episode each environment plays
-    upcoming = n
-    engine.reset(0)
-    obs = np.array(engine.reset_some(episode, seeds[:n]))
-    memory, rows, never = policy.start(n), np.arange(n), np.zeros(n, bool)
-    elapsed = np.zeros(n, np.int64)
-    returns, lengths = np.zeros(episodes), np.zeros(episodes, np.int64)
+def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluation:
+    """The scores of episodes as they are played."""
+    returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
     used = np.zeros(len(policy.labels), np.int64)
     calls = np.zeros(len(policy.labels), np.int64)
-    while len(rows):
-        own = {k: v[rows] for k, v in memory.items()}
-        here = obs[rows]
-        action, own = act(own, here, allowed_rows(engine.mask(), rows))
-        raw = engine.step(action, rows)
-        elapsed[rows] += 1
-        acting = policy.acting(own)
-        if acting is not None:
-            used += np.bincount(acting, minlength=len(used))
-            begun = own["elapsed"] == 0 if "elapsed" in own else np.zeros(len(rows), bool)
-            calls += np.bincount(acting[begun], minlength=len(calls))
-        step = Step(
-            here, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            never[rows], elapsed[rows], raw.info,
-        )  # fmt: skip
-        own = policy.observe(own, step)
-        for k, v in own.items():
-            memory[k][rows] = v
-        obs[rows] = raw.next_obs
-        returns[episode[rows]] += raw.reward
-        lengths[episode[rows]] += 1
-        over = raw.terminated | raw.truncated
-        late = ~over & (elapsed[rows] >= limit)
-        cut += int(late.sum())
-        ended = rows[over | late]
-        if len(ended):
-            fresh = ended[: max(0, episodes - upcoming)]
-            given = seeds[upcoming : upcoming + len(fresh)] + [0] * (len(ended) - len(fresh))
-            obs[ended] = engine.reset_some(ended, given)
-            episode[fresh] = np.arange(upcoming, upcoming + len(fresh))
-            upcoming += len(fresh)
-            elapsed[ended] = 0
-            for k, v in policy.start(n).items():
-                memory[k][ended] = v[ended]
-            rows = np.setdiff1d(rows, ended[len(fresh) :])
+    for played in moments:
+        returns[played.episode] += played.reward
+        lengths[played.episode] += played.lasted
+        cut += int(played.cut.sum())
+        if played.acting is not None:
+            used += np.bincount(played.acting, minlength=len(used))
+            calls += np.bincount(played.acting[played.begun], minlength=len(calls))
     return Evaluation(
         tuple(returns.tolist()),
         tuple(lengths.tolist()),

@@ -171,8 +171,8 @@ def test_train_prints_one_json_object_and_tells_progress_on_stderr(
     answer = call("train", trained.plain, "-o", tmp_path / "run", "--evaluate", 2, "--json")
     assert answer.code == 0
     assert answer.json["run"] == str(tmp_path / "run")
-    assert [p["name"] for p in answer.json["phases"]] == ["left", "balance", "selector"]
-    assert all(p["status"] == "done" for p in answer.json["phases"])
+    assert [p["name"] for p in answer.json["stages"]] == ["left", "balance", "selector"]
+    assert all(p["status"] == "done" for p in answer.json["stages"])
     assert set(answer.json["evaluation"]) >= KEYS
     assert "left: training for 256 steps" in answer.err
 
@@ -242,7 +242,7 @@ def test_scale_and_set_change_budgets_and_settings(
         "train", trained.plain, "-o", tmp_path / "run", "--scale", 0.5, "--evaluate", 0, "--json",
         "--set", "skills.left.steps=130", "--set", "selector.gamma=0.9", "--quiet",
     )  # fmt: skip
-    left, balance, selector = answer.json["phases"]
+    left, balance, selector = answer.json["stages"]
     assert (left["budget"], balance["budget"], selector["budget"]) == (65, 128, 256)
     assert selector["algorithm"]["gamma"] == 0.9
     assert left["algorithm"]["gamma"] == 0.995
@@ -263,10 +263,10 @@ def test_settings_that_only_fit_together_may_be_given_in_any_order(
 def test_the_flat_baseline_trains_on_as_many_steps_as_the_hierarchy(trained: Trained) -> None:
     hierarchy = json.loads((trained.coded_run / "run.json").read_text())
     flat = json.loads((trained.flat_run / "run.json").read_text())
-    (phase,) = flat["phases"]
-    assert flat["kind"] == "flat"
-    assert phase["budget"] == sum(p["budget"] for p in hierarchy["phases"]) == 256 + 256 + 512
-    assert phase["budget"] <= phase["steps"] < phase["budget"] + 64
+    (stage,) = flat["stages"]
+    assert flat["kind"] == "agent"
+    assert stage["budget"] == sum(p["budget"] for p in hierarchy["stages"]) == 256 + 256 + 512
+    assert stage["budget"] <= stage["steps"] < stage["budget"] + 64
 
 
 @pytest.fixture
@@ -297,7 +297,7 @@ def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
             "train", "lunar-lander", "-o", path, *small, *sets, "--evaluate", 0, "--json", "--quiet"
         )
         assert answer.code == 0, answer.err
-        assert {p["budget"] for p in answer.json["phases"]} == {50}
+        assert {p["budget"] for p in answer.json["stages"]} == {50}
     assert recipes.load("lunar-lander").total_steps == before
 
 
@@ -383,10 +383,10 @@ def test_resuming_a_finished_run_scores_it_and_trains_no_more(
     answer = call("resume", run, *arguments)
     assert answer.code == 0, answer.err
     assert answer.json["evaluation"]["episodes"] == 2
-    assert answer.json["phases"] == json.loads((run / "run.json").read_text())["phases"]
+    assert answer.json["stages"] == json.loads((run / "run.json").read_text())["stages"]
 
 
-def test_info_of_a_run_shows_its_phases_and_what_made_it(call: Call, trained: Trained) -> None:
+def test_info_of_a_run_shows_its_stages_and_what_made_it(call: Call, trained: Trained) -> None:
     answer = call("info", trained.coded_run)
     assert answer.code == 0
     assert "hierarchy on CartPole-v1, seed 0" in answer.out
@@ -416,7 +416,7 @@ def test_list_shows_recipes_and_the_runs_here_even_a_damaged_one(
     call: Call, trained: Trained
 ) -> None:
     shutil.copytree(trained.flat_run, "runs/flat")
-    for name, text in (("bad", "{"), ("poor", '{"schema": 1, "seed": 0, "phases": [], "env": ""}')):
+    for name, text in (("bad", "{"), ("poor", '{"schema": 1, "seed": 0, "stages": [], "env": ""}')):
         Path("runs", name).mkdir()
         Path("runs", name, "run.json").write_text(text)
     answer = call("list", "--json")
@@ -449,7 +449,7 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "episodes": (["evaluate", "RUN", "--episodes", "0"], 1, ["episodes", "at least 1"]),
     "final episodes": (["train", "PLAIN", "--evaluate", "-1"], 1, ["evaluate", "-1"]),
     "skill": (["evaluate", "RUN", "--skill", "lift"], 1, ["'lift'", "left, balance"]),
-    "flat skill": (["evaluate", "FLAT", "--skill", "left"], 1, ["flat"]),
+    "flat skill": (["evaluate", "FLAT", "--skill", "left"], 1, ["plain agent"]),
     "target": (["evaluate", "nothing"], 1, ["nothing is neither a run nor a weights file"]),
     "target is a recipe": (["evaluate", "lunar-lander"], 1, ["--pretrained"]),
     "no run": (["info", "."], 1, ["holds no run"]),

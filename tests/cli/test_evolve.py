@@ -44,7 +44,7 @@ def declared() -> Hierarchy:
     return Hierarchy("CartPole-v1", [Left()])
 
 
-def test_settings_become_a_plan_for_each_phase():
+def test_settings_become_a_plan_for_each_stage():
     plan = parse_evolve(
         ["population=5", "left.generations=7", "selection=truncation", "left.selection.share=0.4",
          "ranges.gamma=0.9,0.999,complement", "mutations.units=8,32", "target=200"],
@@ -64,7 +64,7 @@ def test_settings_become_a_plan_for_each_phase():
     assert only is not None
     assert only["left"] is None
     assert only["selector"].selection == Tournament(3)  # type: ignore[union-attr]
-    assert list(parse_evolve(["population=3"], declared(), True) or ()) == ["flat"]
+    assert list(parse_evolve(["population=3"], declared(), True) or ()) == ["agent"]
 
 
 @pytest.mark.parametrize(
@@ -98,15 +98,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_recipe_evolves_and_says_how_it_went(run: Path):
-    phases = {p["name"]: p for p in RunDirectory.open(run).manifest["phases"]}
-    assert {n: p["budget"] for n, p in phases.items()} == {
+    stages = {p["name"]: p for p in RunDirectory.open(run).manifest["stages"]}
+    assert {n: p["budget"] for n, p in stages.items()} == {
         "left": 3 * 128, "right": 2 * 128, "selector": 3 * 128,
     }  # fmt: skip
-    for name, phase in phases.items():
+    for name, stage in stages.items():
         lineage = read_lineage(RunDirectory.open(run), name)
         assert lineage is not None
-        assert lineage.winner.member == phase["winner"]["member"]
-        assert lineage.winner.generation == phase["winner"]["generation"]
+        assert lineage.winner.member == stage["winner"]["member"]
+        assert lineage.winner.generation == stage["winner"]["generation"]
 
 
 def test_the_winners_family_tree_reaches_back_to_the_start(run: Path):
@@ -141,7 +141,7 @@ def test_a_run_without_populations_shows_how_its_agents_learnt(tmp_path):
     out = tmp_path / "run"
     flags = ["-o", str(out), "--flat", "--evaluate", "0", "--quiet"]
     assert main(["train", str(tmp_path / "walk.py"), *flags]) == 0
-    assert [p.name for p in plot_run(RunDirectory.open(out))] == ["flat.png", "flat.svg"]
+    assert [p.name for p in plot_run(RunDirectory.open(out))] == ["agent.png", "agent.svg"]
 
 
 def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):
@@ -149,7 +149,7 @@ def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):
     empty = RunDirectory.create(tmp_path / "empty", manifest)
     with pytest.raises(SkillweaveError, match="nothing to draw yet"):
         plot_run(empty)
-    (empty.path / "lineage.jsonl").write_text('{"phase": "left"}\n')
+    (empty.path / "lineage.jsonl").write_text('{"stage": "left"}\n')
     with pytest.raises(SkillweaveError, match=r"lineage.jsonl, line 1 is damaged"):
         plot_run(empty)
 

@@ -165,22 +165,22 @@ def test_random_settings_cover_their_ranges_and_fit_together():
 @pytest.mark.parametrize(
     ("config", "evolution", "said"),
     [
-        (PPO(), Evolution(mutations=Mutations(ranges={})), "phase x: .*ranges is empty"),
+        (PPO(), Evolution(mutations=Mutations(ranges={})), "stage x: .*ranges is empty"),
         (
             PPO(network=Network(layer_norm=True)),
             Evolution(),
-            r"phase x: Mutations\.architecture is 0.2, but network has layer_norm",
+            r"stage x: Mutations\.architecture is 0.2, but network has layer_norm",
         ),
         (
             DQN(),
             Evolution(mutations=Mutations(ranges={"clip_coef": Range(0.1, 0.3)})),
-            "phase x: .*DQN has no setting 'clip_coef'",
+            "stage x: .*DQN has no setting 'clip_coef'",
         ),
     ],
 )
 def test_mutations_that_an_agent_does_not_have_are_refused(config, evolution, said):
     with pytest.raises(SkillweaveError, match=said):
-        check_mutations(config, evolution, "phase x: ")
+        check_mutations(config, evolution, "stage x: ")
 
 
 # SAC's temperature
@@ -212,7 +212,7 @@ def test_a_temperature_that_is_learnt_does_not_mutate():
     by = Evolution(mutations=Mutations(ranges={"ent_coef": Range(1e-3, 0.5)}))
     check_mutations(FIXED, by, "")
     with pytest.raises(SkillweaveError, match=r"ent_coef.*learn_ent_coef"):
-        check_mutations(learnt, by, "phase x: ")
+        check_mutations(learnt, by, "stage x: ")
 
 
 def test_a_limit_of_gradients_may_be_none_and_may_be_set():

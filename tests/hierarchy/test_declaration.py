@@ -57,8 +57,8 @@ WRONG = {
     "no name": (lambda: declare(named("")), "Custom.*no name"),
     "a name that is no file name": (lambda: declare(named("a/b")), "'a/b'.*Custom.*letters"),
     "two of one name": (lambda: declare(Center(), Center()), "two skills.*'center'"),
-    "the name of the selector": (lambda: declare(named("selector")), "'selector'.*phase"),
-    "the name of the baseline": (lambda: declare(named("flat")), "'flat'.*phase"),
+    "the name of the selector": (lambda: declare(named("selector")), "'selector'.*stage"),
+    "the name of the baseline": (lambda: declare(named("flat")), "'flat'.*stage"),
     "a class": (lambda: declare(Center), r"Center.*not a Skill.*write Center\(\), not Center"),
     "no skill at all": (lambda: declare("center"), "'center'.*not a Skill"),
     "max_steps=0": (lambda: declare(named("x", max_steps=0)), "'x'.*max_steps is 0"),
@@ -509,19 +509,19 @@ def test_a_hierarchy_as_a_skill_needs_a_proper_name(tmp_path, name):
 def test_a_budget_that_ends_before_learning_begins_is_refused(tmp_path, flat):
     late = DQN(learning_starts=500)
     h = Hierarchy("CartPole-v1", [Plain()], algorithm=late, skill_steps=500, flat_steps=500)
-    name = "flat" if flat else "plain"
-    says = f"phase '{name}': its budget is 500 steps, but it begins to learn only after 500"
+    name = "agent" if flat else "plain"
+    says = f"stage '{name}': its budget is 500 steps, but it begins to learn only after 500"
     with pytest.raises(SkillweaveError, match=says):
         h.train(tmp_path / "run", flat=flat)
     assert not (tmp_path / "run").exists()
 
 
 def test_each_members_budget_counts_not_the_populations(tmp_path):
-    phase = {"name": "x", "budget": 4_000, "algorithm": {"learning_starts": 1_000}}
-    check_budgets([phase])
+    stage = {"name": "x", "budget": 4_000, "algorithm": {"learning_starts": 1_000}}
+    check_budgets([stage])
     says = "'x'.*1,000 steps for each member, but it begins to learn only after 1,000"
     with pytest.raises(SkillweaveError, match=says):
-        check_budgets([phase | {"evolution": {"population": 4}}])
+        check_budgets([stage | {"evolution": {"population": 4}}])
     check_budgets([{"name": "x", "budget": 1, "algorithm": {}}])
 
 

@@ -135,11 +135,11 @@ def test_a_model_of_sb3_in_memory_is_kept_by_its_weights(tmp_path):
 
 
 def test_a_run_that_is_resumed_goes_on_with_what_it_has_kept(tmp_path, monkeypatch):
-    import skillweave.evolution.phase as training
+    import skillweave.evolution.stage as training
 
     whole = declare(skill("a", linear())).train(tmp_path / "whole", quiet=True)
     with monkeypatch.context() as patch:
-        patch.setattr(training, "train_phase", lambda *_: 1 / 0)
+        patch.setattr(training, "train_stage", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             declare(skill("a", linear())).train(tmp_path / "cut", quiet=True)
     resumed = declare(skill("a", linear(-WEIGHT))).resume(tmp_path / "cut", quiet=True)
@@ -203,7 +203,7 @@ def test_a_policy_of_ones_own_class_is_only_named(tmp_path):
 
 def test_the_flat_baseline_leaves_foreign_skills_alone(tmp_path):
     run = declare(skill("a", linear())).train(tmp_path / "run", flat=True, quiet=True)
-    assert {p.name for p in (run.path / "policies").iterdir()} == {"flat.safetensors"}
+    assert {p.name for p in (run.path / "policies").iterdir()} == {"agent.safetensors"}
     declare(skill("a", linear(-WEIGHT))).load(run.path)
 
 

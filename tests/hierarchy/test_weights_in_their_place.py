@@ -40,8 +40,8 @@ def run(trained: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def policy(run: Path, phase: str) -> Path:
-    return run / "policies" / f"{phase}.safetensors"
+def policy(run: Path, stage: str) -> Path:
+    return run / "policies" / f"{stage}.safetensors"
 
 
 def test_swapped_skills_are_refused(run: Path) -> None:
@@ -57,10 +57,10 @@ def older(run: Path) -> None:
     """The run as a version wrote it that bound no files."""
     data = read_json(run / "run.json")
     data.pop("id")
-    for entry in data["phases"]:
+    for entry in data["stages"]:
         entry.pop("sha256")
         tensors, header = read_tensors(policy(run, entry["name"]))
-        plain = {k: v for k, v in header.items() if k not in ("run", "phase")}
+        plain = {k: v for k, v in header.items() if k not in ("run", "stage")}
         write_tensors(policy(run, entry["name"]), tensors, plain)
     write_json(run / "run.json", data)
 
@@ -77,7 +77,7 @@ def test_of_an_older_run_a_selector_in_the_place_of_a_skill_is_refused(run: Path
 
 
 def test_a_selector_alone_is_no_flat_agent(run: Path) -> None:
-    with pytest.raises(SkillweaveError, match="holds the policy of phase 'selector' alone"):
+    with pytest.raises(SkillweaveError, match="holds the policy of stage 'selector' alone"):
         declare(("left", "right")).load_weights(policy(run, "selector"))
 
 
@@ -89,7 +89,7 @@ def test_weights_that_are_not_finite_are_refused_by_name(
     tensors, header = read_tensors(policy(run, "selector"))
     tensors[name].view(-1)[0] = value
     data = read_json(run / "run.json")
-    data["phases"][-1]["sha256"] = write_tensors(policy(run, "selector"), tensors, header)
+    data["stages"][-1]["sha256"] = write_tensors(policy(run, "selector"), tensors, header)
     write_json(run / "run.json", data)
     with pytest.raises(SkillweaveError, match=f"tensor {name} holds NaN or infinity"):
         declare().load(run)
@@ -104,7 +104,7 @@ def test_weights_of_another_type_are_refused_by_name(run: Path) -> None:
     tensors, header = read_tensors(policy(run, "left"))
     tensors["actor.0.weight"] = tensors["actor.0.weight"].double()
     data = read_json(run / "run.json")
-    data["phases"][0]["sha256"] = write_tensors(policy(run, "left"), tensors, header)
+    data["stages"][0]["sha256"] = write_tensors(policy(run, "left"), tensors, header)
     write_json(run / "run.json", data)
     says = r"tensor actor\.0\.weight should hold torch\.float32, found torch\.float64"
     with pytest.raises(SkillweaveError, match=says):

@@ -50,7 +50,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 def train(progress: Progress, clock: Clock, name: str = "landing", every: float = 0.5) -> None:
     """20 s of training at 1,000 steps/s, an update each half second."""
-    progress.phase(name, 20_000)
+    progress.stage(name, 20_000)
     for i in range(1, int(20 / every) + 1):
         clock.now += every
         spent = every * i
@@ -77,7 +77,7 @@ def test_plain_lines(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_speed_is_the_recent_one(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with Progress() as progress:
-        progress.phase("landing", 100_000)
+        progress.stage("landing", 100_000)
         progress.tick("landing", 50_000, 500.0, {})  # resumed; it was slow before
         clock.now += 6
         progress.tick("landing", 62_000, 506.0, {})
@@ -88,7 +88,7 @@ def test_speed_is_the_recent_one(clock: Clock, capsys: pytest.CaptureFixture[str
     assert lines[-1] == "landing: 72,000 of 100,000 steps (72%), 500 steps/s, 0:56 left"
 
 
-def test_a_phase_done_without_a_start(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stage_done_without_a_start(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress() as progress:
         progress.done("landing", 5_000, 7322.0, {"return": -1.25})
     assert "return -1.2, 1 steps/s, done in 2:02:02" in capsys.readouterr().err
@@ -117,13 +117,13 @@ def screen(terminal: Terminal) -> list[str]:
     return [line.rstrip() for line in re.split(r"[\r\n]+", text) if line.strip()]
 
 
-def test_bars_keep_finished_phases(
+def test_bars_keep_finished_stages(
     clock: Clock, terminal: Terminal, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with redirect_stderr(terminal), Progress() as progress:
         progress.message("run: runs/[7]")
         train(progress, clock)
-        progress.phase("selector", 2_000_000)
+        progress.stage("selector", 2_000_000)
         clock.now += 1
         progress.tick("selector", 500_000, 50.0, {"return": 12.0})
     lines = screen(terminal)
@@ -157,7 +157,7 @@ def test_the_display_ends_with_an_error(clock: Clock, terminal: Terminal) -> Non
 
     def interrupted() -> None:
         with progress:
-            progress.phase("landing", 10)
+            progress.stage("landing", 10)
             raise KeyboardInterrupt
 
     with redirect_stderr(terminal):

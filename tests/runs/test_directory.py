@@ -28,7 +28,7 @@ from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
-PHASES = [
+STAGES = [
     {"name": "landing", "status": "training", "budget": 10, "algorithm": ALGORITHM},
     {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM},
 ]
@@ -47,7 +47,7 @@ def manifest() -> dict[str, Any]:
         "greedy_skills": True,
         "reflexes": [],
         "needs_recipe": False,
-        "phases": [dict(p) for p in PHASES],
+        "stages": [dict(p) for p in STAGES],
     }
 
 
@@ -77,9 +77,9 @@ def damage(path: Path) -> None:
     path.write_bytes(data)
 
 
-def save(run: RunDirectory, seed: int, phase: str = "landing") -> Learnt:
+def save(run: RunDirectory, seed: int, stage: str = "landing") -> Learnt:
     state = learnt(seed)
-    run.save_checkpoint(state, {"phase": phase, "update": seed, "steps": 10 * seed} | AT)
+    run.save_checkpoint(state, {"stage": stage, "update": seed, "steps": 10 * seed} | AT)
     return state
 
 
@@ -145,15 +145,15 @@ def test_a_run_without_one_of_its_fields_is_damaged_and_the_field_is_named(
     assert str(path) in str(caught.value)
 
 
-def test_an_unknown_phase_is_answered_with_those_there_are(run: RunDirectory) -> None:
+def test_an_unknown_stage_is_answered_with_those_there_are(run: RunDirectory) -> None:
     with pytest.raises(SkillweaveError, match="'ladning'; it has: landing, selector"):
-        run.phase("ladning")
+        run.stage("ladning")
 
 
-def test_a_run_is_finished_when_every_phase_is_done(run: RunDirectory) -> None:
-    run.phase("landing").update(status="done", steps=1, seconds=1.0)
+def test_a_run_is_finished_when_every_stage_is_done(run: RunDirectory) -> None:
+    run.stage("landing").update(status="done", steps=1, seconds=1.0)
     assert not run.finished
-    run.phase("selector").update(status="done", steps=1, seconds=1.0)
+    run.stage("selector").update(status="done", steps=1, seconds=1.0)
     assert run.finished
     run.save()
     assert RunDirectory.open(run.path).finished
@@ -223,7 +223,7 @@ def test_two_damaged_checkpoints_are_an_error_that_names_both(run: RunDirectory)
     assert all(str(p) in str(caught.value) for p in paths)
 
 
-def test_checkpoints_of_another_phase_are_ignored(run: RunDirectory) -> None:
+def test_checkpoints_of_another_stage_are_ignored(run: RunDirectory) -> None:
     mine = save(run, 1, "landing")
     assert run.load_checkpoint(Learnt, "selector") is None
     save(run, 2, "selector")
@@ -237,7 +237,7 @@ def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None
     class Other:
         bias: Tensor
 
-    at = {"phase": "landing", "update": 1, "steps": 1} | AT
+    at = {"stage": "landing", "update": 1, "steps": 1} | AT
     run.save_checkpoint(Other(torch.zeros(1)), at)
     with pytest.raises(SkillweaveError, match="does not hold what this Skillweave resumes from"):
         run.load_checkpoint(Learnt, "landing")
@@ -279,7 +279,7 @@ def policy() -> AgentPolicy:
 
 def test_a_finished_policy_comes_back_exactly(run: RunDirectory, policy: AgentPolicy) -> None:
     run.save_policy("landing", policy)
-    run.phase("landing")["status"] = "done"
+    run.stage("landing")["status"] = "done"
     found = run.load_policy("landing")
     assert found.weights.keys() == policy.weights.keys()
     assert all(torch.equal(found.weights[k], v) for k, v in policy.weights.items())
@@ -287,14 +287,14 @@ def test_a_finished_policy_comes_back_exactly(run: RunDirectory, policy: AgentPo
     assert (found.act({}, obs)[0] == policy.act({}, obs)[0]).all()
 
 
-def test_a_policy_of_an_unfinished_phase_says_how_to_finish_it(run: RunDirectory) -> None:
+def test_a_policy_of_an_unfinished_stage_says_how_to_finish_it(run: RunDirectory) -> None:
     with pytest.raises(SkillweaveError, match="'landing' is not finished; skillweave resume"):
         run.load_policy("landing")
 
 
 def test_a_damaged_policy_is_named(run: RunDirectory, policy: AgentPolicy) -> None:
     run.save_policy("landing", policy)
-    run.phase("landing")["status"] = "done"
+    run.stage("landing")["status"] = "done"
     damage(run.policy_path("landing"))
     with pytest.raises(SkillweaveError, match="damaged") as caught:
         run.load_policy("landing")
@@ -305,7 +305,7 @@ def test_a_checkpoint_in_the_place_of_a_policy_is_refused_by_name(run: RunDirect
     save(run, 1)
     run.policy_path("landing").parent.mkdir()
     (run.path / "checkpoint.safetensors").rename(run.policy_path("landing"))
-    run.phase("landing")["status"] = "done"
+    run.stage("landing")["status"] = "done"
     with pytest.raises(SkillweaveError) as caught:
         run.load_policy("landing")
     assert str(run.policy_path("landing")) in str(caught.value)
@@ -315,12 +315,12 @@ def test_a_checkpoint_in_the_place_of_a_policy_is_refused_by_name(run: RunDirect
 
 
 def test_metrics_come_back_in_order(run: RunDirectory) -> None:
-    records = [{"phase": "landing", "update": i, "loss": i / 3} for i in range(5)]
+    records = [{"stage": "landing", "update": i, "loss": i / 3} for i in range(5)]
     for record in records:
         run.log(record)
     assert list(run.metrics()) == records
     run.close()
-    run.log({"phase": "landing", "update": 5})
+    run.log({"stage": "landing", "update": 5})
     assert [r["update"] for r in RunDirectory.open(run.path).metrics()] == [0, 1, 2, 3, 4, 5]
 
 
@@ -390,17 +390,17 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda m: m.update(phases=5), "phases is 5; it must be a list"),
+        (lambda m: m.update(stages=5), "stages is 5; it must be a list"),
         (
-            lambda m: m["phases"][0].update(status=5),
-            "phases[0].status is 5; it must be one of wait",
+            lambda m: m["stages"][0].update(status=5),
+            "stages[0].status is 5; it must be one of wait",
         ),
-        (lambda m: m["phases"][0].pop("status"), "damaged: phases[0] has no field 'status'"),
-        (lambda m: m["phases"][0].update(status="done"), "phases[0] is done, but has no field 's"),
-        (lambda m: m["phases"][1].update(name="landing"), "phases[1].name is 'landing', a second"),
+        (lambda m: m["stages"][0].pop("status"), "damaged: stages[0] has no field 'status'"),
+        (lambda m: m["stages"][0].update(status="done"), "stages[0] is done, but has no field 's"),
+        (lambda m: m["stages"][1].update(name="landing"), "stages[1].name is 'landing', a second"),
         (
-            lambda m: m["phases"][1].update(name="../../x"),
-            "phases[1].name is '../../x'; it must be",
+            lambda m: m["stages"][1].update(name="../../x"),
+            "stages[1].name is '../../x'; it must be",
         ),
         (lambda m: m["skills"].__setitem__(0, None), "skills[0] is None; it must be an object"),
         (lambda m: m.update(cut_every=[[]]), "cut_every is [[]]; it must be a whole number"),
@@ -408,16 +408,16 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
         (lambda m: m.update(seed=-1), "seed is -1; it must be at least 0"),
         (lambda m: m.update(kind="x" * 10_000), "kind is 'xxx"),
         (
-            lambda m: m["phases"][0]["algorithm"].update(gamma="a"),
-            "phases[0].algorithm.gamma is 'a'; it must be a finite number",
+            lambda m: m["stages"][0]["algorithm"].update(gamma="a"),
+            "stages[0].algorithm.gamma is 'a'; it must be a finite number",
         ),
         (
-            lambda m: m["phases"][0]["algorithm"].update(gamma=2.0),
-            "phases[0].algorithm: PPO.gamma is 2.0; it must be between 0 and 1",
+            lambda m: m["stages"][0]["algorithm"].update(gamma=2.0),
+            "stages[0].algorithm: PPO.gamma is 2.0; it must be between 0 and 1",
         ),
         (
-            lambda m: m["phases"][0]["algorithm"]["network"].update(hidden=[[]]),
-            "phases[0].algorithm.network.hidden[0] is []; it must be a whole number",
+            lambda m: m["stages"][0]["algorithm"]["network"].update(hidden=[[]]),
+            "stages[0].algorithm.network.hidden[0] is []; it must be a whole number",
         ),
     ],
 )
@@ -453,12 +453,12 @@ def test_a_run_json_that_is_no_plain_file_is_refused(tmp_path: Path) -> None:
         RunDirectory.open(tmp_path)
 
 
-# Files belong to their run and phase
+# Files belong to their run and stage
 
 
 def finished(run: RunDirectory, *policies: AgentPolicy) -> None:
-    """Every phase of the run, done."""
-    for entry, policy in zip(run.manifest["phases"], policies, strict=True):
+    """Every stage of the run, done."""
+    for entry, policy in zip(run.manifest["stages"], policies, strict=True):
         run.save_policy(entry["name"], policy)
         entry.update(status="done", steps=1, seconds=1.0)
     run.save()
@@ -469,11 +469,11 @@ def other(policy: AgentPolicy, seed: int = 1) -> AgentPolicy:
     return AgentPolicy.of(policy.algorithm, policy.algorithm.init([Seeds(seed)]))
 
 
-def test_a_policy_of_another_phase_is_refused(run: RunDirectory, policy: AgentPolicy) -> None:
+def test_a_policy_of_another_stage_is_refused(run: RunDirectory, policy: AgentPolicy) -> None:
     finished(run, policy, other(policy))
     a, b = run.policy_path("landing"), run.policy_path("selector")
     a.write_bytes(b.read_bytes())
-    with pytest.raises(SkillweaveError, match=r"landing.*holds the policy of phase 'selector'"):
+    with pytest.raises(SkillweaveError, match=r"landing.*holds the policy of stage 'selector'"):
         RunDirectory.open(run.path).load_policy("landing")
 
 
@@ -508,15 +508,15 @@ def test_equal_runs_have_the_same_identity_and_equal_files(
     assert again.manifest["id"] == run.manifest["id"] != other_seed.manifest["id"]
     for one in (run, again):
         finished(one, policy, policy)
-    for phase in ("landing", "selector"):
-        assert again.policy_path(phase).read_bytes() == run.policy_path(phase).read_bytes()
+    for stage in ("landing", "selector"):
+        assert again.policy_path(stage).read_bytes() == run.policy_path(stage).read_bytes()
 
 
 def test_a_run_of_an_older_version_still_loads(run: RunDirectory, policy: AgentPolicy) -> None:
-    for phase in ("landing", "selector"):
-        path = run.policy_path(phase)
-        write_tensors(path, *policy.to_file())  # neither run nor phase in its header
-        run.phase(phase).update(status="done", steps=1, seconds=1.0)
+    for stage in ("landing", "selector"):
+        path = run.policy_path(stage)
+        write_tensors(path, *policy.to_file())  # neither run nor stage in its header
+        run.stage(stage).update(status="done", steps=1, seconds=1.0)
     del run.manifest["id"]
     run.save()
     assert RunDirectory.open(run.path).load_policy("landing").source() == policy.source()
@@ -602,11 +602,11 @@ def test_a_process_that_is_killed_holds_the_run_no_longer(run: RunDirectory, wor
 def test_what_another_process_did_in_between_is_seen(run: RunDirectory) -> None:
     second = RunDirectory.open(run.path)
     run.begin()
-    run.phase("landing").update(status="done", steps=5, seconds=1.0)
+    run.stage("landing").update(status="done", steps=5, seconds=1.0)
     run.save()
     run.close()
     second.begin()
-    assert second.phase("landing")["status"] == "done"
+    assert second.stage("landing")["status"] == "done"
     second.close()
 
 
@@ -644,11 +644,11 @@ def test_a_checkpoint_between_its_two_renames_is_not_lost(run: RunDirectory) -> 
     assert_same(found[0], state)
 
 
-def test_checkpoints_go_when_their_phase_is_done_and_not_before(run: RunDirectory) -> None:
+def test_checkpoints_go_when_their_stage_is_done_and_not_before(run: RunDirectory) -> None:
     save(run, 1, "landing")
     save(run, 2, "landing")
     save(run, 3, "selector")  # the one before is landing's
-    run.phase("landing").update(status="done", steps=5, seconds=1.0)
+    run.stage("landing").update(status="done", steps=5, seconds=1.0)
     run.save()
     run.begin()
     assert not (run.path / "checkpoint.previous.safetensors").exists()
@@ -711,7 +711,7 @@ def test_a_checkpoint_that_cannot_be_renamed_is_an_error_for_people(
 def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     run: RunDirectory, field: str
 ) -> None:
-    header: dict[str, Any] = {"phase": "landing", "update": 1, "steps": 1} | AT
+    header: dict[str, Any] = {"stage": "landing", "update": 1, "steps": 1} | AT
     origin = {"parent": None, "mutation": "start", "changes": {"gamma": [0.9, 0.99]}}
     member = {"number": 0, "steps": 1, "config": ALGORITHM, "origin": origin}
     best = {"fitness": 1.0, "number": 0, "generation": 0, "policy": {}}

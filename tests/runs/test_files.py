@@ -271,13 +271,13 @@ def test_what_json_cannot_hold_is_an_error_that_names_the_file(tmp_path: Path) -
 @pytest.fixture
 def tensors(tmp_path: Path) -> Path:
     path = tmp_path / "policy.safetensors"
-    write_tensors(path, TENSORS, {"phase": "landing", "steps": 12})
+    write_tensors(path, TENSORS, {"stage": "landing", "steps": 12})
     return path
 
 
 def test_tensors_and_header_come_back_bit_for_bit(tensors: Path) -> None:
     found, header = read_tensors(tensors)
-    assert header == {"schema": SCHEMA, "phase": "landing", "steps": 12}
+    assert header == {"schema": SCHEMA, "stage": "landing", "steps": 12}
     assert found.keys() == TENSORS.keys()
     for name, value in TENSORS.items():
         assert found[name].dtype == value.dtype
@@ -312,7 +312,7 @@ def test_a_header_that_is_nested_deep_or_no_object_is_damaged(tmp_path: Path, te
 
 def test_the_same_content_gives_the_same_bytes(tensors: Path) -> None:
     again = tensors.with_name("again.safetensors")
-    write_tensors(again, dict(reversed(TENSORS.items())), {"steps": 12, "phase": "landing"})
+    write_tensors(again, dict(reversed(TENSORS.items())), {"steps": 12, "stage": "landing"})
     assert again.read_bytes() == tensors.read_bytes()
 
 

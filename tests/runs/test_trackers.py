@@ -18,7 +18,7 @@ from skillweave.types import MissingExtra, SkillweaveError
 
 @pytest.fixture
 def run(tmp_path: Path) -> RunDirectory:
-    return RunDirectory.create(tmp_path / "run", {"env": "CartPole-v1", "seed": 0, "phases": []})
+    return RunDirectory.create(tmp_path / "run", {"env": "CartPole-v1", "seed": 0, "stages": []})
 
 
 def test_no_trackers_are_made_where_none_are_named(run: RunDirectory) -> None:
@@ -65,7 +65,7 @@ def test_tensorboard_gets_every_scalar_over_environment_steps(run: RunDirectory)
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     (tracker,) = make_trackers(("tensorboard",), run)
-    tracker.phase("landing", 1000)
+    tracker.stage("landing", 1000)
     tracker.tick("landing", 128, 0.5, {"return": 1.5, "kl": 0.25})
     tracker.tick("landing", 256, 1.0, {"return": 2.5, "kl": 0.5})
     tracker.done("landing", 256, 1.0, {"return": 2.5})
@@ -83,9 +83,9 @@ from pathlib import Path
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 
-run = RunDirectory.create(Path(sys.argv[1]), {"env": "CartPole-v1", "seed": 0, "phases": []})
+run = RunDirectory.create(Path(sys.argv[1]), {"env": "CartPole-v1", "seed": 0, "stages": []})
 (tracker,) = make_trackers(("wandb",), run)
-tracker.phase("landing", 1000)
+tracker.stage("landing", 1000)
 tracker.tick("landing", 128, 0.5, {"return": 1.5})
 tracker.done("landing", 128, 0.5, {"return": 1.5})
 tracker.close()

@@ -12,7 +12,7 @@ from skillweave.runs.files import write_json, write_tensors
 def make_run(path, seconds):
     """What a finished run looks like."""
     lines = [
-        {"phase": "flat", "update": i, "return": 2.0 * i, "seconds": i * seconds} for i in (1, 2)
+        {"stage": "flat", "update": i, "return": 2.0 * i, "seconds": i * seconds} for i in (1, 2)
     ]
     path.mkdir()
     (path / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in lines))
@@ -22,7 +22,7 @@ def make_run(path, seconds):
         "metrics_bytes": int(seconds),
         "final": {"return": 4},
     }
-    write_json(path / "run.json", {"seed": 3, "created": str(seconds), "phases": [final]})
+    write_json(path / "run.json", {"seed": 3, "created": str(seconds), "stages": [final]})
     write_tensors(
         path / "policies" / "flat.safetensors", {"w": torch.arange(3.0)}, {"kind": "agent"}
     )

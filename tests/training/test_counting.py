@@ -54,8 +54,8 @@ def made(monkeypatch):
 
 
 def reported(run: sw.Run) -> int:
-    phases = run.info()["phases"]
-    return sum(p["steps"] + p["evaluation_steps"] for p in phases)
+    stages = run.info()["stages"]
+    return sum(p["steps"] + p["evaluation_steps"] for p in stages)
 
 
 def hierarchy(**settings) -> sw.Hierarchy:
@@ -75,7 +75,7 @@ def hierarchy(**settings) -> sw.Hierarchy:
 def test_the_search_for_a_start_is_reported_and_counts_against_the_budget(settings, made, tmp_path):
     run = hierarchy(**settings).train(tmp_path / "run", quiet=True)
     assert reported(run) == made[0]
-    late, always, selector = run.info()["phases"]
+    late, always, selector = run.info()["stages"]
     assert late["steps"] <= 600 + 4 * 16 * 14, "a rollout, each step of it perhaps a search"
     assert always["steps"] <= 600 + 4 * 16
     assert selector["steps"] <= 600 + 4 * 16 + 4 * 3
@@ -90,7 +90,7 @@ def test_the_fitness_of_a_population_is_reported_and_counts_against_the_budget(
     spec = sw.EnvSpec(Walk, engine="sync")
     run = sw.train_agent(spec, algorithm, 800, tmp_path / "run", quiet=True, evolve=search)
     assert reported(run) == made[0]
-    (entry,) = run.info()["phases"]
+    (entry,) = run.info()["stages"]
     assert entry["budget"] == 2400
     # The first generation could not know what fitness takes: 3 members and the best, 5 episodes.
     assert 2000 <= entry["steps"] <= 2400 + 3 * 64 + 4 * 100
@@ -111,7 +111,7 @@ def test_what_a_killed_and_resumed_run_made_again_is_not_reported_twice(made, tm
         with pytest.raises(Stop):
             hierarchy(cut_every=150).train(tmp_path / "broken", quiet=True)
     again = hierarchy(cut_every=150).resume(tmp_path / "broken", quiet=True)
-    ours, theirs = ([p["steps"] for p in r.info()["phases"]] for r in (again, whole))
+    ours, theirs = ([p["steps"] for p in r.info()["stages"]] for r in (again, whole))
     assert ours == theirs
 
 
@@ -129,7 +129,7 @@ def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
     run = declared.train(tmp_path / "run", quiet=True)
     updates = sum(1 for _ in RunDirectory.open(run.path).metrics())
     assert updates >= 150 / 20
-    assert run.info()["phases"][0]["steps"] <= declared.selector_steps + 64 * 64 + 64 * 40
+    assert run.info()["stages"][0]["steps"] <= declared.selector_steps + 64 * 64 + 64 * 40
 
 
 @pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
@@ -159,5 +159,5 @@ def test_a_population_whose_budget_ends_it_early_says_so(tmp_path, capsys):
     search = sw.Evolution(population=2, generations=5, episodes=20)
     spec = sw.EnvSpec(Walk, engine="sync")
     run = sw.train_agent(spec, SMALL, 300, tmp_path / "run", evolve=search)
-    assert run.info()["phases"][0]["winner"]["generations"] < 5
+    assert run.info()["stages"][0]["winner"]["generations"] < 5
     assert "of 5 generations: measuring fitness counts, too" in capsys.readouterr().err

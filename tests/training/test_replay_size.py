@@ -17,8 +17,8 @@ class Left(Skill):
 @pytest.mark.parametrize(
     ("how", "says"),
     [
-        ({"algorithm": DQN(**HUGE)}, r"phase 'left': .*lower buffer_size"),
-        ({"selector": SAC(**HUGE)}, r"phase 'selector': .*lower buffer_size"),
+        ({"algorithm": DQN(**HUGE)}, r"stage 'left': .*lower buffer_size"),
+        ({"selector": SAC(**HUGE)}, r"stage 'selector': .*lower buffer_size"),
     ],
 )
 def test_a_hierarchy_whose_buffer_is_larger_than_the_memory_makes_no_run(tmp_path, how, says):
@@ -30,7 +30,7 @@ def test_a_hierarchy_whose_buffer_is_larger_than_the_memory_makes_no_run(tmp_pat
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
 def test_an_agent_whose_buffer_is_larger_than_the_memory_makes_no_run(tmp_path, env):
-    with pytest.raises(SkillweaveError, match=r"phase 'flat': .*lower buffer_size"):
+    with pytest.raises(SkillweaveError, match=r"stage 'agent': .*lower buffer_size"):
         train_agent(env, SAC(**HUGE), 100, tmp_path / "run", quiet=True)
     assert list(tmp_path.iterdir()) == []
 
@@ -38,6 +38,6 @@ def test_an_agent_whose_buffer_is_larger_than_the_memory_makes_no_run(tmp_path, 
 def test_a_population_whose_members_share_too_small_a_buffer_makes_no_run(tmp_path):
     # One agent's 4 environments fit into 10 transitions; three agents' 12 do not.
     config, evolve = DQN(**SMALL, buffer_size=10), Evolution(population=3, generations=2)
-    with pytest.raises(SkillweaveError, match=r"phase 'flat': .*at least num_envs, 12"):
+    with pytest.raises(SkillweaveError, match=r"stage 'agent': .*at least num_envs, 12"):
         train_agent("CartPole-v1", config, 100, tmp_path / "run", quiet=True, evolve=evolve)
     assert list(tmp_path.iterdir()) == []

@@ -1,12 +1,14 @@
-"""A phase in which a population evolves, generation by generation, in a run directory.
+"""A stage in which a population evolves, generation by generation, in a run directory.
 
-Beside what every phase writes, ``lineage.jsonl`` gets a line for each member of each generation.
+Beside what every stage writes, ``lineage.jsonl`` gets a line for each member of each generation.
 A generation is one piece: a run that was killed goes on from the last complete one.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,33 +17,21 @@ from torch import Tensor
 
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
-from skillweave.evolution.config import Evolution, evolution_from_json
+from skillweave.evolution.config import evolution_from_json
 from skillweave.evolution.lineage import lineage_of, settings_of
 from skillweave.evolution.population import Population, score
 from skillweave.evolution.stacks import Member, Origin
-from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
-from skillweave.training.phase import (
-    START,
-    Listener,
-    Phase,
-    Record,
-    resume_episodes,
-    train_phase,
-)
+from skillweave.training.stage_log import StageLog, resume_episodes
+from skillweave.training.trainer import StageRun
 from skillweave.types import Array, prefixed, unprefixed
 
 
 @dataclass
-class Nothing:
-    """A population's state, for a checkpoint: its members' tensors stand beside it."""
-
-
-@dataclass
 class Best:
-    """The best member so far: its policy is what the phase ends with.
+    """The best member so far: its policy is what the stage ends with.
 
     Fitness is that of the latest generation's episodes.
     """
@@ -52,97 +42,86 @@ class Best:
     policy: AgentPolicy
 
 
-def evolve_phase(
-    phase: Phase,
-    run: RunDirectory,
-    seeds: Seeds,
-    listeners: tuple[Listener, ...],
-    selection: Any = None,
-) -> AgentPolicy:
-    """Like ``train_phase``; where the run's entry says so, a population evolves instead.
-
-    The settings in the run count, not those of ``phase``: a resumed run goes on as it began.
+class EvolvingPopulation:
+    """The learner of a stage whose entry says that a population evolves.
 
     Args:
         selection: the user's own, which the run knows by name only.
 
     Raises:
-        SkillweaveError: every member diverged, or the selection is missing or wrong.
+        SkillweaveError: the selection is missing or wrong.
     """
-    entry = run.phase(phase.name)
-    if entry.get("evolution") is None:
-        return train_phase(phase, run, seeds, listeners)
-    if entry["status"] == "done":
-        return run.load_policy(phase.name)
-    where = f"{run.path}: phase {phase.name!r}"
-    evolution = evolution_from_json(entry["evolution"], where, selection)
-    evolving = _Evolving(phase, run, seeds, listeners, evolution)
-    try:
-        while not evolving.over:
-            evolving.generation()
-    finally:
-        evolving.close()
-    return evolving.finish()
 
+    schema: Any = Generation
 
-class _Evolving:
-    """One phase's population under way."""
-
-    def __init__(
-        self,
-        phase: Phase,
-        run: RunDirectory,
-        seeds: Seeds,
-        listeners: tuple[Listener, ...],
-        evolution: Evolution,
-    ) -> None:
-        self.phase, self.run, self.seeds, self.evolution = phase, run, seeds, evolution
-        self.listeners, entry = listeners, run.phase(phase.name)
-        self.config = config_from_json(entry["algorithm"])
-        self.budget = int(entry["budget"])
-        # It may be damaged: before there is an arena.
-        found = run.load_checkpoint(Nothing, phase.name, schema=Generation)
-        self.arena = phase.make_env(evolution.episodes, self.config.gamma)
-        """Where fitness is measured."""
-        self.spaces = self.arena.observation_space, self.arena.action_space
+    def __init__(self, stage: StageRun, selection: Any = None) -> None:
+        self.stage, self.run, self.seeds = stage, stage.run, stage.seeds
+        where = f"{stage.run.path}: stage {stage.name!r}"
+        self.evolution = evolution_from_json(stage.entry["evolution"], where, selection)
+        self.config, self.budget, self.target = stage.config, stage.budget, stage.target
         self.best: Best | None = None
         self.done = 0
         """Complete generations."""
         self.fitness_steps = 0
         """Environment steps that the latest measurement of fitness took."""
-        if found is None:
-            at: dict[str, Any] = dict(START)
-            self.population = Population.fresh(
-                self.config, evolution, phase.make_env, self.spaces, seeds
-            )
+        self._open = ExitStack()
+
+    def open(self) -> None:
+        """Make the environments where fitness is measured."""
+        self.arena = self.stage.make_env(self.evolution.episodes, self.config.gamma)
+        self._open.callback(self.arena.close)
+        self.spaces = self.arena.observation_space, self.arena.action_space
+
+    def go_on(self, state: None, extra: dict[str, Tensor], log: StageLog) -> None:
+        """Stand where a checkpoint says: its members are in ``extra``."""
+        self.log = log
+        if extra:
+            self._restore(log.at, extra)
         else:
-            _, at, tensors = found
-            self._restore(at, tensors)
-        run.lineage.rewind(at.get("lineage_bytes", entry.get("lineage_bytes")))
-        entry.setdefault("lineage_bytes", run.lineage.size)
-        self.record = Record(phase.name, run, listeners, at)
-        if found is not None:
-            self._resume_episodes(found[2])
-        self._started: float = time.perf_counter() - at["seconds"]
+            self.population = Population.fresh(
+                self.config, self.evolution, self.stage.make_env, self.spaces, self.seeds
+            )
+        self._open.callback(self.population.close)
+        if extra:
+            self._resume_episodes(extra)
+        self._started: float = time.perf_counter() - log.at["seconds"]
+
+    def train(self, log: StageLog) -> AgentPolicy:
+        """Train generation after generation; the best policy.
+
+        Raises:
+            SkillweaveError: every member diverged.
+        """
+        while not self.over:
+            self.generation()
+        return self._finish()
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._open.close()
 
     @property
     def over(self) -> bool:
         """Whether all generations are complete, the target is reached, or the budget is spent."""
-        target = self.evolution.target
-        good = self.best is not None and target is not None and self.best.fitness >= target
-        spent = self.done > 0 and self.record.at["steps"] >= self.budget
-        return good or spent or self.done >= self.evolution.generations
+        spent = self.done > 0 and self.log.at["steps"] >= self.budget
+        return self._good or spent or self.done >= self.evolution.generations
+
+    @property
+    def _good(self) -> bool:
+        """Whether the target is reached."""
+        target, best = self.target, self.best
+        return target is not None and best is not None and best.fitness >= target.at_least
 
     def generation(self) -> None:
         """Train, compare, write down, evolve, and save."""
-        before = self.record.at["steps"]
+        before = self.log.at["steps"]
 
         def on_tick(steps: int, tick: Tick) -> None:
             metrics = tick.metrics
             if self.best is not None:
                 metrics |= {"fitness": self.best.fitness}
-            update = self.record.at["update"] + 1
-            self.record.tick(update, before + steps, self._seconds, metrics)
+            update = self.log.at["update"] + 1
+            self.log.tick(update, before + steps, self._seconds, metrics)
 
         seeds = self.seeds / "generation" / self.done
         self.population.train(*self._until(before), seeds, on_tick)
@@ -150,33 +129,28 @@ class _Evolving:
         fitness = self.population.fitness(self.arena, seeds / "fitness")
         self._keep_best(fitness, seeds / "fitness")
         self.fitness_steps = self.arena.steps_made - measured
-        self.record.at["steps"] += self.fitness_steps
+        self.log.at["steps"] += self.fitness_steps
         self._note(fitness)
         self.done += 1
         if not self.over:
             self.population.evolve(fitness, seeds)
         self._save()
 
-    def finish(self) -> AgentPolicy:
-        """The phase is over."""
+    def _finish(self) -> AgentPolicy:
+        """The policy that the stage ends with."""
         assert self.best is not None
-        asked, target = self.evolution.generations, self.evolution.target
-        if self.done < asked and (target is None or self.best.fitness < target):
-            self._tell(
+        asked = self.evolution.generations
+        if self._good:
+            self.log.reached(self.best.fitness)
+        elif self.done < asked:
+            self.log.tell(
                 f"its budget of {self.budget:,} steps is spent after {self.done} of {asked} "
                 "generations: measuring fitness counts, too. Give it more steps, or fewer episodes"
             )
-        entry = self.record.entry
-        entry["winner"] = {"member": self.best.number, "fitness": self.best.fitness}
-        entry["winner"] |= {"generation": self.best.generation, "generations": self.done}
-        self.record.done(self.best.policy)
+        winner = {"member": self.best.number, "fitness": self.best.fitness}
+        winner |= {"generation": self.best.generation, "generations": self.done}
+        self.log.entry["winner"] = winner
         return self.best.policy
-
-    def close(self) -> None:
-        """Release the environments."""
-        self.arena.close()
-        if self.population is not None:
-            self.population.close()
 
     def _until(self, spent: int) -> tuple[int, int]:
         """Steps of each member at this generation's end, and when schedules end.
@@ -207,24 +181,20 @@ class _Evolving:
         members = self.population.members
         best = self.best.number if self.best and self.best.generation == self.done else None
         self.run.lineage.append(
-            lineage_of(self.phase.name, self.done, members, fitness, self.evolution, best)
+            lineage_of(self.stage.name, self.done, members, fitness, self.evolution, best)
         )
         lost = [str(m.number) for m, f in zip(members, fitness, strict=True) if f == -np.inf]
         if lost:
-            self._tell(
+            self.log.tell(
                 f"generation {self.done + 1}: member {', '.join(lost)} diverged; it is replaced"
             )
         winner = members[int(fitness.argmax())]
         settings = settings_of(winner.config, self.evolution)
         shown = ", ".join(f"{k} {_short(v)}" for k, v in settings.items())
-        self._tell(
+        self.log.tell(
             f"generation {self.done + 1} of {self.evolution.generations}: best is member "
             f"{winner.number} with {fitness.max():.1f} ({shown})"
         )
-
-    def _tell(self, text: str) -> None:
-        for listener in self.listeners:
-            listener.message(f"{self.phase.name}: {text}")
 
     def _save(self) -> None:
         """A checkpoint of the whole population, as it is to go on."""
@@ -239,7 +209,6 @@ class _Evolving:
             "rounds": self.population.rounds,
             "fitness_steps": self.fitness_steps,
             "next_number": self.population.next_number,
-            "lineage_bytes": self.run.lineage.size,
             "members": [_member_to_json(m) for m in self.population.members],
         }
         if self.best is not None:
@@ -247,16 +216,16 @@ class _Evolving:
             tensors |= prefixed("best", weights)
             header["best"] = {"fitness": self.best.fitness, "number": self.best.number}
             header["best"] |= {"generation": self.best.generation, "policy": about}
-        self.run.save_checkpoint(Nothing(), self.record.header() | header, tensors)
+        self.log.save(None, tensors, **header)
 
     def _resume_episodes(self, tensors: dict[str, Tensor]) -> None:
         """Bring the environments, and what was seen in them, back to where a checkpoint was."""
         population, saved = self.population, unprefixed("collector", tensors)
-        resume_episodes(population.collector, saved, self.seeds, self.record)
+        resume_episodes(population.collector, saved, self.seeds, self.log)
         if buffer := unprefixed("buffer", tensors):
             population.load_buffer(buffer)
 
-    def _restore(self, at: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
         """Stand where a checkpoint says."""
         members = []
         for i, told in enumerate(at["members"]):
@@ -269,7 +238,7 @@ class _Evolving:
             member.state = state_from(own, fresh, where, algorithm.parameter_groups())
             members.append(member)
         self.population = Population(
-            members, self.evolution, self.phase.make_env, self.spaces, self.seeds
+            members, self.evolution, self.stage.make_env, self.spaces, self.seeds
         )
         self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
         self.done, self.fitness_steps = at["generation"], at["fitness_steps"]

@@ -30,7 +30,7 @@ from skillweave import (
     Truncation,
     train_agent,
 )
-from skillweave.evolution import phase as evolving
+from skillweave.evolution import stage as evolving
 from skillweave.evolution.population import Population, has_diverged
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
@@ -107,7 +107,7 @@ def test_a_population_evolves_and_ends_with_the_best_member(name, tmp_path):
         assert line["fitness"] == max(
             x["fitness"] for x in lines if x["generation"] == line["generation"]
         )
-    (entry,) = run.info()["phases"]
+    (entry,) = run.info()["stages"]
     assert entry["winner"]["member"] == best[-1]["member"]
     assert entry["winner"]["generation"] == best[-1]["generation"]
     if best[-1]["generation"] == 3:
@@ -135,7 +135,7 @@ def test_the_best_so_far_must_hold_its_own_on_the_same_episodes(tmp_path, monkey
     run = train("ppo", tmp_path / "run", by)
     flagged = [(x["generation"], x["member"]) for x in lineage(run.path) if x["best"]]
     assert [g for g, _ in flagged] == [0, 2]  # 9.5 beats 9.0; of equals the latest
-    winner = run.info()["phases"][0]["winner"]
+    winner = run.info()["stages"][0]["winner"]
     assert (winner["generation"], winner["fitness"]) == (2, 6.0)
 
 
@@ -249,7 +249,7 @@ def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tm
 
 def test_it_ends_early_at_the_target(tmp_path):
     run = train("ppo", tmp_path / "run", Evolution(3, 9, 2, target=-1e9))
-    assert run.info()["phases"][0]["winner"]["generations"] == 1
+    assert run.info()["stages"][0]["winner"]["generations"] == 1
     assert len(lineage(run.path)) == 3
 
 
@@ -306,11 +306,11 @@ def test_skills_and_selector_evolve_each_by_its_own_plan(tmp_path):
     )  # fmt: skip
     plan = {"right": Evolution(3, 2, 2), "selector": Evolution(2, 3, 2), "left": None}
     run = hierarchy.train(tmp_path / "run", quiet=True, evolve=plan)
-    phases = {p["name"]: p for p in run.info()["phases"]}
-    assert "winner" not in phases["left"]
-    assert phases["right"]["budget"] == 3 * 64
-    assert phases["selector"]["budget"] == 2 * 96
-    seen = {(x["phase"], x["generation"]) for x in lineage(run.path)}
+    stages = {p["name"]: p for p in run.info()["stages"]}
+    assert "winner" not in stages["left"]
+    assert stages["right"]["budget"] == 3 * 64
+    assert stages["selector"]["budget"] == 2 * 96
+    seen = {(x["stage"], x["generation"]) for x in lineage(run.path)}
     assert seen == {("right", g) for g in range(2)} | {("selector", g) for g in range(3)}
     assert run.evaluate(2).mean == hierarchy.load(tmp_path / "run").evaluate(2).mean
 
@@ -318,11 +318,11 @@ def test_skills_and_selector_evolve_each_by_its_own_plan(tmp_path):
 @pytest.mark.parametrize(
     ("plan", "said"),
     [
-        ({"middle": Evolution()}, "no phase 'middle' is trained; there are: left, right, selector"),
+        ({"middle": Evolution()}, "no stage 'middle' is trained; there are: left, right, selector"),
         ({"left": 3}, r"evolve\['left'\] is 3"),
         (
             Evolution(mutations=Mutations(ranges={"tau": Range(0.1, 1.0)})),
-            "phase 'left': .*PPO has no setting 'tau'",
+            "stage 'left': .*PPO has no setting 'tau'",
         ),
     ],
 )

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from skillweave.training.probe import Probe, episode_returns
 
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.training.probe import Probe, episode_returns
 from tests.toys import Calls, Clockwork, Countdown, Identity
 
 
@@ -99,8 +99,8 @@ def test_a_run_logs_what_it_saw_at_every_level_and_looking_changes_nothing(tmp_p
         )  # fmt: skip
         run = hierarchy.train(tmp_path / str(every), quiet=True)
         lines = list(RunDirectory.open(run.path).metrics())
-        for phase in ("balance", "selector"):
-            seen = [m["steps"] // 1000 for m in lines if m["phase"] == phase and "eval_return" in m]
+        for stage in ("balance", "selector"):
+            seen = [m["steps"] // 1000 for m in lines if m["stage"] == stage and "eval_return" in m]
             assert seen == ([1, 2] if every else [])
             assert all(
                 m["eval_return"] >= m["eval_return_min"] > 0 for m in lines if "eval_return" in m

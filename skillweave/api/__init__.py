@@ -1,0 +1,273 @@
+"""What users call: declare a ``Hierarchy`` or an ``Agent``, train it, get a ``Run``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from skillweave import recipes
+from skillweave.algorithms.config import AlgorithmConfig, config_from_json
+from skillweave.api.run import Run, as_path
+from skillweave.envs.make import EnvSpec
+from skillweave.evolution.plan import Evolve, make_learner, plan
+from skillweave.hierarchy import training
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
+from skillweave.messages import short, whole_number
+from skillweave.reporting.progress import Progress
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import make_trackers
+from skillweave.skills import Skill
+from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.stage import check_replay, check_stages
+from skillweave.types import SkillweaveError
+
+
+class Agent(PlainAgent):
+    """One plain agent that learns an environment's own reward: declared, trained and watched."""
+
+    recipe: str | None = None
+
+    def train(
+        self,
+        run_dir: str | Path,
+        *,
+        seed: int = 0,
+        quiet: bool = False,
+        track: Sequence[str] = (),
+        evolve: Evolve = None,
+    ) -> Run:
+        """Train it; everything goes to ``run_dir``. The arguments are ``Hierarchy.train``'s."""
+        content = self.manifest(whole_number(seed, "seed", 0))
+        return _train(self, content, run_dir, quiet, track, evolve)
+
+    def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
+        """Finish a run that was stopped; as ``Hierarchy.resume``."""
+        run = RunDirectory.open(as_path(run_dir, "run_dir"))
+        _check_run(self, run)
+        return _go_on(self, run, quiet, evolve)
+
+    def load(self, run_dir: str | Path) -> Run:
+        """A finished run of this agent."""
+        run = RunDirectory.open(as_path(run_dir, "run_dir"))
+        _check_run(self, run)
+        return Run(self, run.path, training.load(self, run))
+
+    @classmethod
+    def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
+        """The agent of a run that needs none of the user's code."""
+        (stage,) = manifest["stages"]
+        config = config_from_json(stage["algorithm"])
+        return cls(_spec_of(manifest), config, int(stage["budget"]))
+
+    @classmethod
+    def from_weights(cls, path: str | Path) -> Run:
+        """A plain agent with its environment, from the file that ``Run.save_weights`` wrote."""
+        path = as_path(path, "path")
+        tensors, header = open_weights(path)
+        if header["kind"] != "agent" or "env" not in header:
+            raise SkillweaveError(f"{path} does not say which environment its agent is for")
+        agent = cls(_spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
+        return Run(agent, path, read_agent(agent.spec, tensors, header, path))
+
+
+class Hierarchy(Declaration):
+    """Skills, reflexes and a selector on one environment: declared, then trained and watched."""
+
+    recipe: str | None = None
+    """Where it was declared: a shipped recipe's name or a file; written into runs."""
+
+    def train(
+        self,
+        run_dir: str | Path,
+        *,
+        seed: int = 0,
+        flat: bool = False,
+        quiet: bool = False,
+        track: Sequence[str] = (),
+        evolve: Evolve = None,
+    ) -> Run:
+        """Train every skill, then the selector; everything goes to ``run_dir``.
+
+        Args:
+            run_dir: a new directory; an existing run is never overwritten.
+            seed: the root of every random stream.
+            flat: train one plain agent on the same number of steps instead: the baseline.
+            quiet: no progress.
+            track: "tensorboard", "wandb".
+            evolve: a population for every stage, or for some by name (a skill's, "selector",
+                "agent"). Its budget is the stage's for each member, measuring fitness included.
+
+        Raises:
+            SkillweaveError: the declaration does not fit the environment, or training diverged.
+        """
+        content = training.manifest(self, seed=whole_number(seed, "seed", 0), flat=flat)
+        return _train(self, content, run_dir, quiet, track, evolve)
+
+    def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
+        """Finish a run that was stopped; the end is the same as if it had not been.
+
+        ``evolve`` is needed only where the population evolves by a selection of your own.
+        """
+        run = RunDirectory.open(as_path(run_dir, "run_dir"))
+        self._adopt_run_config(run)
+        return _go_on(self, run, quiet, evolve)
+
+    def load(self, run_dir: str | Path) -> Run:
+        """A finished run of this hierarchy, or of its flat baseline."""
+        run = RunDirectory.open(as_path(run_dir, "run_dir"))
+        self._adopt_run_config(run)
+        return Run(_declared(self, run), run.path, training.load(self, run))
+
+    def load_weights(self, path: str | Path) -> Run:
+        """This hierarchy with the weights of one file (see ``Run.save_weights``)."""
+        path = as_path(path, "path")
+        tensors, header = open_weights(path)
+        if header["kind"] == "agent":
+            return Run(self.plain_agent(), path, read_agent(self.spec, tensors, header, path))
+        return Run(self, path, read_weights(self, tensors, header, path))
+
+    @staticmethod
+    def pretrained(name: str) -> Run:
+        """A shipped recipe with its shipped weights."""
+        return recipes.load(name).load_weights(recipes.weights_path(name))
+
+    @classmethod
+    def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
+        """The hierarchy of a run that needs none of the user's code (plain data says it all)."""
+        skills = [
+            type(s["name"], (Skill,), {"name": s["name"], "max_steps": s["max_steps"]})()
+            for s in manifest["skills"]
+        ]
+        return cls(_spec_of(manifest), skills, call_steps=manifest["call_steps"])
+
+    def _adopt_run_config(self, run: RunDirectory) -> None:
+        """Take over from a run how its skills are called, after a check that it fits."""
+        _check_run(self, run)
+        if run.manifest["kind"] == "hierarchy":
+            self.call_steps = run.manifest["call_steps"]
+            self.reflexes_in_training = run.manifest.get("reflexes_in_training", True)
+            self.greedy_skills = run.manifest["greedy_skills"]
+
+
+def train_agent(
+    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
+    algorithm: AlgorithmConfig,
+    steps: int,
+    run_dir: str | Path,
+    *,
+    target_return: float | None = None,
+    target_success: float | None = None,
+    eval_every: int | None = None,
+    eval_episodes: int = 20,
+    seed: int = 0,
+    quiet: bool = False,
+    track: Sequence[str] = (),
+    evolve: Evolve = None,
+) -> Run:
+    """Train one plain agent on an environment's own reward; the run is like any other.
+
+    Args:
+        env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
+        algorithm: its settings, ``SAC()`` for example.
+        steps: training budget in environment steps.
+        target_return: stop early at this mean return of the periodic evaluation.
+        target_success: stop early at this share of episodes whose ``info["success"]`` is true.
+        eval_every: environment steps between these evaluations; None: none.
+        eval_episodes: episodes of each.
+        run_dir, seed, quiet, track, evolve: as in ``Hierarchy.train``.
+
+    Raises:
+        SkillweaveError: the algorithm cannot act in the environment; the message says which can.
+    """
+    agent = Agent(
+        env,
+        algorithm,
+        steps,
+        target_return=target_return,
+        target_success=target_success,
+        eval_every=eval_every,
+        eval_episodes=eval_episodes,
+    )
+    return agent.train(run_dir, seed=seed, quiet=quiet, track=track, evolve=evolve)
+
+
+def _train(
+    declared: Hierarchy | Agent,
+    content: dict[str, Any],
+    run_dir: str | Path,
+    quiet: bool,
+    track: Sequence[str],
+    evolve: Evolve,
+) -> Run:
+    """Check everything, begin a run of this manifest, and train it."""
+    run_dir = as_path(run_dir, "run_dir")
+    observation_space, action_space = declared.check_spaces()
+    plan(content["stages"], evolve)
+    check_stages(content["stages"], content["eval_every"])
+    for stage in content["stages"]:
+        acts: Any = action_space
+        if stage["kind"] == "selector":
+            acts = gym.spaces.Discrete(len(content["skills"]))
+        check_replay(stage, observation_space, acts)
+    if isinstance(track, str) or not isinstance(track, Sequence):
+        raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
+    track = tuple(track)
+    make_trackers(track, None)  # a missing extra is said before anything is written
+    run = RunDirectory.create(run_dir, content | {"recipe": declared.recipe, "track": track})
+    return _go_on(declared, run, quiet, evolve)
+
+
+def _go_on(declared: Hierarchy | Agent, run: RunDirectory, quiet: bool, evolve: Evolve) -> Run:
+    """Train what is left of a run."""
+    learner = make_learner(run.manifest["stages"], evolve)
+    with ExitStack() as stack:
+        stack.callback(run.close)
+        run.begin()
+        progress = stack.enter_context(Progress(quiet=quiet))
+        trackers = make_trackers(run.manifest.get("track", ()), run)
+        for tracker in trackers:
+            stack.callback(tracker.close)
+        policy = training.train(declared, run, (progress, *trackers), learner)
+    return Run(_declared(declared, run), run.path, policy)
+
+
+def _declared(declared: Hierarchy | Agent, run: RunDirectory) -> Declaration | PlainAgent:
+    """What a run trained: a hierarchy, or its flat baseline."""
+    flat = run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy)
+    return declared.plain_agent() if flat else declared  # type: ignore[union-attr]
+
+
+def _check_run(declared: Hierarchy | Agent, run: RunDirectory) -> None:
+    """Raise a SkillweaveError where a run is not one of this declaration."""
+    if run.manifest["kind"] == "hierarchy":
+        if isinstance(declared, Agent):
+            raise SkillweaveError(f"{run.path} is the run of a hierarchy, not of a plain agent")
+        mine = [s.name for s in declared.skills]
+        theirs = [s["name"] for s in run.manifest["skills"]]
+        if mine != theirs:
+            raise SkillweaveError(
+                f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
+                f"has {', '.join(mine)}"
+            )
+    if run.manifest["env"] != declared.spec.name:
+        what = "agent" if isinstance(declared, Agent) else "hierarchy"
+        raise SkillweaveError(
+            f"{run.path} was trained on {run.manifest['env']}, but this {what} is on "
+            f"{declared.spec.name}"
+        )
+
+
+def _spec_of(told: dict[str, Any]) -> EnvSpec:
+    """The environment that a manifest or a header names, if that says it all."""
+    spec = EnvSpec(told["env"], kwargs=told.get("env_kwargs", {}))
+    if not spec.is_data:
+        raise SkillweaveError(f"the environment {spec.name!r} names code; give the recipe")
+    return spec
+
+
+__all__ = ["Agent", "Hierarchy", "Run", "train_agent"]

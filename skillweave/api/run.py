@@ -1,0 +1,137 @@
+"""What training and loading give back: a ``Run``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.hierarchy.weights import write_weights
+from skillweave.messages import short, whole_number
+from skillweave.reporting.video import color_of, render_policy
+from skillweave.runs.directory import RunDirectory
+from skillweave.skills import Skill
+from skillweave.training.evaluation import Evaluation, evaluate
+from skillweave.training.plain_agent import AGENT, PlainAgent
+from skillweave.types import Memory, Policy, SkillweaveError
+
+
+class Run:
+    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill."""
+
+    def __init__(self, declaration: Declaration | PlainAgent, path: Path, policy: Policy) -> None:
+        self.declaration, self.path, self.policy = declaration, path, policy
+
+    @property
+    def hierarchy(self) -> Declaration:
+        """The hierarchy that was trained.
+
+        Raises:
+            SkillweaveError: this is the run of a plain agent.
+        """
+        if isinstance(self.declaration, PlainAgent):
+            raise SkillweaveError("this is the run of a plain agent: it has no hierarchy")
+        return self.declaration
+
+    def evaluate(
+        self,
+        episodes: int = 100,
+        *,
+        seed: int = 0,
+        deterministic: bool = True,
+        skill: str | None = None,
+        max_steps: int | None = None,
+    ) -> Evaluation:
+        """Score it on Gymnasium's environment.
+
+        Args:
+            episodes: whole episodes.
+            seed: picks them.
+            deterministic: act greedily, else sample. Of a hierarchy it is about the selector;
+                ``greedy_skills`` is about its skills.
+            skill: score this skill alone, as if the selector always chose it: the hierarchy's
+                reflexes are in force, also where the skill was trained without them
+                (``reflexes_in_training=False``).
+            max_steps: an episode that nothing has ended by then is cut, and the result says so;
+                None: the environment's own time limit, or 100,000 steps.
+        """
+        return evaluate(
+            self._policy(skill),
+            self.declaration.spec,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+            max_steps=max_steps,
+        )
+
+    def render(
+        self,
+        path: str | Path,
+        *,
+        episodes: int = 1,
+        seed: int = 0,
+        deterministic: bool = True,
+        skill: str | None = None,
+        max_steps: int | None = None,
+    ) -> dict[str, Any]:
+        """Write a captioned GIF or MP4; ``skill`` shows one skill alone, as in ``evaluate``."""
+        plain = isinstance(self.declaration, PlainAgent)
+        skills = () if plain else self.hierarchy.skills
+        colors = {s.name: color_of(i, s.color) for i, s in enumerate(skills)}
+
+        def label(memory: Memory) -> tuple[str, tuple[int, int, int]]:
+            if skill is not None:
+                return skill, colors[skill]
+            acting = policy.acting(memory)
+            if acting is None:
+                return AGENT, color_of(len(colors), None)
+            name = policy.labels[int(acting[0])]
+            return name, colors[name]
+
+        policy, path = self._policy(skill), as_path(path, "path")
+        seed = whole_number(seed, "seed", 0)
+        return render_policy(
+            self.declaration.spec,
+            policy,
+            path,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+            label=label,
+            max_steps=max_steps,
+            rng=np.random.default_rng(seed),
+        )
+
+    def save_weights(self, path: str | Path) -> Path:
+        """Write every policy into one file for ``Hierarchy.load_weights``."""
+        path = as_path(path, "path")
+        write_weights(path, self.declaration, self.policy)
+        return path
+
+    def as_skill(self, name: str, **attributes: Any) -> Skill:
+        """All of it as one skill of another hierarchy."""
+        kind = type(name, (Skill,), {"name": name, "policy": self.policy, **attributes})
+        skill: Skill = kind()
+        return skill
+
+    def info(self) -> dict[str, Any]:
+        """The manifest of its run."""
+        return RunDirectory.open(self.path).manifest
+
+    def _policy(self, skill: str | None) -> Policy:
+        if skill is None:
+            return self.policy
+        if not isinstance(self.policy, HierarchyPolicy):
+            raise SkillweaveError("this is a plain agent: it has no skills")
+        self.hierarchy.skill(skill)
+        return SkillAlone(self.policy.skills, skill)
+
+
+def as_path(path: str | Path, name: str) -> Path:
+    """``path`` as one; an error names the argument where it is none."""
+    if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
+        raise SkillweaveError(f"{name} is {short(path)}; it must be a path")
+    return Path(path)

@@ -1,0 +1,181 @@
+"""Playing whole episodes: the one loop of evaluation, periodic evaluation and videos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.engine import Engine
+from skillweave.envs.infos import allowed_rows
+from skillweave.seeding import Seeds
+from skillweave.types import Array, Memory, Policy, Step, VecEnv
+
+
+@dataclass(slots=True)
+class Played:
+    """One step in each environment that acts; arrays have a row for each of these."""
+
+    rows: Array  # (k,) int64, the environments
+    episode: Array  # (k,) int64, the episode that each of them plays; −1: one that does not count
+    step: Step  # ``elapsed`` counts the episode's environment steps
+    reward: Array  # (k,) undiscounted; of a call the sum over its steps
+    lasted: Array  # (k,) int64, environment steps that the action lasted
+    cut: Array  # (k,) bool: nothing had ended the episode when it became too long
+    acting: Array | None = None  # (k,) int64, the skill that acted; None: no skills below
+    begun: Array | None = None  # (k,) bool: a call of that skill began
+
+    @property
+    def over(self) -> Array:
+        """(k,) bool: the episode has ended, or was cut."""
+        over: Array = self.step.terminated | self.step.truncated | self.cut
+        return over
+
+
+class Episodes(Protocol):
+    """Environments and the episodes that are to be played in them."""
+
+    num_envs: int
+    rows: Array
+    """(k,) environments that act; none: all episodes are over."""
+    obs: Array
+    """(N, *obs_shape), what to act on next."""
+
+    def mask(self) -> Array | None:
+        """(k, A) bool, the actions allowed now, or None."""
+        ...
+
+    def step(self, action: Array) -> Played:
+        """Act in ``rows``."""
+        ...
+
+    def go_on(self, played: Played) -> Array:
+        """Begin new episodes where some are over and more are left; (m,) these environments."""
+        ...
+
+
+def play(
+    policy: Policy,
+    episodes: Episodes,
+    *,
+    deterministic: bool = True,
+    rng: np.random.Generator | None = None,
+    before_step: Callable[[Memory], None] | None = None,
+) -> Iterator[Played]:
+    """Play all episodes, a step at a time.
+
+    Args:
+        deterministic: act greedily, else sample with ``rng``.
+        before_step: is shown the policy's memory after it has chosen an action, before the
+            environments act.
+    """
+    n = episodes.num_envs
+    memory = policy.start(n)
+    while len(rows := episodes.rows):
+        own = {k: v[rows] for k, v in memory.items()}
+        obs, mask = episodes.obs[rows], episodes.mask()
+        action, own = policy.act(own, obs, mask, deterministic=deterministic, rng=rng)
+        if before_step is not None:
+            before_step(own)
+        acting = policy.acting(own)
+        begun = own["elapsed"] == 0 if "elapsed" in own else np.zeros(len(rows), bool)
+        played = episodes.step(action)
+        played.acting, played.begun = acting, begun
+        for k, v in policy.observe(own, played.step).items():
+            memory[k][rows] = v
+        yield played
+        fresh = episodes.go_on(played)
+        if len(fresh):
+            for k, v in policy.start(n).items():
+                memory[k][fresh] = v[fresh]
+
+
+class SeededEpisodes:
+    """Whole episodes in an engine, each from a seed of its own."""
+
+    def __init__(self, engine: Engine, seeds: Sequence[int], max_steps: int) -> None:
+        self.engine, self.num_envs = engine, engine.num_envs
+        self._seeds, self._max_steps = seeds, max_steps
+        self.rows = np.arange(min(self.num_envs, len(seeds)))
+        self._episode = np.arange(self.num_envs)
+        self._upcoming = len(self.rows)
+        self._elapsed = np.zeros(self.num_envs, np.int64)
+        self.obs = np.array(engine.reset_some(self.rows, list(seeds[: self._upcoming])))
+
+    def mask(self) -> Array | None:
+        """(k, A) bool, the actions allowed now, or None."""
+        return allowed_rows(self.engine.mask(), self.rows)
+
+    def step(self, action: Array) -> Played:
+        """Act in ``rows``."""
+        rows = self.rows
+        obs = self.obs[rows]
+        raw = self.engine.step(action, rows)
+        self._elapsed[rows] += 1
+        self.obs[rows] = raw.next_obs
+        elapsed, no = self._elapsed[rows], np.zeros(len(rows), bool)
+        step = Step(
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated, no, elapsed,
+            raw.info,
+        )  # fmt: skip
+        cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
+        one = np.ones(len(rows), np.int64)
+        return Played(rows, self._episode[rows], step, raw.reward, one, cut)
+
+    def go_on(self, played: Played) -> Array:
+        """Begin the episodes that are left, in order, where others are over."""
+        ended = played.rows[played.over]
+        first, left = self._upcoming, len(self._seeds) - self._upcoming
+        fresh, spare = ended[:left], ended[left:]
+        self.rows = np.setdiff1d(self.rows, spare)
+        if len(ended) and len(self.rows):
+            # Those that play no more are started anew, too: an engine may step all together.
+            self._upcoming = first + len(fresh)
+            seeds = [*self._seeds[first : self._upcoming], *([0] * len(spare))]
+            self.obs[ended] = self.engine.reset_some(ended, seeds)
+            self._episode[fresh] = np.arange(first, self._upcoming)
+            self._elapsed[fresh] = 0
+        return fresh
+
+
+class FirstEpisodes:
+    """The first episode in each environment of a training environment, which goes on by itself.
+
+    All environments act until each has ended its first episode; those after it do not count.
+    """
+
+    def __init__(self, env: VecEnv, seeds: Seeds, max_steps: int = LONGEST_EPISODE) -> None:
+        self.env, self.num_envs, self._max_steps = env, env.num_envs, max_steps
+        self._all = np.arange(env.num_envs)
+        self.rows = self._all
+        self._episode = np.arange(env.num_envs)
+        self._elapsed = np.zeros(env.num_envs, np.int64)
+        self.obs = env.reset(seeds)
+
+    def mask(self) -> Array | None:
+        """(N, A) bool, the actions allowed now, or None."""
+        return self.env.mask()
+
+    def step(self, action: Array) -> Played:
+        """Act everywhere."""
+        obs, made = self.obs, self.env.step(action)
+        self._elapsed = self._elapsed + made.steps
+        self.obs = made.obs
+        no = np.zeros(self.num_envs, bool)
+        step = Step(
+            obs, action, made.next_obs, made.reward, made.terminated, made.truncated, no,
+            self._elapsed, made.info,
+        )  # fmt: skip
+        reward = made.info.get("call_return", made.reward)
+        cut = ~made.ended & (self._elapsed >= self._max_steps)
+        return Played(self._all, self._episode, step, reward, made.steps, cut)
+
+    def go_on(self, played: Played) -> Array:
+        """Stop when every first episode is over."""
+        self._episode = np.where(played.over, -1, self._episode)
+        if (self._episode < 0).all():
+            self.rows = self._all[:0]
+        return self._all[:0]

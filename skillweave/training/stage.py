@@ -1,0 +1,132 @@
+"""A stage as data: who learns, who decides, with which algorithm, for how many steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from types import SimpleNamespace
+from typing import Any, Literal
+
+from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
+from skillweave.algorithms.off_policy import OffPolicyAlgorithm
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.messages import short
+from skillweave.training.off_policy import make_buffer
+from skillweave.training.periodic import MakeEnv
+from skillweave.types import Policy, SkillweaveError
+
+Policies = Mapping[str, Policy]
+"""By name, everyone who can act already: ready skills, and who learnt in earlier stages."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where a stage may end before its budget is spent, by its periodic evaluation."""
+
+    of: Literal["return", "success"]
+    """The mean return, or the share of episodes that succeed."""
+    at_least: float
+    """The value that is good enough."""
+
+    def reached(self, metrics: Mapping[str, float]) -> float | None:
+        """The value in an evaluation's metrics, where it is good enough."""
+        value = metrics.get(f"eval_{self.of}")
+        return value if value is not None and value >= self.at_least else None
+
+
+def target_of(target_return: Any, target_success: Any, where: str) -> Target | None:
+    """The target that two settings, of which one may be given, ask for.
+
+    Raises:
+        SkillweaveError: both are given, or one is no number in its range.
+    """
+    given = {"return": target_return, "success": target_success}
+    given = {k: v for k, v in given.items() if v is not None}
+    if len(given) > 1:
+        raise SkillweaveError(f"{where}: give target_return or target_success, not both")
+    for of, value in given.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value):
+            raise SkillweaveError(f"{where}: target_{of} is {short(value)}; it must be a number")
+        if of == "success" and not 0.0 < value <= 1.0:
+            raise SkillweaveError(
+                f"{where}: target_success is {short(value)}; it is a share of episodes, more than "
+                "0 and at most 1"
+            )
+        return Target("success" if of == "success" else "return", float(value))
+    return None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What to train, and in which environment."""
+
+    name: str
+    kind: Literal["agent", "skill", "selector"]
+    config: AlgorithmConfig
+    """The algorithm's settings."""
+    budget: int
+    """Environment steps."""
+    env: Callable[[Policies], MakeEnv]
+    """Where it learns, given everyone who can act already."""
+    target: Target | None = None
+    """Where it may end early."""
+
+    def entry(self) -> dict[str, Any]:
+        """The manifest's entry before training."""
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "learns": [self.name],
+            "decides": self.name if self.kind == "selector" else None,
+            "budget": self.budget,
+            "algorithm": config_to_json(self.config),
+            "target": None if self.target is None else asdict(self.target),
+            "status": "waiting",
+        }
+
+
+def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> None:
+    """Raise a SkillweaveError where a stage of a manifest could not do what it is to do."""
+    for entry in entries:
+        where, population = f"stage {entry['name']!r}", entry.get("evolution")
+        members = 1 if population is None else population["population"]
+        starts, budget = entry["algorithm"].get("learning_starts", 0), entry["budget"] // members
+        if budget <= starts:
+            each = " for each member" if members > 1 else ""
+            raise SkillweaveError(
+                f"{where}: its budget is {budget:,} steps{each}, but it begins to learn only after "
+                f"{starts:,} (learning_starts). Give it more steps, or start earlier"
+            )
+        target = entry.get("target")
+        if target is not None and population is not None and target["of"] != "return":
+            raise SkillweaveError(
+                f"{where}: it evolves, and members are compared by their mean return, so its "
+                "target must be target_return"
+            )
+        if target is not None and population is None and eval_every is None:
+            raise SkillweaveError(
+                f"{where}: it has a target, but is not evaluated while it trains: set eval_every "
+                "to the environment steps between evaluations"
+            )
+
+
+def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
+    """Raise a SkillweaveError where a stage's replay buffer cannot be made.
+
+    Args:
+        entry: the manifest's; "evolution" says of how many members.
+    """
+    config = config_from_json(entry["algorithm"])
+    algorithm = make_algorithm(config, observation_space, action_space)
+    if not isinstance(algorithm, OffPolicyAlgorithm):
+        return
+    members = int((entry.get("evolution") or {"population": 1})["population"])
+    env: Any = SimpleNamespace(
+        num_envs=config.num_envs * members, observation_space=observation_space
+    )
+    try:
+        make_buffer(algorithm, env, members, shared=True)  # what is not written takes no memory
+    except SkillweaveError as error:
+        raise SkillweaveError(f"stage {entry['name']!r}: {error}") from error

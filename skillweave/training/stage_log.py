@@ -1,0 +1,121 @@
+"""What a stage writes and tells while it trains, whoever learns in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.runs.directory import RunDirectory
+from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
+from skillweave.types import SkillweaveError
+
+START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
+"""Where a stage stands before its first update."""
+
+
+class Listener(Protocol):
+    """Is told how training goes: a progress bar, TensorBoard, Weights & Biases."""
+
+    def stage(self, name: str, budget: int) -> None:
+        """A stage begins, or goes on."""
+        ...
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """An update was made."""
+        ...
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """A stage is over."""
+        ...
+
+    def message(self, text: str) -> None:
+        """Something that people should know."""
+        ...
+
+
+class StageLog:
+    """A stage's entry in the manifest, its lines, its checkpoints, and who is told.
+
+    Args:
+        at: where the stage stands: a checkpoint's header, or ``START``.
+    """
+
+    def __init__(
+        self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: Mapping[str, Any]
+    ) -> None:
+        self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), dict(at)
+        run.rewind_metrics(self.at.get("metrics_bytes", self.entry.get("metrics_bytes")))
+        run.lineage.rewind(self.at.get("lineage_bytes", self.entry.get("lineage_bytes")))
+        self.entry.setdefault("metrics_bytes", run.metrics_size())
+        self.entry.setdefault("lineage_bytes", run.lineage.size)
+        self.entry["status"] = "training"
+        run.save()
+        for listener in listeners:
+            listener.stage(name, int(self.entry["budget"]))
+
+    def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """An update was made."""
+        name = self.entry["name"]
+        self.at.update(update=update, steps=steps, seconds=seconds, metrics=metrics)
+        now = {"stage": name, "update": update, "steps": steps}
+        self.run.log(now | {"seconds": round(seconds, 4)} | metrics)
+        for listener in self.listeners:
+            listener.tick(name, steps, seconds, metrics)
+
+    def tell(self, text: str) -> None:
+        """Something that people should know."""
+        for listener in self.listeners:
+            listener.message(f"{self.entry['name']}: {text}")
+
+    def save(self, state: Any | None, extra: Mapping[str, Tensor] | None, **more: Any) -> None:
+        """Write a checkpoint: a state, what else resuming needs, and ``more`` in its header."""
+        kept = ("update", "steps", "evaluation_steps", "seconds", "metrics")
+        header = {"stage": self.entry["name"]} | {k: self.at[k] for k in kept} | more
+        self.run.save_checkpoint(state, header, extra)
+
+    def reached(self, value: float) -> None:
+        """The stage has reached its target and ends here."""
+        self.entry["reached"] = {"steps": self.at["steps"], "value": value}
+        target = self.entry["target"]
+        self.tell(
+            f"target reached after {self.at['steps']:,} steps: {target['of']} {value:g}, "
+            f"at least {target['at_least']:g} was asked"
+        )
+
+    def done(self, policy: AgentPolicy) -> None:
+        """The stage is over: keep its policy, and say how it went."""
+        entry, at = self.entry, self.at
+        self.run.save_policy(entry["name"], policy)
+        entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
+        entry["evaluation_steps"] = at["evaluation_steps"]
+        entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
+        entry["final"] = at["metrics"]
+        self.run.save()
+        self.run.drop_checkpoints()
+        for listener in self.listeners:
+            listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
+
+
+def resume_episodes(
+    collector: Collector, saved: dict[str, Tensor], seeds: Seeds, log: StageLog
+) -> None:
+    """Bring the environments back to where a checkpoint left them; say where that cannot be."""
+    if not saved:
+        return
+    try:
+        collector.restore(saved, seeds / "restart" / log.at["update"])
+    except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
+        raise SkillweaveError(
+            f"{log.run.path}: the checkpoint of stage {log.entry['name']!r} does not hold "
+            f"episodes of these environments: {error!r}"
+        ) from error
+    if count := len(collector.begun_anew):
+        log.tell(
+            f"{count} of {collector.num_envs} open episodes begin anew, so the end may differ from "
+            "that of an undisturbed run: given the same seed and the same actions, the environment "
+            "does not repeat itself"
+        )

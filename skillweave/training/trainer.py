@@ -1,0 +1,248 @@
+"""One trainer for every stage: a plain agent, a skill, a selector, or a population of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.config import AlgorithmConfig, config_from_json
+from skillweave.algorithms.off_policy import OffPolicyAlgorithm
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.ppo import PPOAlgorithm
+from skillweave.messages import short
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import Checkpoint
+from skillweave.seeding import Seeds
+from skillweave.training.collector import Collector
+from skillweave.training.episodes import Tick
+from skillweave.training.off_policy import train_off_policy
+from skillweave.training.on_policy import train_on_policy
+from skillweave.training.periodic import MakeEnv, PeriodicEvaluation
+from skillweave.training.stage import Policies, Stage, Target
+from skillweave.training.stage_log import START, Listener, StageLog, resume_episodes
+from skillweave.types import Policy, SkillweaveError, unprefixed
+
+
+@dataclass(frozen=True)
+class StageRun:
+    """A stage in a run. The run's settings count: a resumed run goes on as it began."""
+
+    entry: dict[str, Any]
+    """The manifest's."""
+    run: RunDirectory
+    seeds: Seeds
+    """The stage's node of the seed tree."""
+    make_env: MakeEnv
+
+    @property
+    def name(self) -> str:
+        """The stage's."""
+        return str(self.entry["name"])
+
+    @property
+    def config(self) -> AlgorithmConfig:
+        """The algorithm's settings."""
+        return config_from_json(self.entry["algorithm"])
+
+    @property
+    def budget(self) -> int:
+        """Environment steps."""
+        return int(self.entry["budget"])
+
+    @property
+    def target(self) -> Target | None:
+        """Where the stage may end early."""
+        told = self.entry.get("target")
+        return None if told is None else Target(**told)
+
+
+class StageLearner(Protocol):
+    """Who learns in a stage: one agent, or a population."""
+
+    schema: Any
+    """Of the headers of its checkpoints."""
+
+    def open(self) -> Any | None:
+        """Make the environments; the state to begin with, if checkpoints hold one."""
+        ...
+
+    def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
+        """Stand where a checkpoint says, or at the start where ``extra`` is empty."""
+        ...
+
+    def train(self, log: StageLog) -> AgentPolicy:
+        """Learn until the stage is over; the policy that it ends with."""
+        ...
+
+    def close(self) -> None:
+        """Release the environments."""
+        ...
+
+
+MakeLearner = Callable[[StageRun], StageLearner]
+"""Who is to learn in a stage, by its entry in the manifest."""
+
+
+class OneAgent:
+    """A stage's learner where nothing evolves."""
+
+    schema: Any = Checkpoint
+
+    def __init__(self, stage: StageRun) -> None:
+        if stage.entry.get("evolution") is not None:
+            raise SkillweaveError(f"stage {stage.name!r} evolves: it needs a population to train")
+        self.stage, self._open = stage, ExitStack()
+
+    def open(self) -> Any:
+        """Make the environments and the agent; the agent's state."""
+        stage, config = self.stage, self.stage.config
+        manifest = stage.run.manifest
+        every, episodes = manifest.get("eval_every"), manifest.get("eval_episodes", 0)
+        env = stage.make_env(config.num_envs, config.gamma)
+        self._open.callback(env.close)
+        self.evaluation = PeriodicEvaluation(
+            stage.make_env, config.gamma, stage.seeds, every, episodes
+        )
+        self._open.callback(self.evaluation.close)
+        self.algorithm = make_algorithm(config, env.observation_space, env.action_space)
+        self.collector = Collector(env)
+        self.state = self.algorithm.init([stage.seeds / "member" / 0])
+        return self.state
+
+    def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
+        """Stand where a checkpoint says."""
+        self.state = state
+        self._steps_before = log.at["steps"] - self.collector.env.steps_made
+        self._buffer = unprefixed("buffer", extra)
+        resume_episodes(self.collector, unprefixed("collector", extra), self.stage.seeds, log)
+        self.evaluation.start(log.at["steps"])
+
+    def train(self, log: StageLog) -> AgentPolicy:
+        """Learn until the budget is spent or the target is reached."""
+        target = self.stage.target
+
+        def on_tick(tick: Tick) -> None:
+            metrics = tick.metrics
+            metrics |= self.evaluation.due(
+                tick.steps, lambda: AgentPolicy.of(self.algorithm, tick.state)
+            )
+            log.at["evaluation_steps"] += self.evaluation.spent()
+            log.tick(tick.update, tick.steps, tick.seconds, metrics)
+            if target is not None and target.reached(metrics) is not None:
+                # No checkpoint: who resumes from the one before comes here again.
+                raise _TargetReached
+            if tick.cut:
+                log.save(tick.state, tick.extra)
+
+        how: dict[str, Any] = {k: log.at[k] for k in ("update", "steps", "seconds")}
+        how |= {"cut_every": int(self.stage.run.manifest["cut_every"]), "on_tick": on_tick}
+        how |= {"saved": self._buffer}
+        try:
+            run_loop(
+                self.algorithm, self.collector, self.state, self.stage.seeds, self.stage.budget, how
+            )
+        except _TargetReached:
+            assert target is not None
+            # What was collected since the update was made, too.
+            log.at["steps"] = self._steps_before + self.collector.env.steps_made
+            log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
+        return AgentPolicy.of(self.algorithm, self.state)
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._open.close()
+
+
+class _TargetReached(Exception):
+    """Ends a loop: what it has learnt is good enough."""
+
+
+def run_loop(
+    algorithm: Algorithm,
+    collector: Collector,
+    state: Any,
+    seeds: Seeds,
+    budget: int,
+    how: dict[str, Any],
+) -> None:
+    """Train one agent by its algorithm's loop, state in place: the one place that calls loops.
+
+    Args:
+        how: ``cut_every``, ``update``, ``steps``, ``seconds``, ``on_tick`` of the loops, and
+            ``saved``, the replay buffer of a checkpoint.
+
+    Raises:
+        SkillweaveError: no loop is known for the algorithm.
+    """
+    if isinstance(algorithm, OffPolicyAlgorithm):
+        train_off_policy(algorithm, collector, state, seeds, budget, **how)
+    elif isinstance(algorithm, PPOAlgorithm):
+        how = {k: v for k, v in how.items() if k != "saved"}
+        train_on_policy(algorithm, collector, state, seeds, budget, **how)
+    else:
+        raise SkillweaveError(
+            f"no training loop is known for {short(algorithm)}: it must be an OffPolicyAlgorithm "
+            "or a PPOAlgorithm"
+        )
+
+
+def train_stage(
+    stage: Stage,
+    run: RunDirectory,
+    seeds: Seeds,
+    listeners: tuple[Listener, ...] = (),
+    policies: Policies | None = None,
+    make_learner: MakeLearner = OneAgent,
+) -> AgentPolicy:
+    """Train a stage to its end, or return its policy where it is done already.
+
+    Args:
+        seeds: the stage's node of the seed tree.
+        policies: everyone who can act already.
+        make_learner: who is to learn, by the stage's entry.
+
+    Raises:
+        SkillweaveError: training diverged, or a checkpoint is damaged.
+    """
+    entry = run.stage(stage.name)
+    if entry["status"] == "done":
+        return run.load_policy(stage.name)
+    learner = make_learner(StageRun(entry, run, seeds, stage.env(policies or {})))
+    try:
+        fresh = learner.open()
+        kind = None if fresh is None else type(fresh)
+        found = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
+        state, at, extra = found or (fresh, START, {})
+        log = StageLog(stage.name, run, listeners, at)
+        learner.go_on(state, extra, log)
+        policy = learner.train(log)
+    finally:
+        learner.close()
+    log.done(policy)
+    return policy
+
+
+def train_stages(
+    stages: Sequence[Stage],
+    run: RunDirectory,
+    listeners: tuple[Listener, ...] = (),
+    policies: Policies | None = None,
+    make_learner: MakeLearner = OneAgent,
+) -> dict[str, Policy]:
+    """Train stages one after another; by name, everyone who can act after them.
+
+    Args:
+        policies: who can act before the first.
+    """
+    found = dict(policies or {})
+    root = Seeds(int(run.manifest["seed"]))
+    for stage in stages:
+        found[stage.name] = train_stage(
+            stage, run, root / stage.name, listeners, found, make_learner
+        )
+    return found
