@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
-from skillweave.buffers.memory import check_memory
+from skillweave.buffers.ram import check_memory
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.messages import short
@@ -222,7 +222,8 @@ class Declaration:
         ):
             if isinstance(config, PPO):
                 size = config.num_envs * config.n_steps
-                check_memory(size, each + 32, str(short(space)), "rollout", "num_envs or n_steps")
+                what = f"a rollout of {size:,} transitions of {short(space)}"
+                check_memory(size, each + 32, what, "num_envs or n_steps")
 
     def ready_policies(self) -> dict[str, Policy]:
         """By skill, the policies that are not trained, on the environment's spaces."""
