@@ -82,10 +82,10 @@ class Columns:
         """Bytes that are reserved; what was never written takes no memory yet."""
         return sum(a.nbytes for a in (*self.data.values(), self._rewards))
 
-    @property
-    def live(self) -> Array:
-        """(N,) slots of each column that are written, boundaries included."""
-        return np.minimum(self.newest + 1, self.rows)
+    def used(self, first: int = 0, count: int | None = None) -> int:
+        """Rows that are written, of the longest of ``count`` columns from ``first`` on."""
+        last = None if count is None else first + count
+        return min(int(self.newest[first:last].max()) + 1, self.rows)
 
     def add(self, experience: Experience) -> list[tuple[Array, Array]]:
         """Append rows.
@@ -162,7 +162,7 @@ class Columns:
 
     def written(self) -> dict[str, Array]:
         """Views of all that was written, by name."""
-        used = int(self.live.max()) * self.num_envs
+        used = self.used() * self.num_envs
         found = {name: array[:used] for name, array in self.data.items()}
         if "call" in found:
             found["rewards"] = self._rewards[: self._rewards_used]
@@ -184,11 +184,12 @@ class Columns:
             self._start("mask")
         # Where a trajectory goes on, a successor's slot is that of the next transition as well.
         data["obs"][after], data["kind"][after] = flat(rows.next_obs), NOTHING
-        data["obs"][slot], data["kind"][slot] = flat(rows.obs), NOTHING
+        data["obs"][slot] = flat(rows.obs)
         data["action"][slot], data["reward"][slot] = flat(rows.action), flat(rows.reward)
         if "steps" in data:
             data["steps"][slot] = flat(rows.steps)
         if "call" in data:
+            data["kind"][slot] = NOTHING  # what is overwritten needs its rewards no more
             each = rows.reward[..., None] if rows.rewards is None else rows.rewards
             self._keep_rewards(slot, flat(each), flat(rows.steps))
         if "mask" in data:
@@ -239,9 +240,7 @@ class Columns:
         width = min(whole.shape[1], rewards.shape[1])
         whole[:, :width] = rewards[:, :width]
         end = self._rewards_used + needed
-        self._rewards[self._rewards_used : end] = whole[
-            np.arange(whole.shape[1]) < steps[:, None]
-        ]
+        self._rewards[self._rewards_used : end] = whole[np.arange(whole.shape[1]) < steps[:, None]]
         self._rewards_used = end
 
     def _compact(self, needed: int) -> None:

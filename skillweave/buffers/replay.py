@@ -18,32 +18,21 @@ from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array
 
 
-class ReplaySettings(Protocol):
-    """What a replay store reads of an algorithm's settings."""
+class _Settings(Protocol):
+    """What a store needs of an off-policy algorithm's settings."""
 
     @property
-    def buffer_size(self) -> int:
-        """Transitions of one member."""
-        ...
-
+    def buffer_size(self) -> int: ...
     @property
-    def n_step(self) -> int:
-        """Transitions of which a sample holds the rewards."""
-        ...
-
+    def n_step(self) -> int: ...
     @property
-    def prioritized(self) -> bool:
-        """Sample by priorities."""
-        ...
-
+    def prioritized(self) -> bool: ...
     @property
-    def priority_alpha(self) -> float:
-        """How strongly they count."""
-        ...
+    def priority_alpha(self) -> float: ...
 
 
 def replay_store(
-    config: ReplaySettings,
+    config: _Settings,
     codec: ActionCodec,
     observation_space: gym.Space[Any],
     num_envs: int,
@@ -171,7 +160,6 @@ class ReplayStore:
             beta: how far importance weights correct what priorities prefer.
             progress: of the ``Sample``.
         """
-        assert self.ready, "sample() before add()"
         return self.at(*self._draw(batch, rngs, beta, first), gamma, progress)
 
     def at(
@@ -242,7 +230,7 @@ class ReplayStore:
     def _written_priorities(self) -> dict[str, Array]:
         if self._priorities is None:
             return {}
-        return self._priorities.written(int(self._columns.live.max()) * self._width)
+        return self._priorities.written(self._columns.used() * self._width)
 
     def _places(self, slot: Array) -> tuple[Array, Array]:
         """Who draws from slots (k,), and which of their own these are; of all members in turn."""
@@ -259,6 +247,7 @@ class ReplayStore:
             members = range(first, first + len(rngs))
             drawn = [self._uniform(batch, r, p) for r, p in zip(rngs, members, strict=True)]
             return self._columns.number(np.stack(drawn)), None
+        assert self.ready, "sample() before add()"
         uniform = np.stack([rng.random(batch) for rng in rngs])
         place, weight = self._priorities.draw(uniform, beta, first)
         slot = place + place // self._width * (self._columns.num_envs - self._width)
@@ -267,17 +256,17 @@ class ReplayStore:
 
     def _uniform(self, batch: int, rng: np.random.Generator, member: int) -> Array:
         """Transitions (B,) of a member, all as likely: slots are drawn until B hold one."""
-        kind, n, first = self._columns.data["kind"], self._columns.num_envs, self._offset[member]
-        live = self._columns.live[first : first + self._width]
-        among = int(live.max()) * self._width
-        more = 1.1 * among / int(live.sum())  # columns may be filled unequally
+        columns, first, more = self._columns, self._offset[member], 1.1
+        among = columns.used(first, self._width) * self._width
+        assert among, "sample() before add()"
         found = np.zeros(0, np.int64)
         while len(found) < batch:
             slot = rng.integers(among, size=int(more * (batch - len(found))) + 8)
-            if self._width < n:
-                slot += slot // self._width * (n - self._width) + first
-            slot = slot[kind.take(slot) != NOTHING]
+            if self._width < columns.num_envs:
+                slot += slot // self._width * (columns.num_envs - self._width) + first
+            slot = slot[columns.data["kind"].take(slot) != NOTHING]
             found = np.concatenate([found, slot]) if len(found) else slot
+            more *= 2  # where some columns are nearly empty
         return found[:batch]
 
     def _seen_between(self, between: list[tuple[Array, Array]]) -> dict[str, Tensor | None]:
