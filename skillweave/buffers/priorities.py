@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from torch import Tensor
 
-from skillweave.spaces import to_tensor
 from skillweave.types import Array
 
 FAN_OUT = 32  # children of a node: four levels reach a million leaves
@@ -91,12 +89,9 @@ class Priorities:
         """Bytes of the trees."""
         return self._trees.nbytes
 
-    def turn(self, new: Array, gone: Array) -> None:
-        """Give slots ``new`` the highest priority so far, and ``gone`` none."""
-        slot, members = np.concatenate([new, gone]), len(self._highest)
-        value = np.outer(self._highest**self._alpha, np.arange(len(slot)) < len(new))
-        tree = np.repeat(np.arange(members), len(slot))
-        self._trees.put(tree, np.tile(slot, members), value.reshape(-1))
+    def set_new(self, member: Array, slot: Array, new: Array) -> None:
+        """Give slots the member's highest priority so far where ``new``, else none; all (K,)."""
+        self._trees.put(member, slot, self._highest[member] ** self._alpha * new)
 
     def draw(self, uniform: Array, beta: float, first: int = 0) -> tuple[Array, Array]:
         """Slots and importance weights (K, B), one of each B-th of the mass (stratified).
@@ -123,15 +118,14 @@ class Priorities:
         self._trees.rebuild()
         self._highest[:] = self._highest[parents]
 
-    def state(self, used: int) -> dict[str, Tensor]:
-        """Copies of the first ``used`` slots' priorities, to go on exactly."""
-        arrays = {"priority": self._trees.leaves[:, :used], "highest_priority": self._highest}
-        return {name: to_tensor(array.copy()) for name, array in arrays.items()}
+    def written(self, used: int) -> dict[str, Array]:
+        """Views of the first ``used`` slots' priorities, by name; after writing ``rebuild``."""
+        return {"priority": self._trees.leaves[:, :used], "highest_priority": self._highest}
 
-    def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        kept = state["priority"].numpy()
+    def forget(self) -> None:
+        """No slot has a priority."""
         self._trees.leaves[:] = 0.0
-        self._trees.leaves[:, : kept.shape[1]] = kept
+
+    def rebuild(self) -> None:
+        """Sum everything anew, after what ``written`` gave was written to."""
         self._trees.rebuild()
-        self._highest[:] = state["highest_priority"].numpy()

@@ -1,31 +1,89 @@
-"""The replay buffer: transitions of N environments, each observation kept once."""
+"""The replay store: transitions to be sampled at random, again and again."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import DTypeLike
 from torch import Tensor
 
+from skillweave.buffers.columns import NOTHING, TERMINATED, Columns, copy_into
 from skillweave.buffers.priorities import Priorities
-from skillweave.buffers.store import GOES_ON, TERMINATED, Store
-from skillweave.experience import Sample
-from skillweave.spaces import to_tensor
-from skillweave.types import Array, VecStep
+from skillweave.experience import Experience, Sample
+from skillweave.spaces import ActionCodec, to_tensor
+from skillweave.types import Array
 
 
-class ReplayBuffer(Store):
-    """Filled a step at a time and sampled at random.
+class _Settings(Protocol):
+    """What a store needs of an off-policy algorithm's settings."""
 
-    N = P·B columns as in ``RolloutBuffer``. Members see their own columns, or with ``shared`` all;
-    each has its own γ. ``n_step`` and ``prioritized`` (Schaul et al. 2016) say how it is sampled,
-    and ``between`` that samples hold the observations between the n steps, too.
+    @property
+    def buffer_size(self) -> int: ...
+    @property
+    def n_step(self) -> int: ...
+    @property
+    def prioritized(self) -> bool: ...
+    @property
+    def priority_alpha(self) -> float: ...
+
+
+def replay_store(
+    config: _Settings,
+    codec: ActionCodec,
+    observation_space: gym.Space[Any],
+    num_envs: int,
+    members: int = 1,
+    *,
+    shared: bool = False,
+    between: bool = False,
+    device: str | torch.device = "cpu",
+) -> ReplayStore:
+    """An empty replay store as an algorithm's settings ask for.
+
+    Args:
+        num_envs: of all members together.
+        shared: members learn from what all did; ``buffer_size`` is then that of all together.
+        between: as ``OffPolicyAlgorithm.between`` says.
 
     Raises:
-        SkillweaveError: the buffer is larger than the free memory, or holds not even one row.
+        SkillweaveError: it is larger than the machine's memory, or holds not even one row.
+    """
+    return ReplayStore(
+        config.buffer_size * (1 if shared else members),
+        num_envs,
+        members,
+        observation_space,
+        () if codec.discrete else (codec.size,),
+        np.int64 if codec.discrete else np.float32,
+        mask_size=codec.size if codec.discrete else None,
+        shared=shared,
+        n_step=config.n_step,
+        prioritized=config.prioritized,
+        alpha=config.priority_alpha,
+        between=between,
+        device=device,
+    )
+
+
+class ReplayStore:
+    """Filled with experience and sampled at random; the oldest transitions make room.
+
+    N = P·B columns as in ``Experience``. Members see their own columns, or with ``shared`` all;
+    each has its own γ. Every end of a trajectory takes the room of a transition.
+
+    Args:
+        capacity: transitions of all columns together.
+        mask_size: number of discrete actions.
+        n_step, prioritized, alpha: how it is sampled (Schaul et al. 2016).
+        between: samples hold the observations between the n steps, too.
+        device: of the samples.
+
+    Raises:
+        SkillweaveError: it is larger than the free memory, or holds not even one row.
     """
 
     def __init__(
@@ -43,30 +101,48 @@ class ReplayBuffer(Store):
         prioritized: bool = False,
         alpha: float = 0.6,
         between: bool = False,
+        device: str | torch.device = "cpu",
     ) -> None:
-        super().__init__(
+        self._columns = Columns(
             capacity, num_envs, observation_space, action_shape, action_dtype,
             mask_size=mask_size, each=4 * prioritized * (members if shared else 1),
             keep_rewards=shared,
         )  # fmt: skip
         self._n_step, self._between = n_step, between and n_step > 1
+        self._device = torch.device(device)
         # Columns that a member draws from, and the first of them.
+        self._members, self._shared = members, shared
         self._width = num_envs if shared else num_envs // members
-        self._offset = np.arange(members)[:, None] * (0 if shared else self._width)
-        places = self._rows * self._width
+        self._offset = np.arange(members) * (0 if shared else self._width)
+        places = self._columns.rows * self._width
         self._priorities = Priorities(members, places, alpha) if prioritized else None
+
+    def __len__(self) -> int:
+        """Transitions that can be sampled, over all columns."""
+        return int((self._columns.data["kind"] != NOTHING).sum())
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is something to sample for every member."""
+        return bool((self._columns.newest >= 0).reshape(-1, self._width).any(1).all())
 
     @property
     def nbytes(self) -> int:
         """Bytes that are reserved; what was never written takes no memory yet."""
-        return super().nbytes + (self._priorities.nbytes if self._priorities else 0)
+        return self._columns.nbytes + (self._priorities.nbytes if self._priorities else 0)
 
-    def add(self, obs: Array, mask: Array | None, action: Array, step: VecStep) -> None:
-        """Append a step: ``obs`` and ``mask`` acted on, ``action`` (N, ...) in policy units."""
-        super().add(obs, mask, action, step)
-        if self._priorities is not None:
-            rows = np.arange(self._count - 1, self._count + 1)[:, None] % self._rows
-            self._priorities.turn(*(rows * self._width + np.arange(self._width)))
+    def add(self, experience: Experience) -> None:
+        """Append the rows of an experience to their columns; they are copied."""
+        for slot, after in self._columns.add(experience):
+            if self._priorities is not None:
+                # Of slots named twice, the last counts: a successor may be a transition.
+                member, place = self._places(np.concatenate([after, slot]))
+                new = np.arange(len(place)) % (2 * len(slot)) >= len(after)
+                self._priorities.set_new(member, place, new)
+
+    def cut(self, columns: Array) -> None:
+        """End the open trajectories of ``columns`` (k,), whose environments begin anew."""
+        self._columns.cut(columns)
 
     def sample(
         self,
@@ -75,54 +151,59 @@ class ReplayBuffer(Store):
         rngs: Sequence[np.random.Generator],
         beta: float = 1.0,
         first: int = 0,
+        progress: float = 0.0,
     ) -> Sample:
         """``batch`` transitions for each member from ``first`` on, as many as generators are given.
 
-        ``gamma`` (P,) are their discounts.
+        Args:
+            gamma: (P,), their discounts.
+            beta: how far importance weights correct what priorities prefer.
+            progress: of the ``Sample``.
         """
-        assert self._count, "sample() before add()"
-        return self.at(*self._draw(batch, rngs, beta, first), gamma)
+        return self.at(*self._draw(batch, rngs, beta, first), gamma, progress)
 
-    def at(self, index: Array, weight: Array | None, gamma: Tensor) -> Sample:
-        """The transitions (P, B) that a sample, perhaps of another buffer, calls ``index``."""
-        data, n = self._data, self._num_envs
-        start = slot = index % self._slots
-        factor = gamma.float().numpy()[:, None]
-        reward, discount = self._reward(factor, slot), self._power(factor, slot)
-        end, newest = data["end"].take(slot), self._row(self._count - 1).start
+    def at(
+        self, index: Array, weight: Array | None, gamma: Tensor, progress: float = 0.0
+    ) -> Sample:
+        """The transitions (P, B) that a sample, perhaps of another store, calls ``index``."""
+        columns, data = self._columns, self._columns.data
+        factor = gamma.float().cpu().numpy()[:, None]
+        start = slot = index % columns.slots
+        reward, discount = columns.reward(factor, slot), columns.power(factor, slot)
+        after = columns.after(slot)
         between: list[tuple[Array, Array]] = []
         for _ in range(self._n_step - 1):
-            goes_on = (end == GOES_ON) & ((slot < newest) | (slot >= newest + n))
-            slot = np.where(goes_on, (slot + n) % self._slots, slot)
+            goes_on = data["kind"].take(after) != NOTHING
+            slot = np.where(goes_on, after, slot)
             between.append((slot, np.where(goes_on, discount, np.float32(0))))
-            reward += np.where(goes_on, discount * self._reward(factor, slot), np.float32(0))
-            discount = np.where(goes_on, discount * self._power(factor, slot), discount)
-            end = data["end"].take(slot)
-        now = {name: data[name].take(start, axis=0) for name in self._ends}
-        action, after = data["action"].take(start, axis=0), self._after(slot, end)
+            reward += np.where(goes_on, discount * columns.reward(factor, slot), np.float32(0))
+            discount = np.where(goes_on, discount * columns.power(factor, slot), discount)
+            after = columns.after(slot)
+        action = data["action"].take(start, axis=0)
         return Sample(
-            obs=to_tensor(now["obs"]),
-            action=to_tensor(action.astype(np.int64) if action.dtype.kind in "iu" else action),
-            reward=to_tensor(reward),
-            discount=to_tensor(discount * (end != TERMINATED)),
-            next_obs=to_tensor(after["obs"]),
-            obs_mask=self._allowed(now.get("mask")),
-            next_obs_mask=self._allowed(after.get("mask")),
-            weight=None if weight is None else to_tensor(weight),
+            obs=self._tensor(data["obs"].take(start, axis=0)),
+            action=self._tensor(action.astype(np.int64) if action.dtype.kind in "iu" else action),
+            reward=self._tensor(reward),
+            discount=self._tensor(discount * (data["kind"].take(slot) != TERMINATED)),
+            next_obs=self._tensor(data["obs"].take(after, axis=0)),
+            obs_mask=self._mask(start),
+            next_obs_mask=self._mask(after),
+            weight=None if weight is None else self._tensor(weight),
             index=index,
+            progress=progress,
             **self._seen_between(between),
         )
 
     def update_priorities(self, index: Array, priority: Tensor, first: int = 0) -> None:
         """New priorities (P, B), above 0, of what members from ``first`` on have sampled."""
         if self._priorities is not None:
+            slot = index % self._columns.slots
             # What was overwritten since is skipped.
-            member, place = (index >= self._count * self._num_envs - len(self)).nonzero()
-            index, width = index[member, place], self._width
-            own = index - index // self._num_envs * (self._num_envs - width)
-            own = (own - self._offset[first + member, 0]) % (self._rows * width)
-            new = priority.detach().float().numpy()[member, place]
-            self._priorities.update(first + member, own, new)
+            kept = (self._columns.number(slot) == index).nonzero()
+            row, column = np.divmod(slot[kept], self._columns.num_envs)
+            place = row * self._width + column - self._offset[first + kept[0]]
+            new = priority.detach().float().cpu().numpy()[kept]
+            self._priorities.update(first + kept[0], place, new)
 
     def inherit(self, parents: Array) -> None:
         """Every member (P,) goes on with the priorities of the one it descends from."""
@@ -131,48 +212,78 @@ class ReplayBuffer(Store):
 
     def state(self) -> dict[str, Tensor]:
         """Copies of all that was written, to go on exactly; see ``load``."""
-        state = super().state()
-        if self._priorities is not None:
-            state |= self._priorities.state(min(self._count, self._rows) * self._width)
-        return state
+        written = self._columns.written() | self._written_priorities()
+        return {name: to_tensor(array.copy()) for name, array in written.items()}
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from the ``state`` of a buffer that was made with the same arguments."""
-        super().load(state)
-        if self._priorities is not None:
-            self._priorities.load(state)
+        """Go on from the ``state`` of a store that was made with the same arguments.
 
-    @property
-    def capacity(self) -> int:
-        """Transitions that it holds when full, over all columns."""
-        return (self._rows - 1) * self._num_envs
+        Raises:
+            SkillweaveError: it is of other settings, or of an older version.
+        """
+        self._columns.load(state)
+        if self._priorities is not None:
+            self._priorities.forget()
+            copy_into(self._written_priorities(), state)
+            self._priorities.rebuild()
+
+    def _written_priorities(self) -> dict[str, Array]:
+        if self._priorities is None:
+            return {}
+        return self._priorities.written(self._columns.used() * self._width)
+
+    def _places(self, slot: Array) -> tuple[Array, Array]:
+        """Who draws from slots (k,), and which of their own these are; of all members in turn."""
+        if self._shared:
+            return np.repeat(np.arange(self._members), len(slot)), np.tile(slot, self._members)
+        row, column = np.divmod(slot, self._columns.num_envs)
+        return column // self._width, row * self._width + column % self._width
 
     def _draw(
         self, batch: int, rngs: Sequence[np.random.Generator], beta: float, first: int
     ) -> tuple[Array, Array | None]:
-        """Which transitions (P, B), counted from the first ever added, and their weights."""
-        width, weight = self._width, None
+        """Which transitions (P, B), by their numbers since the first ever, and their weights."""
         if self._priorities is None:
-            among = self._filled * width
-            drawn = np.stack([rng.integers(among, size=batch) for rng in rngs])
-            drawn += (self._count - self._filled) * width
-        else:
-            uniform = np.stack([rng.random(batch) for rng in rngs])
-            place, weight = self._priorities.draw(uniform, beta, first)
-            newest = self._count * width - 1
-            drawn = newest - (newest - place) % (self._rows * width)
-        # Counted so far among the member's own columns.
-        start = self._offset[first : first + len(rngs)]
-        return drawn + drawn // width * (self._num_envs - width) + start, weight
+            members = range(first, first + len(rngs))
+            drawn = [self._uniform(batch, r, p) for r, p in zip(rngs, members, strict=True)]
+            return self._columns.number(np.stack(drawn)), None
+        assert self.ready, "sample() before add()"
+        uniform = np.stack([rng.random(batch) for rng in rngs])
+        place, weight = self._priorities.draw(uniform, beta, first)
+        slot = place + place // self._width * (self._columns.num_envs - self._width)
+        slot += self._offset[first : first + len(rngs), None]
+        return self._columns.number(slot), weight
 
-    def _seen_between(self, between: list[tuple[Array, Array]]) -> dict[str, Any]:
+    def _uniform(self, batch: int, rng: np.random.Generator, member: int) -> Array:
+        """Transitions (B,) of a member, all as likely: slots are drawn until B hold one."""
+        columns, first, more = self._columns, self._offset[member], 1.1
+        among = columns.used(first, self._width) * self._width
+        assert among, "sample() before add()"
+        found = np.zeros(0, np.int64)
+        while len(found) < batch:
+            slot = rng.integers(among, size=int(more * (batch - len(found))) + 8)
+            if self._width < columns.num_envs:
+                slot += slot // self._width * (columns.num_envs - self._width) + first
+            slot = slot[columns.data["kind"].take(slot) != NOTHING]
+            found = np.concatenate([found, slot]) if len(found) else slot
+            more *= 2  # where some columns are nearly empty
+        return found[:batch]
+
+    def _seen_between(self, between: list[tuple[Array, Array]]) -> dict[str, Tensor | None]:
         """Of n steps, the observations after the first: of their slots (P, B) and discounts."""
         if not self._between:
             return {}
         slots, discounts = (np.stack(each, -1) for each in zip(*between, strict=True))
-        seen = {name: self._data[name].take(slots, axis=0) for name in self._ends}
         return {
-            "between_obs": to_tensor(seen["obs"]),
-            "between_mask": self._allowed(seen.get("mask")),
-            "between_discount": to_tensor(discounts),
+            "between_obs": self._tensor(self._columns.data["obs"].take(slots, axis=0)),
+            "between_mask": self._mask(slots),
+            "between_discount": self._tensor(discounts),
         }
+
+    def _mask(self, slot: Array) -> Tensor | None:
+        mask = self._columns.mask(slot)
+        return None if mask is None else self._tensor(mask)
+
+    def _tensor(self, array: Array) -> Tensor:
+        tensor = to_tensor(array)
+        return tensor if self._device.type == "cpu" else tensor.to(self._device)

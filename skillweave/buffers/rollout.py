@@ -1,79 +1,126 @@
-"""The rollout: T steps of N environments, in the order in which they happened."""
+"""The rollout store: an on-policy learner's own rows, until it learns from them."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.experience import Rollout
-from skillweave.spaces import obs_dtype, obs_shape, to_tensor
-from skillweave.types import Array, VecStep
+from skillweave.experience import Experience, Rollout
+from skillweave.spaces import to_tensor
+from skillweave.types import Array, unprefixed
 
 
-class RolloutBuffer:
-    """Filled a step at a time, then read once as a ``Rollout``; it need not be full.
+class RolloutStore:
+    """Takes experience and gives it away once, as a ``Rollout``.
 
-    N = P·B columns: the environments of member 0 first, then those of member 1, and so on.
+    N = P·B columns as in ``Experience``. In a rollout the valid rows of a column come first, one
+    after another. Where several experiences are collected, they lie side by side, as further
+    columns. Rows that are not valid repeat some valid row, so nothing there is out of range.
+
+    Args:
+        members: P.
+        quota: valid rows that every member must have before it learns; 0: learn from each
+            experience.
+        device: of the rollouts.
     """
 
-    def __init__(
-        self, n_steps: int, num_envs: int, members: int, observation_space: gym.Space[Any]
-    ) -> None:
-        self._members, self._at = members, 0
-        lead, shape = (n_steps, num_envs), obs_shape(observation_space)
-        self._obs = np.empty((*lead, *shape), obs_dtype(observation_space))
-        self._next_obs = np.empty_like(self._obs)
-        self._reward = np.empty(lead, np.float32)
-        self._steps = np.empty(lead, np.float32)
-        self._terminated = np.empty(lead, bool)
-        self._last = np.empty(lead, bool)
-        self._mask: list[Array | None] = [None] * n_steps
-        self._action: list[Tensor] = []
-        self._head: list[Tensor] = []
+    def __init__(self, members: int, quota: int = 0, device: str | torch.device = "cpu") -> None:
+        self._members, self._quota, self._device = members, quota, torch.device(device)
+        self._held: list[dict[str, Tensor]] = []  # fields (P, T, B, …), memory as one row
 
-    def add(
-        self, obs: Array, mask: Array | None, action: Tensor, head: Tensor, step: VecStep
-    ) -> None:
-        """Append one step; action (P, B, ...) and head (P, B, A) in policy units."""
-        t = self._at
-        self._obs[t], self._next_obs[t] = obs, step.next_obs
-        self._reward[t], self._steps[t] = step.reward, step.steps
-        self._terminated[t] = step.terminated
-        np.logical_or(step.terminated, step.truncated, out=self._last[t])
-        self._mask[t] = mask
-        self._action.append(action)
-        self._head.append(head)
-        self._at += 1
+    def add(self, experience: Experience) -> None:
+        """Keep an experience until it is learnt from.
 
-    def read(self, gamma: Tensor) -> Rollout:
-        """What was added, discounted by each member's γ (P,)."""
-        done = self._at
-        self._last[done - 1] = True  # the end of the rollout cuts every trajectory
-        steps = self._by_member(self._steps[:done])
-        alive = self._by_member(~self._terminated[:done])
-        discount = gamma[:, None, None].pow(steps) * alive
-        masks = [m for m in self._mask[:done] if m is not None]
+        Arrays of one member are not copied: they must stay as they are until then.
+        """
+        e, last = experience, experience.ended
+        valid = np.ones_like(last) if e.valid is None else e.valid
+        if not valid.any():
+            return
+        rows = {
+            "obs": e.obs, "action": e.action, "reward": e.reward, "steps": e.steps,
+            "terminated": e.terminated, "next_obs": e.next_obs, "last": last,
+            "obs_mask": e.obs_mask, "head": e.head, "starts": e.starts,
+        }  # fmt: skip
+        rows = {k: x for k, x in rows.items() if x is not None}
+        if not valid.all():
+            cells, valid = _valid_first(valid)
+            rows = {k: x.reshape(-1, *x.shape[2:])[cells] for k, x in rows.items()}
+        column = valid.any(0).nonzero()[0]
+        rows["last"][valid.sum(0)[column] - 1, column] = True
+        rows["last"] &= valid
+        held = {k: self._by_member(x) for k, x in (rows | {"valid": valid}).items()}
+        if e.memory is not None:
+            held["memory"] = self._by_member(e.memory[None])
+        self._held.append(held)
+
+    def rollout(
+        self, gamma: Tensor, log_std: Tensor | None = None, progress: float = 0.0
+    ) -> Rollout | None:
+        """All that was collected since the last one; None: it is not enough yet.
+
+        Args:
+            gamma: (P,), each member's discount of one step.
+            log_std, progress: of the ``Rollout``.
+        """
+        if not self._held or self._valid_rows() < self._quota:
+            return None
+        named = self._held[0] if len(self._held) == 1 else _side_by_side(self._held)
+        self._held = []
+        named = {name: x.to(self._device) for name, x in named.items()}
+        named["discount"] = gamma.to(self._device)[:, None, None] ** named.pop("steps")
+        named["discount"] *= ~named.pop("terminated")
+        memory = named.pop("memory", None)
         return Rollout(
-            obs=self._by_member(self._obs[:done]),
-            action=torch.stack(self._action, dim=1),
-            reward=self._by_member(self._reward[:done]),
-            discount=discount,
-            next_obs=self._by_member(self._next_obs[:done]),
-            last=self._by_member(self._last[:done]),
-            obs_mask=self._by_member(self._masks(masks[0])) if masks else None,
-            head=torch.stack(self._head, dim=1),
-        )
+            **named, memory=None if memory is None else memory[:, 0], log_std=log_std,
+            progress=progress,
+        )  # fmt: skip
 
-    def _masks(self, example: Array) -> Array:
-        """(T, N, A) bool; a step without a mask allows everything."""
-        free = np.ones_like(example)
-        return np.stack([free if m is None else m for m in self._mask[: self._at]])
+    def state(self) -> dict[str, Tensor]:
+        """Copies of what is held, to go on exactly; see ``load``."""
+        parts = {str(i): held for i, held in enumerate(self._held)}
+        return {f"{i}.{k}": x.clone() for i, held in parts.items() for k, x in held.items()}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from a ``state``."""
+        self._held = []
+        while held := unprefixed(str(len(self._held)), state):
+            self._held.append(held)
+
+    def _valid_rows(self) -> int:
+        """Of the member that has the fewest."""
+        return int(torch.stack([held["valid"].sum((1, 2)) for held in self._held]).sum(0).min())
 
     def _by_member(self, x: Array) -> Tensor:
-        """(T, P·B, ...) to (P, T, B, ...)."""
-        split = x.reshape(x.shape[0], self._members, -1, *x.shape[2:])
-        return to_tensor(split).transpose(0, 1).contiguous()
+        """(T, P·B, …) to (P, T, B, …)."""
+        return to_tensor(x).unflatten(1, (self._members, -1)).transpose(0, 1).contiguous()
+
+
+def _valid_first(valid: Array) -> tuple[Array, Array]:
+    """Which rows (T, N) to take so that the valid ones of each column come first.
+
+    Returns:
+        (D, N) int64, rows and columns as one number, where the fullest column has D valid rows;
+        and (D, N) bool, which of them are valid: the others repeat a valid one.
+    """
+    count = valid.sum(0)
+    kept: Array = np.arange(count.max())[:, None] < count
+    row = np.argsort(~valid, axis=0, kind="stable")[: len(kept)]
+    return np.where(kept, row * len(count) + np.arange(len(count)), valid.argmax()), kept
+
+
+def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Several experiences as one: more columns, as many rows as the longest has."""
+    masks = [h["obs_mask"] for h in held if "obs_mask" in h]
+    if masks:  # without one, all is allowed
+        every = [masks[0].new_ones(*h["valid"].shape, masks[0].shape[-1]) for h in held]
+        held = [{"obs_mask": free} | h for free, h in zip(every, held, strict=True)]
+    t = max(h["valid"].shape[1] for h in held)
+    return {k: torch.cat([_padded(k, h[k], t) for h in held], 2) for k in held[0]}
+
+
+def _padded(name: str, x: Tensor, t: int) -> Tensor:
+    """A field (P, T, B, …) with ``t`` rows: its first is repeated, but is not valid there."""
+    more = x[:, :1].expand(-1, 0 if name == "memory" else t - x.shape[1], *x.shape[2:])
+    return torch.cat([x, torch.zeros_like(more) if name in ("valid", "last") else more], 1)

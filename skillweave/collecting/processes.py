@@ -181,7 +181,7 @@ class ProcessCollectors(Collectors):
 
     def _begin(self, worker: _Worker) -> None:
         ours, theirs = self._context.Pipe()
-        make = CloudpickleWrapper(self._make)
+        make: Any = CloudpickleWrapper(self._make)  # type: ignore[type-var,arg-type]
         about = worker.number, make, self._each, theirs, ours, os.getpid()
         worker.pipe = ours
         worker.process = self._context.Process(
@@ -244,7 +244,7 @@ class _Columns:
             k: np.ndarray(shape, dtype, worker.memory.buf, at)
             for k, (at, dtype, shape) in self.places.items()
         }
-        return Collected(Experience(**found, spent=self.spent), self.episodes)  # type: ignore[arg-type]
+        return Collected(Experience(**found, spent=self.spent), self.episodes)
 
 
 class _Writer:
@@ -318,6 +318,7 @@ def _work(
         pipe.send((None, None))
         writer = _Writer()
         for what, task in _tasks(pipe, parent):
+            answer: Any
             answer = collector.state() if what == "state" else getattr(collector, what)(task)
             pipe.send((None, writer.write(answer) if what == "collect" else answer))
     except (EOFError, BrokenPipeError):

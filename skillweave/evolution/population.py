@@ -16,7 +16,7 @@ from torch import Tensor
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.buffers.replay import ReplayStore, replay_store
+from skillweave.buffers.replay import ReplayStore
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector, apart, together
 from skillweave.collecting.group import Collectors
@@ -28,9 +28,10 @@ from skillweave.evolution.stacks import Member, Origin, copy, grouped, join, spl
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import ReplayLearner, RolloutLearner, Stack
+from skillweave.training.learner import ReplayLearner, RolloutLearner, Stack, store_of
 from skillweave.training.loop import Progress, train
-from skillweave.training.playing import MakeCollector, returns_of
+from skillweave.training.playing import returns_of
+from skillweave.training.scene import Scene
 from skillweave.types import Array, prefixed, unprefixed
 
 NEVER = 2**62
@@ -45,25 +46,22 @@ class Population:
     Members of one stack stand side by side in ``members``.
 
     Args:
-        make: makes the collector of a place, given its number of environments.
-        row_steps: environment steps of a row of experience, about.
+        scene: where they learn.
     """
 
     def __init__(
         self,
         members: list[Member],
         evolution: Evolution,
-        make: MakeCollector,
-        spaces: Any,
+        scene: Scene,
         seeds: Seeds,
-        row_steps: int = 1,
     ) -> None:
         self.members, self.evolution, self.seeds = members, evolution, seeds
-        self.spaces, self.row_steps = spaces, row_steps
+        self.spaces, self.row_steps = spaces_of(scene), scene.row_steps
         self.next_number = len(members)
         each = members[0].config.num_envs
-        self.replays = members[0].algorithm(spaces).store == "replay"
-        self.places = [make(each, None, i * each, self.replays) for i in range(len(members))]
+        self.replays = members[0].algorithm(self.spaces).store == "replay"
+        self.places = [scene.collector(each, None, i * each, self.replays) for i in range(len(members))]
         """Where they act: an heir goes on with its place's open episodes."""
         self.episodes = Episodes()
         self.rounds = 0
@@ -77,13 +75,11 @@ class Population:
         cls,
         config: AlgorithmConfig,
         evolution: Evolution,
-        make: MakeCollector,
-        spaces: Any,
+        scene: Scene,
         seeds: Seeds,
-        row_steps: int = 1,
     ) -> Population:
         """The first generation, each member with weights of its own."""
-        members = []
+        members, spaces = [], spaces_of(scene)
         for i in range(evolution.population):
             own = config
             if evolution.start == "random":
@@ -92,7 +88,7 @@ class Population:
             member.state = member.algorithm(spaces).init([seeds / "member" / i])
             members.append(member)
         ordered = [m for group in grouped(members, spaces) for m in group]
-        return cls(ordered, evolution, make, spaces, seeds, row_steps)
+        return cls(ordered, evolution, scene, seeds)
 
     @property
     def steps(self) -> int:
@@ -181,7 +177,7 @@ class Population:
     def _make_store(self) -> ReplayStore:
         algorithm = self.members[0].algorithm(self.spaces)
         count = len(self.members)
-        return replay_store(algorithm, count * self.places[0].num_envs, count, shared=True)
+        return store_of(algorithm, count * self.places[0].num_envs, count, shared=True)
 
     def cut(self, seeds: Seeds) -> dict[str, Tensor]:
         """Make a clean cut; what resuming from it needs of the environments."""
@@ -246,6 +242,11 @@ class Population:
         self.members = [m for group in grouped(members, self.spaces) for m in group]
         if self.store is not None:
             self.store.inherit(np.array([places[m.number] for m in self.members]))
+
+
+def spaces_of(scene: Scene) -> tuple[Any, Any]:
+    """What algorithms are made for: (observation space, action space)."""
+    return scene.observation_space, scene.action_space
 
 
 class _Clock:

@@ -19,12 +19,12 @@ from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.evolution.config import evolution_from_json
 from skillweave.evolution.lineage import lineage_of, settings_of
-from skillweave.evolution.population import Population, score
+from skillweave.evolution.population import Population, score, spaces_of
 from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
-from skillweave.training.stage_log import StageLog, resume_episodes
+from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.trainer import StageRun
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -68,9 +68,9 @@ class EvolvingPopulation:
 
     def open(self) -> None:
         """Make the environments where fitness is measured."""
-        self.arena = self.stage.make_env(self.evolution.episodes, self.config.gamma)
+        self.arena = self.stage.scene.collector(self.evolution.episodes, None)
         self._open.callback(self.arena.close)
-        self.spaces = self.arena.observation_space, self.arena.action_space
+        self.spaces = spaces_of(self.stage.scene)
 
     def go_on(self, state: None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says: its members are in ``extra``."""
@@ -79,7 +79,7 @@ class EvolvingPopulation:
             self._restore(log.at, extra)
         else:
             self.population = Population.fresh(
-                self.config, self.evolution, self.stage.make_env, self.spaces, self.seeds
+                self.config, self.evolution, self.stage.scene, self.seeds
             )
         self._open.callback(self.population.close)
         if extra:
@@ -125,10 +125,10 @@ class EvolvingPopulation:
 
         seeds = self.seeds / "generation" / self.done
         self.population.train(*self._until(before), seeds, on_tick)
-        measured = self.arena.steps_made
+        measured = self.arena.engine.steps_made
         fitness = self.population.fitness(self.arena, seeds / "fitness")
         self._keep_best(fitness, seeds / "fitness")
-        self.fitness_steps = self.arena.steps_made - measured
+        self.fitness_steps = self.arena.engine.steps_made - measured
         self.log.at["steps"] += self.fitness_steps
         self._note(fitness)
         self.done += 1
@@ -201,9 +201,9 @@ class EvolvingPopulation:
         tensors = prefixed("collector", self.population.cut(self.seeds / "cut" / self.done))
         for i, member in enumerate(self.population.members):
             tensors |= prefixed(str(i), vars(member.state))
-        buffer = self.population.buffer
-        if buffer is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
-            tensors |= prefixed("buffer", buffer.state())
+        store = self.population.store
+        if store is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
+            tensors |= prefixed("store", store.state())
         header: dict[str, Any] = {
             "generation": self.done,
             "rounds": self.population.rounds,
@@ -221,9 +221,9 @@ class EvolvingPopulation:
     def _resume_episodes(self, tensors: dict[str, Tensor]) -> None:
         """Bring the environments, and what was seen in them, back to where a checkpoint was."""
         population, saved = self.population, unprefixed("collector", tensors)
-        resume_episodes(population.collector, saved, self.seeds, self.log)
-        if buffer := unprefixed("buffer", tensors):
-            population.load_buffer(buffer)
+        store = unprefixed("store", tensors)
+        ids = resumed(self.log, lambda: population.resume(saved, store))
+        self.log.tell_begun_anew(len(ids), len(population.places) * population.places[0].num_envs)
 
     def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
         """Stand where a checkpoint says."""
@@ -237,9 +237,7 @@ class EvolvingPopulation:
             fresh, where = algorithm.init([self.seeds]), f"{self.run.path}: member {i}"
             member.state = state_from(own, fresh, where, algorithm.parameter_groups())
             members.append(member)
-        self.population = Population(
-            members, self.evolution, self.stage.make_env, self.spaces, self.seeds
-        )
+        self.population = Population(members, self.evolution, self.stage.scene, self.seeds)
         self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
         self.done, self.fitness_steps = at["generation"], at["fitness_steps"]
         if best := at.get("best"):

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-from skillweave.envs.foreign import FromVectorEnv
-from skillweave.envs.make import make_engine
 from skillweave.hierarchy.declaration import Declaration, check_target
-from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign import source_of
-from skillweave.training.periodic import MakeEnv
-from skillweave.training.plain_agent import PlainAgent, load_agent_of, task_env
+from skillweave.training.plain_agent import PlainAgent, load_agent_of
+from skillweave.training.scene import Scene, selector_scene, skill_scene
 from skillweave.training.stage import Policies, Stage, target_of
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, OneAgent, train_stages
-from skillweave.types import Policy, VecEnv
+from skillweave.types import Policy
 
 SELECTOR = "selector"
 """What the selector's stage is named."""
@@ -54,23 +51,22 @@ def stages_of(declaration: Declaration) -> list[Stage]:
 
     def skill_stage(skill: Skill) -> Stage:
         config, budget = skill.algorithm or declaration.algorithm, declaration.budget(skill)
-        make_env = task_env(declaration.spec, skill, reflexes)
-        return Stage(skill.name, "skill", config, budget, lambda _: make_env, check_target(skill))
+        target = check_target(skill)
 
-    def selector_env(policies: Policies) -> MakeEnv:
+        def scene(_: Policies) -> Scene:
+            return skill_scene(declaration.spec, skill, reflexes)
+
+        return Stage(skill.name, "skill", config, budget, scene, target)
+
+    def calls(policies: Policies) -> Scene:
         skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
-
-        def make_env(num_envs: int, gamma: Any) -> VecEnv:
-            engine = make_engine(declaration.spec, num_envs)
-            return FromVectorEnv(OptionsEnv(engine, skills, gamma))
-
-        return make_env
+        return selector_scene(declaration.spec, skills)
 
     config, budget = declaration.selector, declaration.selector_steps
     target = target_of(declaration.selector_target_return, None, SELECTOR)
     return [
         *(skill_stage(s) for s in declaration.skills if s.policy is None),
-        Stage(SELECTOR, "selector", config, budget, selector_env, target),
+        Stage(SELECTOR, "selector", config, budget, calls, target),
     ]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.types import Array, SkillweaveError, VecStep
+from skillweave.types import Array, SkillweaveError
 
 WINDOW = 100  # episodes in the reported means
 
@@ -20,29 +20,15 @@ class Episodes:
 
     returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
     task_returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    lengths: deque[int] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    successes: deque[bool] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    lengths: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    successes: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
 
-    def add(self, step: VecStep, sums: Array) -> None:
-        """Take one step of N environments into account.
-
-        ``sums`` (N, 3) are the open episodes' return, return of the task and length so far.
-        """
-        # An options environment sums the undiscounted reward of a call apart.
-        sums[:, 0] += step.info.get("call_return", step.reward)
-        if "task_reward" in step.info:
-            sums[:, 1] += step.info["task_reward"]
-        sums[:, 2] += step.steps
-        ended = step.ended
-        if ended.any():
-            for i in np.flatnonzero(ended):
-                self.returns.append(float(sums[i, 0]))
-                if "task_reward" in step.info:
-                    self.task_returns.append(float(sums[i, 1]))
-                self.lengths.append(int(sums[i, 2]))
-                if "success" in step.info:
-                    self.successes.append(bool(step.info["success"][i]))
-            sums[ended] = 0.0
+    def extend(self, ended: Array) -> None:
+        """Take episodes (K, 4) into account, as ``Collected.episodes``; NaN: not told."""
+        windows = self.returns, self.task_returns, self.lengths, self.successes
+        for column, window in enumerate(windows):
+            known = ended[:, column]
+            window.extend(known[~np.isnan(known)].tolist())
 
     def state(self) -> dict[str, Array]:
         """The latest episodes, to go on from."""
@@ -79,15 +65,15 @@ class Tick:
     """What else resuming needs: where the environments are, and the replay buffer."""
 
 
-def to_numbers(metrics: dict[str, Any], update: int, *, tolerant: bool = False) -> dict[str, float]:
+def to_numbers(metrics: dict[str, Any], update: int, *, skip_diverged: bool = False) -> dict[str, float]:
     """Member means; a value that is not finite stops the run, saying which and where.
 
-    If ``tolerant`` it is left out of the mean: whoever trains a population replaces its member.
+    If ``skip_diverged`` it is left out of the mean: whoever trains a population replaces its member.
     """
     numbers: dict[str, float] = {}
     for name, value in metrics.items():
         finite = torch.isfinite(value)
-        if tolerant:
+        if skip_diverged:
             numbers |= {name: float(value[finite].mean())} if bool(finite.any()) else {}
             continue
         if not bool(finite.all()):

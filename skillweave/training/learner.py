@@ -15,10 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.buffers.replay import ReplayStore
+from skillweave.buffers.replay import ReplayStore, replay_store
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Experience
+from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.types import Array, prefixed, unprefixed
@@ -43,7 +44,11 @@ class Stack:
 class Learner(Protocol):
     """Stacks that learn from what they did."""
 
-    stacks: Sequence[Stack]
+    @property
+    def stacks(self) -> Sequence[Stack]:
+        """Side by side."""
+        ...
+
     overlap: bool
     """It may learn on a thread of its own, while the next experience is collected."""
     report_every: int
@@ -84,7 +89,7 @@ class RolloutLearner:
         self.stacks, self._stack, self._seeds = (stack,), stack, seeds
         config = stack.algorithm.config
         self.overlap, self.threads = bool(config.overlap), int(config.threads)
-        self._store = RolloutStore(stack.members, device=stack.algorithm.device)
+        self._store = RolloutStore(stack.members, device=stack.state.params.device)
         self._log_std: Tensor | None = None
 
     def request(self, update: int, steps: int, progress: float) -> Request:
@@ -203,7 +208,7 @@ class ReplayLearner:
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """Make the gradient steps that are due; the metrics of the last one, if there were any."""
-        if steps <= self._learns_from:
+        if steps <= self._learns_from or not self.store.ready:
             self._transitions[0] = self._transitions[1]
             return {}
         found = [self._learn(i, update, progress) for i in range(len(self.stacks))]
@@ -262,6 +267,38 @@ class ReplayLearner:
         return slice(self._first[stack] * each, self._first[stack + 1] * each)
 
 
+def store_of(
+    algorithm: Any, num_envs: int, members: int = 1, *, shared: bool = False
+) -> ReplayStore:
+    """An empty replay store for an algorithm's samples.
+
+    Args:
+        num_envs: of all members together.
+        shared: members learn from what all did.
+
+    Raises:
+        SkillweaveError: it is larger than the machine's memory, or holds not even one row.
+    """
+    return replay_store(
+        algorithm.config, algorithm.codec, algorithm.observation_space, num_envs, members,
+        shared=shared, between=algorithm.between, device=resolve_device(algorithm.config.device),
+    )  # fmt: skip
+
+
+def learner_of(
+    stack: Stack, num_envs: int, seeds: Seeds, *, row_steps: int = 1, goes_on_at: int = 0
+) -> Learner:
+    """The learner of one stack, by what its algorithm learns from.
+
+    Args:
+        row_steps, goes_on_at: as of ``ReplayLearner``.
+    """
+    if stack.algorithm.store == "rollout":
+        return RolloutLearner(stack, seeds)
+    store = store_of(stack.algorithm, num_envs, stack.members)
+    return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
+
+
 def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int = 0) -> list[Seeds]:
     """A node of the seed tree for each member from ``first`` on."""
     return [seeds / name / (first + member) / update for member in range(members)]
@@ -274,7 +311,7 @@ def crossed(every: int, before: int, after: int) -> bool:
 
 def _flat(rows: Tensor, members: int) -> Tensor:
     """(T, P·B, …) to (P, T·B, …)."""
-    split = rows.unflatten(1, (members, -1)).transpose(0, 1)
+    split: Tensor = rows.unflatten(1, (members, -1)).transpose(0, 1)  # type: ignore[no-untyped-call]
     return split.flatten(1, 2)
 
 

@@ -157,7 +157,7 @@ class _Loop:
         if self._on_tick is None or not due:
             return
         self.at.seconds = time.perf_counter() - self._started
-        metrics = to_numbers(self._metrics, update, tolerant=self.skip_diverged)
+        metrics = to_numbers(self._metrics, update, skip_diverged=self.skip_diverged)
         # Those of the episodes are from when the update began, where it was not waited for.
         metrics |= self._summary if self.learner.overlap else self.episodes.summary()
         self._metrics = {}

@@ -3,84 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.collecting.collector import RETURN, SUCCESS, Collector
 from skillweave.seeding import Seeds
-from skillweave.training.members import passed
-from skillweave.training.play import FirstEpisodes, play
-from skillweave.types import Array, Policy, VecEnv
-
-MakeEnv = Callable[[int, Any], VecEnv]
-"""(num_envs, γ of a step: a number, or one for each environment) to an environment."""
-
-
-def first_episodes(
-    policy: Policy,
-    env: VecEnv,
-    seeds: Seeds,
-    *,
-    deterministic: bool = True,
-    max_steps: int = LONGEST_EPISODE,
-) -> tuple[Array, Array | None]:
-    """Play the first episode in each of N environments.
-
-    Equal seeds give equal starts, whoever plays. An episode that nothing has ended after
-    ``max_steps`` counts as it stands then.
-
-    Returns:
-        Undiscounted returns (N,) float64; and (N,) bool, which episodes succeeded: None where
-        the environment says nothing of success.
-    """
-    n = env.num_envs
-    returns, succeeded, told = np.zeros(n), np.zeros(n, bool), False
-    episodes = FirstEpisodes(env, seeds / "start", max_steps)
-    rng = (seeds / "act").numpy()
-    for played in play(policy, episodes, deterministic=deterministic, rng=rng):
-        counts = played.episode >= 0
-        returns += counts * np.asarray(played.reward, np.float64)
-        if "success" in played.step.info:
-            told = True
-            success = np.asarray(played.step.info["success"], bool)
-            succeeded |= counts & played.over & success
-    return returns, succeeded if told else None
+from skillweave.training.learner import crossed
+from skillweave.training.playing import episodes_of
+from skillweave.training.scene import Scene
 
 
 class PeriodicEvaluation:
     """Plays ``episodes`` episodes every so many steps of training; always the same starts."""
 
-    def __init__(
-        self, make_env: MakeEnv, gamma: float, seeds: Seeds, every: int | None, episodes: int
-    ) -> None:
-        self._make: Callable[[], VecEnv] = lambda: make_env(episodes, gamma)
+    def __init__(self, scene: Scene, seeds: Seeds, every: int | None, episodes: int) -> None:
+        self._scene, self._episodes = scene, episodes
         # The node's name is that of older versions, so that their runs have the same starts.
         self._seeds, self._every, self._last = seeds / "probe", every, 0
-        self._env: VecEnv | None = None
+        self._arena: Collector | None = None
         self._counted = 0
 
     def start(self, steps: int) -> None:
         """Training stands at ``steps``: what was due until here is done."""
         self._last = steps
 
-    def due(self, steps: int, policy: Callable[[], Policy]) -> dict[str, float]:
+    def due(self, steps: int, policy: Callable[[], AgentPolicy]) -> dict[str, float]:
         """Evaluate where it is time to, and tell metrics; else none."""
-        if self._every is None or not passed(self._every, self._last, steps):
+        if self._every is None or not crossed(self._every, self._last, steps):
             return {}
         self._last = steps
-        self._env = self._env or self._make()
-        returns, succeeded = first_episodes(policy(), self._env, self._seeds)
+        self._arena = self._arena or self._scene.collector(self._episodes, None)
+        told = episodes_of(policy(), self._arena, self._seeds)
+        returns, success = told[:, RETURN], told[:, SUCCESS]
         found = {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
-        return found if succeeded is None else found | {"eval_success": float(succeeded.mean())}
+        if np.isnan(success).all():
+            return found
+        return found | {"eval_success": float((success == 1.0).mean())}
 
     def spent(self) -> int:
         """Environment steps made since this was last asked."""
-        made = 0 if self._env is None else self._env.steps_made
+        made = 0 if self._arena is None else self._arena.engine.steps_made
         since, self._counted = made - self._counted, made
         return since
 
     def close(self) -> None:
         """Release the environments."""
-        if self._env is not None:
-            self._env.close()
+        if self._arena is not None:
+            self._arena.close()

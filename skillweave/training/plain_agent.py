@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium as gym
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
+from skillweave.algorithms.config import AlgorithmConfig, OnPolicy, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.buffers.memory import check_memory
-from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.envs.skill_env import SkillEnv
+from skillweave.buffers.ram import check_memory
+from skillweave.envs.make import EnvSpec
 from skillweave.messages import short
 from skillweave.runs.directory import RunDirectory
-from skillweave.skills import Reflex, Skill
 from skillweave.spaces import action_codec, obs_codec, obs_dtype, obs_shape
-from skillweave.training.periodic import MakeEnv
+from skillweave.training.scene import skill_scene
 from skillweave.training.stage import Stage, target_of
-from skillweave.types import SkillweaveError, VecEnv
+from skillweave.types import SkillweaveError
 
 AGENT = "agent"
 """What a plain agent's stage is named."""
@@ -81,8 +79,9 @@ class PlainAgent:
     def stages(self, name: str = AGENT) -> list[Stage]:
         """Its only stage; in runs of older versions it has another name."""
         target = target_of(self.target_return, self.target_success, AGENT)
-        make_env = task_env(self.spec)
-        return [Stage(name, "agent", self.algorithm, self.steps, lambda _: make_env, target)]
+        spec = self.spec
+        how = self.algorithm, self.steps, lambda _: skill_scene(spec), target
+        return [Stage(name, "agent", *how)]
 
     def manifest(self, seed: int) -> dict[str, Any]:
         """What a new run's ``run.json`` says."""
@@ -103,15 +102,6 @@ class PlainAgent:
 def load_agent_of(run: RunDirectory) -> AgentPolicy:
     """The policy of a finished run of a plain agent."""
     return run.load_policy(run.manifest["stages"][0]["name"])
-
-
-def task_env(spec: EnvSpec, skill: Skill | None = None, reflexes: Sequence[Reflex] = ()) -> MakeEnv:
-    """Makes environments that are seen through a skill; None: as they are."""
-
-    def make_env(num_envs: int, gamma: Any) -> VecEnv:
-        return SkillEnv(make_engine(spec, num_envs), skill, tuple(reflexes))
-
-    return make_env
 
 
 # Checks that declarations share
@@ -149,7 +139,8 @@ def check_fields(declared: Any) -> None:
 
 def check_rollout(config: AlgorithmConfig | None, space: gym.Space[Any]) -> None:
     """Raise a SkillweaveError where the rollouts of an on-policy algorithm take too much memory."""
-    if isinstance(config, PPO):
+    if isinstance(config, OnPolicy):
         each = 2 * obs_dtype(space).itemsize * math.prod(obs_shape(space)) + 32
         size = config.num_envs * config.n_steps
-        check_memory(size, each, str(short(space)), "rollout", "num_envs or n_steps")
+        what = f"a rollout of {size:,} transitions of {short(space)}"
+        check_memory(size, each, what, "num_envs or n_steps")

@@ -8,11 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
-from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
-from skillweave.seeding import Seeds
-from skillweave.types import Array, Memory, Policy, Step, VecEnv
+from skillweave.types import Array, Memory, Policy, Step
 
 
 @dataclass(slots=True)
@@ -139,43 +137,3 @@ class SeededEpisodes:
             self._episode[fresh] = np.arange(first, self._upcoming)
             self._elapsed[fresh] = 0
         return fresh
-
-
-class FirstEpisodes:
-    """The first episode in each environment of a training environment, which goes on by itself.
-
-    All environments act until each has ended its first episode; those after it do not count.
-    """
-
-    def __init__(self, env: VecEnv, seeds: Seeds, max_steps: int = LONGEST_EPISODE) -> None:
-        self.env, self.num_envs, self._max_steps = env, env.num_envs, max_steps
-        self._all = np.arange(env.num_envs)
-        self.rows = self._all
-        self._episode = np.arange(env.num_envs)
-        self._elapsed = np.zeros(env.num_envs, np.int64)
-        self.obs = env.reset(seeds)
-
-    def mask(self) -> Array | None:
-        """(N, A) bool, the actions allowed now, or None."""
-        return self.env.mask()
-
-    def step(self, action: Array) -> Played:
-        """Act everywhere."""
-        obs, made = self.obs, self.env.step(action)
-        self._elapsed = self._elapsed + made.steps
-        self.obs = made.obs
-        no = np.zeros(self.num_envs, bool)
-        step = Step(
-            obs, action, made.next_obs, made.reward, made.terminated, made.truncated, no,
-            self._elapsed, made.info,
-        )  # fmt: skip
-        reward = made.info.get("call_return", made.reward)
-        cut = ~made.ended & (self._elapsed >= self._max_steps)
-        return Played(self._all, self._episode, step, reward, made.steps, cut)
-
-    def go_on(self, played: Played) -> Array:
-        """Stop when every first episode is over."""
-        self._episode = np.where(played.over, -1, self._episode)
-        if (self._episode < 0).all():
-            self.rows = self._all[:0]
-        return self._all[:0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from skillweave.algorithms.policy import AgentPolicy
@@ -15,25 +13,10 @@ from skillweave.seeding import Seeds
 from skillweave.types import Array
 
 
-class MakeCollector(Protocol):
-    """Makes the collector that a stage learns through."""
-
-    def __call__(
-        self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
-    ) -> Collector:
-        """A collector of ``num_envs`` environments.
-
-        Args:
-            acting: the learners; None where they come later.
-            first: the number of the first environment, for messages.
-            shared: several learn from what each does, with a γ of their own.
-        """
-        ...
-
-
 def returns_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
     """Returns (N,) of one episode in each of the arena's environments, acting greedily."""
-    return episodes_of(policy, arena, seeds)[:, RETURN]
+    returns: Array = episodes_of(policy, arena, seeds)[:, RETURN]
+    return returns
 
 
 def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
@@ -44,4 +27,4 @@ def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
     gamma = np.array([algorithm.config.gamma])
     request = Request(0, (params,), gamma, seeds / "act", greedy=True)
     with torch_threads(1):  # several wait for each other, for ever on a busy machine
-        return player.play(request, seeds, LONGEST_EPISODE)
+        return player.play(request, seeds / "start", LONGEST_EPISODE)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from types import SimpleNamespace
 from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.messages import short
-from skillweave.training.off_policy import make_buffer
-from skillweave.training.periodic import MakeEnv
+from skillweave.training.learner import store_of
+from skillweave.training.scene import Scene
 from skillweave.types import Policy, SkillweaveError
 
 Policies = Mapping[str, Policy]
@@ -68,7 +66,7 @@ class Stage:
     """The algorithm's settings."""
     budget: int
     """Environment steps."""
-    env: Callable[[Policies], MakeEnv]
+    scene: Callable[[Policies], Scene]
     """Where it learns, given everyone who can act already."""
     target: Target | None = None
     """Where it may end early."""
@@ -120,13 +118,10 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
     """
     config = config_from_json(entry["algorithm"])
     algorithm = make_algorithm(config, observation_space, action_space)
-    if not isinstance(algorithm, OffPolicyAlgorithm):
+    if algorithm.store != "replay":
         return
     members = int((entry.get("evolution") or {"population": 1})["population"])
-    env: Any = SimpleNamespace(
-        num_envs=config.num_envs * members, observation_space=observation_space
-    )
-    try:
-        make_buffer(algorithm, env, members, shared=True)  # what is not written takes no memory
+    try:  # what is not written takes no memory
+        store_of(algorithm, config.num_envs * members, members, shared=members > 1)
     except SkillweaveError as error:
         raise SkillweaveError(f"stage {entry['name']!r}: {error}") from error

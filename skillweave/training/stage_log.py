@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, TypeVar
 
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.directory import RunDirectory
-from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
 from skillweave.types import SkillweaveError
 
+T = TypeVar("T")
 START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
 """Where a stage stands before its first update."""
 
@@ -71,6 +70,15 @@ class StageLog:
         for listener in self.listeners:
             listener.message(f"{self.entry['name']}: {text}")
 
+    def tell_begun_anew(self, count: int, of: int) -> None:
+        """Of ``of`` environments, ``count`` could not be brought back to where they were."""
+        if count:
+            self.tell(
+                f"{count} of {of} open episodes begin anew, so the end may differ from that of an "
+                "undisturbed run: given the same seed and the same actions, the environment does "
+                "not repeat itself"
+            )
+
     def save(self, state: Any | None, extra: Mapping[str, Tensor] | None, **more: Any) -> None:
         """Write a checkpoint: a state, what else resuming needs, and ``more`` in its header."""
         kept = ("update", "steps", "evaluation_steps", "seconds", "metrics")
@@ -100,22 +108,16 @@ class StageLog:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 
 
-def resume_episodes(
-    collector: Collector, saved: dict[str, Tensor], seeds: Seeds, log: StageLog
-) -> None:
-    """Bring the environments back to where a checkpoint left them; say where that cannot be."""
-    if not saved:
-        return
+def resumed(log: StageLog, restore: Callable[[], T]) -> T:
+    """What ``restore`` returns, which brings environments back to where a checkpoint left them.
+
+    Raises:
+        SkillweaveError: the checkpoint does not hold what belongs there.
+    """
     try:
-        collector.restore(saved, seeds / "restart" / log.at["update"])
+        return restore()
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
         raise SkillweaveError(
             f"{log.run.path}: the checkpoint of stage {log.entry['name']!r} does not hold "
             f"episodes of these environments: {error!r}"
         ) from error
-    if count := len(collector.begun_anew):
-        log.tell(
-            f"{count} of {collector.num_envs} open episodes begin anew, so the end may differ from "
-            "that of an undisturbed run: given the same seed and the same actions, the environment "
-            "does not repeat itself"
-        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -9,22 +10,23 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.base import state_to
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
-from skillweave.algorithms.off_policy import OffPolicyAlgorithm
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.algorithms.ppo import PPOAlgorithm
-from skillweave.messages import short
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.group import make_collectors
+from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
-from skillweave.training.episodes import Tick
-from skillweave.training.off_policy import train_off_policy
-from skillweave.training.on_policy import train_on_policy
-from skillweave.training.periodic import MakeEnv, PeriodicEvaluation
+from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.learner import Stack, learner_of
+from skillweave.training.loop import Progress, resume, train
+from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Stage, Target
-from skillweave.training.stage_log import START, Listener, StageLog, resume_episodes
+from skillweave.training.stage_log import START, Listener, StageLog, resumed
 from skillweave.types import Policy, SkillweaveError, unprefixed
 
 
@@ -37,7 +39,7 @@ class StageRun:
     run: RunDirectory
     seeds: Seeds
     """The stage's node of the seed tree."""
-    make_env: MakeEnv
+    scene: Scene
 
     @property
     def name(self) -> str:
@@ -100,58 +102,67 @@ class OneAgent:
 
     def open(self) -> Any:
         """Make the environments and the agent; the agent's state."""
-        stage, config = self.stage, self.stage.config
+        stage, config, scene = self.stage, self.stage.config, self.stage.scene
         manifest = stage.run.manifest
         every, episodes = manifest.get("eval_every"), manifest.get("eval_episodes", 0)
-        env = stage.make_env(config.num_envs, config.gamma)
-        self._open.callback(env.close)
-        self.evaluation = PeriodicEvaluation(
-            stage.make_env, config.gamma, stage.seeds, every, episodes
-        )
+        self.evaluation = PeriodicEvaluation(scene, stage.seeds, every, episodes)
         self._open.callback(self.evaluation.close)
-        self.algorithm = make_algorithm(config, env.observation_space, env.action_space)
-        self.collector = Collector(env)
-        self.state = self.algorithm.init([stage.seeds / "member" / 0])
-        return self.state
+        algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+
+        def collector(num_envs: int, first: int) -> Collector:
+            return scene.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
+
+        workers = int(stage.entry.get("workers", 1))
+        self.collectors = make_collectors(collector, config.num_envs, workers, 1, scene.name)
+        self._open.callback(self.collectors.close)
+        self.algorithm, self.episodes = algorithm, Episodes()
+        return algorithm.init([stage.seeds / "member" / 0])
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says."""
-        self.state = state
-        self._steps_before = log.at["steps"] - self.collector.env.steps_made
-        self._buffer = unprefixed("buffer", extra)
-        resume_episodes(self.collector, unprefixed("collector", extra), self.stage.seeds, log)
+        stage, config = self.stage, self.stage.config
+        stack = Stack(self.algorithm, state_to(state, resolve_device(config.device)))
+        self.learner = learner_of(
+            stack, config.num_envs, stage.seeds, row_steps=stage.scene.row_steps,
+            goes_on_at=log.at["steps"],
+        )  # fmt: skip
+        self._steps_before = int(log.at["steps"])
+        if extra:
+            ids = resumed(
+                log, lambda: resume(self.learner, self.collectors, self.episodes, extra)
+            )
+            log.tell_begun_anew(len(ids), self.collectors.num_envs)
         self.evaluation.start(log.at["steps"])
 
     def train(self, log: StageLog) -> AgentPolicy:
         """Learn until the budget is spent or the target is reached."""
-        target = self.stage.target
+        target, (stack,) = self.stage.target, self.learner.stacks
+        made = self.collectors.steps_made
 
         def on_tick(tick: Tick) -> None:
-            metrics = tick.metrics
-            metrics |= self.evaluation.due(
-                tick.steps, lambda: AgentPolicy.of(self.algorithm, tick.state)
-            )
+            policy = functools.partial(AgentPolicy.of, self.algorithm, stack.state)
+            found = self.evaluation.due(tick.steps, policy)
             log.at["evaluation_steps"] += self.evaluation.spent()
-            log.tick(tick.update, tick.steps, tick.seconds, metrics)
-            if target is not None and target.reached(metrics) is not None:
+            log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
+            if target is not None and target.reached(found) is not None:
                 # No checkpoint: who resumes from the one before comes here again.
                 raise _TargetReached
             if tick.cut:
-                log.save(tick.state, tick.extra)
+                log.save(state_to(stack.state, "cpu"), tick.extra)
 
-        how: dict[str, Any] = {k: log.at[k] for k in ("update", "steps", "seconds")}
-        how |= {"cut_every": int(self.stage.run.manifest["cut_every"]), "on_tick": on_tick}
-        how |= {"saved": self._buffer}
+        at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
         try:
-            run_loop(
-                self.algorithm, self.collector, self.state, self.stage.seeds, self.stage.budget, how
-            )
+            train(
+                self.learner, self.collectors, self.episodes, self.stage.seeds, self.stage.budget,
+                resume_from=at, cut_every=int(self.stage.run.manifest["cut_every"]),
+                on_tick=on_tick,
+            )  # fmt: skip
         except _TargetReached:
             assert target is not None
             # What was collected since the update was made, too.
-            log.at["steps"] = self._steps_before + self.collector.env.steps_made
+            log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
-        return AgentPolicy.of(self.algorithm, self.state)
+        return AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))
 
     def close(self) -> None:
         """Release the environments."""
@@ -160,35 +171,6 @@ class OneAgent:
 
 class _TargetReached(Exception):
     """Ends a loop: what it has learnt is good enough."""
-
-
-def run_loop(
-    algorithm: Algorithm,
-    collector: Collector,
-    state: Any,
-    seeds: Seeds,
-    budget: int,
-    how: dict[str, Any],
-) -> None:
-    """Train one agent by its algorithm's loop, state in place: the one place that calls loops.
-
-    Args:
-        how: ``cut_every``, ``update``, ``steps``, ``seconds``, ``on_tick`` of the loops, and
-            ``saved``, the replay buffer of a checkpoint.
-
-    Raises:
-        SkillweaveError: no loop is known for the algorithm.
-    """
-    if isinstance(algorithm, OffPolicyAlgorithm):
-        train_off_policy(algorithm, collector, state, seeds, budget, **how)
-    elif isinstance(algorithm, PPOAlgorithm):
-        how = {k: v for k, v in how.items() if k != "saved"}
-        train_on_policy(algorithm, collector, state, seeds, budget, **how)
-    else:
-        raise SkillweaveError(
-            f"no training loop is known for {short(algorithm)}: it must be an OffPolicyAlgorithm "
-            "or a PPOAlgorithm"
-        )
 
 
 def train_stage(
@@ -212,7 +194,7 @@ def train_stage(
     entry = run.stage(stage.name)
     if entry["status"] == "done":
         return run.load_policy(stage.name)
-    learner = make_learner(StageRun(entry, run, seeds, stage.env(policies or {})))
+    learner = make_learner(StageRun(entry, run, seeds, stage.scene(policies or {})))
     try:
         fresh = learner.open()
         kind = None if fresh is None else type(fresh)

@@ -74,7 +74,7 @@ def test_a_million_leaves_are_few_bytes():
 
 def test_draws_are_stratified():
     priorities = Priorities(1, 100, 1.0)
-    priorities.turn(np.arange(100), np.arange(0))
+    priorities.set_new(np.zeros(100, int), np.arange(100), np.ones(100, bool))
     slot, weight = priorities.draw(np.random.default_rng(0).random((1, 100)), 0.4)
     assert slot.tolist() == [list(range(100))]
     assert (weight == 1).all()
@@ -93,4 +93,13 @@ def test_weights_by_hand():
 def test_no_priority_is_zero():
     priorities = Priorities(1, 2, 1.0)
     priorities.update(np.zeros(2, int), np.array([0, 1]), np.zeros(2, np.float32))
-    assert priorities.state(2)["priority"].tolist() == [pytest.approx([FLOOR, FLOOR])]
+    assert priorities.written(2)["priority"].tolist() == [pytest.approx([FLOOR, FLOOR])]
+
+
+def test_new_slots_get_their_members_highest_priority_and_others_none():
+    priorities = Priorities(2, 3, 0.5)
+    priorities.update(np.array([1]), np.array([2]), np.array([9.0], np.float32))
+    member, slot = np.array([0, 0, 0, 1, 1]), np.array([0, 1, 0, 0, 2])
+    priorities.set_new(member, slot, np.array([False, True, True, True, False]))
+    # the last of slots named twice counts; 9^0.5 of member 1
+    assert priorities.written(3)["priority"].tolist() == [[1, 1, 0], [3, 0, 0]]

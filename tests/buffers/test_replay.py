@@ -1,4 +1,5 @@
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields
+from types import SimpleNamespace
 from unittest import mock
 
 import gymnasium as gym
@@ -7,16 +8,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain_replay import SPACE, A, World
 
-from skillweave.buffers import memory
-from skillweave.buffers.replay import ReplayBuffer
-from skillweave.experience import Sample
-from skillweave.spaces import obs_dtype
-from skillweave.types import SkillweaveError, VecStep
+from skillweave.buffers import ram
+from skillweave.buffers.replay import ReplayStore, replay_store
+from skillweave.experience import Experience, Sample
+from skillweave.spaces import action_codec, obs_dtype
+from skillweave.types import SkillweaveError
 
-SPACE = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
 GAMMA = torch.tensor([0.9, 0.5, 0.99])
-A = 3
 
 
 def generators(members: int, seed: int = 0) -> list[np.random.Generator]:
@@ -30,47 +30,50 @@ def same(a: Sample, b: Sample) -> bool:
     return all(equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Sample))
 
 
+def make(capacity: int, num_envs: int = 1, members: int = 1, **kwargs) -> ReplayStore:
+    return ReplayStore(capacity, num_envs, members, SPACE, (), np.int64, mask_size=A, **kwargs)
+
+
 # One column by hand: observations are the time, the true successor of an ended step is t + 0.5
 
 
-def line(rewards, ends="", capacity=100, steps=None, **kwargs) -> ReplayBuffer:
-    """``ends`` has a letter a step: t terminated, l time limit, b both, . goes on; c is a cut."""
-    buffer = ReplayBuffer(capacity, 1, 1, SPACE, (), np.int64, mask_size=A, **kwargs)
-    for t, reward in enumerate(rewards):
-        end = ends[t] if t < len(ends) else "."
-        terminated, truncated = np.array([end in "tb"]), np.array([end in "lb"])
-        true = t + (0.5 if end in "tlb" else 1.0)
-        buffer.add(
-            np.full((1, 2), t, np.float32),
-            None,
-            np.array([t % A]),
-            VecStep(
-                np.full((1, 2), true, np.float32),
-                np.full((1, 2), t + 1, np.float32),
-                np.array([reward], np.float32),
-                terminated,
-                truncated,
-                np.array([1 if steps is None else steps[t]]),
-                None,
-                {},
-            ),
+def line(rewards, ends="", capacity=100, steps=None, at_once=1, **kwargs) -> ReplayStore:
+    """``ends`` has a letter a step: t terminated, l time limit, . goes on; c is a cut."""
+    store = make(capacity, **kwargs)
+    ends = ends.ljust(len(rewards), ".")
+    time = np.arange(len(rewards), dtype=np.float32)
+    ended = np.array([end in "tl" for end in ends])
+    obs, after = (np.repeat(x[:, None, None], 2, 2) for x in (time, time + 1 - 0.5 * ended))
+    for t in range(0, len(rewards), at_once):
+        part = slice(t, t + at_once)
+        store.add(
+            Experience(
+                obs[part],
+                (np.arange(len(rewards)) % A)[part, None],
+                np.float32(rewards)[part, None],
+                np.array(steps or [1] * len(rewards))[part, None],
+                np.array([[end == "t"] for end in ends])[part],
+                np.array([[end == "l"] for end in ends])[part],
+                after[part],
+            )
         )
-        if end == "c":
-            buffer.cut(np.arange(1))
-    return buffer
+        if ends[t] == "c":
+            store.cut(np.arange(1))
+    return store
 
 
-def by_time(buffer: ReplayBuffer, gamma: float = 0.5) -> dict[int, tuple[float, float, float]]:
+def by_time(store: ReplayStore, gamma: float = 0.5) -> dict[int, tuple[float, float, float]]:
     """Time to reward, discount and next_obs, of everything that can be sampled."""
-    s = buffer.sample(1000, torch.tensor([gamma]), generators(1))
+    s = store.sample(1000, torch.tensor([gamma]), generators(1))
     rows = zip(s.obs[0, :, 0], s.reward[0], s.discount[0], s.next_obs[0, :, 0], strict=True)
     return {int(t): (float(r), float(d), float(n)) for t, r, d, n in rows}
 
 
-def test_one_step():
-    buffer = line([1, 2, 4, 8], ".tl.")
-    assert len(buffer) == 4
-    assert by_time(buffer) == {
+@pytest.mark.parametrize("at_once", [1, 3, 4])
+def test_one_step(at_once):
+    store = line([1, 2, 4, 8], ".tl.", at_once=at_once)
+    assert len(store) == 4
+    assert by_time(store) == {
         0: (1, 0.5, 1), 1: (2, 0, 1.5), 2: (4, 0.5, 2.5), 3: (8, 0.5, 4)
     }  # fmt: skip
 
@@ -82,7 +85,7 @@ def test_n_steps_stop_at_ends_cuts_and_the_newest_step():
         2: (4 + 8 / 2, 0.25, 4),
         3: (8, 0.5, 4),
     }
-    for end, factor, successor in ("t", 0, 1.5), ("b", 0, 1.5), ("l", 1, 1.5), ("c", 1, 2):
+    for end, factor, successor in ("t", 0, 1.5), ("l", 1, 1.5), ("c", 1, 2):
         found = by_time(line([1, 2, 4, 8], f".{end}", n_step=3))
         assert found[0] == (2, 0.25 * factor, successor)
         assert found[1] == (2, 0.5 * factor, successor)
@@ -90,145 +93,41 @@ def test_n_steps_stop_at_ends_cuts_and_the_newest_step():
 
 
 def test_calls_discount_by_their_length():
-    buffer = line([1, 2, 4], steps=[1, 3, 2], n_step=2)
-    assert by_time(buffer) == {0: (2, 1 / 16, 2), 1: (2.5, 1 / 32, 3), 2: (4, 0.25, 3)}
+    store = line([1, 2, 4], steps=[1, 3, 2], n_step=2)
+    assert by_time(store) == {0: (2, 1 / 16, 2), 1: (2.5, 1 / 32, 3), 2: (4, 0.25, 3)}
 
 
-def test_overwritten_steps_are_gone():
-    buffer = line(range(10), "l.....l", capacity=4)
-    assert len(buffer) == 4
-    assert by_time(buffer) == {
-        6: (6, 0.5, 6.5), 7: (7, 0.5, 8), 8: (8, 0.5, 9), 9: (9, 0.5, 10)
-    }  # fmt: skip
+@pytest.mark.parametrize("at_once", [1, 2, 10])
+def test_overwritten_steps_are_gone_and_an_end_takes_the_room_of_a_step(at_once):
+    store = line(range(10), "l.....l", capacity=4, at_once=at_once)
+    assert len(store) == 3
+    assert by_time(store) == {7: (7, 0.5, 8), 8: (8, 0.5, 9), 9: (9, 0.5, 10)}
+    store = line(range(9), "l......l", capacity=4, at_once=at_once)
+    assert by_time(store) == {6: (6, 0.5, 7), 7: (7, 0.5, 7.5), 8: (8, 0.5, 9)}
 
 
-def test_cutting_an_empty_or_a_cut_buffer_does_nothing():
-    buffer = ReplayBuffer(10, 1, 1, SPACE, (), np.int64)
-    buffer.cut(np.arange(1))
-    assert len(buffer) == 0
-    buffer = line([1, 2], ".c")
-    before = buffer.state()
-    buffer.cut(np.arange(1))
-    after = buffer.state()
+def test_cutting_an_empty_or_a_cut_store_does_nothing():
+    store = make(10)
+    store.cut(np.arange(1))
+    assert len(store) == 0
+    store = line([1, 2], ".c")
+    before = store.state()
+    store.cut(np.arange(1))
+    after = store.state()
     assert all(torch.equal(after[name], before[name]) for name in before)
 
 
-# Everything else against a naive buffer that keeps whole transitions
+def test_an_experience_of_nobody_changes_nothing():
+    store = line([1, 2, 4])
+    before = store.state()
+    nobody = World(store, 1, np.random.default_rng(0), filled=0.0)
+    store.add(nobody.collect(3))
+    store.add(nobody.collect(0))
+    after = store.state()
+    assert all(torch.equal(after[name], before[name]) for name in before)
 
 
-@dataclass
-class Kept:
-    obs: np.ndarray
-    obs_mask: np.ndarray
-    action: np.ndarray
-    reward: float
-    next_obs: np.ndarray
-    allowed: np.ndarray
-    terminated: bool
-    ended: bool
-    steps: int
-    rewards: np.ndarray | None = None  # of each step, where members with other γ learn from them
-
-
-@dataclass
-class World:
-    """Random steps of N columns, added to a buffer and noted one by one."""
-
-    buffer: ReplayBuffer
-    num_envs: int
-    rng: np.random.Generator
-    ending: float
-    longest: int
-    masked: float
-    told: bool = False  # the rewards of each step of a call
-
-    def __post_init__(self) -> None:
-        self.history: list[list[Kept]] = []
-        self.obs, self.mask = self.draw(), self.draw_mask()
-
-    def draw(self):
-        return self.rng.random((self.num_envs, 2), dtype=np.float32)
-
-    def draw_mask(self):
-        given = self.rng.random() < self.masked
-        return self.rng.random((self.num_envs, A)) < 0.5 if given else None
-
-    def restart(self, columns: np.ndarray) -> None:
-        obs, mask = self.draw(), self.draw_mask()
-        self.obs = self.obs.copy()
-        self.obs[columns] = obs[columns]
-        if len(columns) == self.num_envs:
-            self.mask = mask
-        elif self.mask is not None and mask is not None:
-            self.mask = self.mask.copy()
-            self.mask[columns] = mask[columns]
-
-    def step(self) -> None:
-        n, rng = self.num_envs, self.rng
-        terminated, truncated = rng.random((2, n)) < self.ending
-        ended = terminated | truncated
-        true, mask, allowed = self.draw(), self.draw_mask(), self.draw_mask()
-        if allowed is not None:
-            allowed[~ended] = True if mask is None else mask[~ended]
-        steps, info = rng.integers(1, self.longest + 1, n), {}
-        reward = rng.random(n, dtype=np.float32)
-        if self.told:
-            rewards = rng.random((n, int(steps.max())), dtype=np.float32)
-            info["rewards"] = rewards * (np.arange(rewards.shape[1]) < steps[:, None])
-            reward = info["rewards"] @ np.float32(0.7) ** np.arange(rewards.shape[1])
-        step = VecStep(
-            true, np.where(ended[:, None], self.draw(), true), reward,
-            terminated, truncated, steps, mask, info, allowed,
-        )  # fmt: skip
-        action = rng.integers(A, size=n)
-        self.buffer.add(self.obs, self.mask, action, step)
-        row, everything = [], np.ones(A, bool)
-        for i in range(n):
-            after = allowed if ended[i] else mask
-            row.append(
-                Kept(
-                    self.obs[i], everything if self.mask is None else self.mask[i], action[i],
-                    step.reward[i], true[i],
-                    everything if after is None else after[i],
-                    terminated[i], ended[i], step.steps[i],
-                    info["rewards"][i] if self.told else None,
-                )
-            )  # fmt: skip
-        self.history.append(row)
-        self.obs, self.mask = step.obs, mask
-
-    def cut(self) -> None:
-        """Some environments begin anew."""
-        columns = np.flatnonzero(self.rng.random(self.num_envs) < 0.5)
-        self.buffer.cut(columns)
-        for i in columns if self.history else ():
-            self.history[-1][i] = replace(self.history[-1][i], ended=True)
-        self.restart(columns)
-
-    def expected(self, index: int, n_step: int, gamma: float) -> dict:
-        t, column = divmod(index, self.num_envs)
-        reward, discount = 0.0, 1.0
-        between = {"obs": np.zeros((n_step - 1, 2)), "mask": np.ones((n_step - 1, A), bool)}
-        counts = np.zeros(n_step - 1)
-        for k, kept in enumerate(row[column] for row in self.history[t : t + n_step]):
-            if k:
-                between["obs"][k - 1], between["mask"][k - 1] = kept.obs, kept.obs_mask
-                counts[k - 1] = discount
-            own = kept.reward
-            if kept.rewards is not None:
-                own = sum(gamma**i * r for i, r in enumerate(kept.rewards))
-            reward += discount * own
-            discount *= gamma**kept.steps
-            if kept.ended:
-                break
-        first = self.history[t][column]
-        discount *= not kept.terminated
-        return {
-            "obs": first.obs, "obs_mask": first.obs_mask, "action": first.action,
-            "reward": reward, "discount": discount, "next_obs": kept.next_obs,
-            "mask": kept.allowed, "between_discount": counts,
-            "between_obs": between["obs"], "between_mask": between["mask"],
-        }  # fmt: skip
+# Everything else against the plainest replay there is
 
 
 @given(
@@ -240,50 +139,60 @@ class World:
     ending=st.sampled_from([0.0, 0.2, 0.6, 1.0]),
     longest=st.sampled_from([1, 10]),
     masked=st.sampled_from([0.0, 0.5, 1.0]),
+    filled=st.sampled_from([1.0, 0.6, 0.1]),
     shared=st.booleans(),
     prioritized=st.booleans(),
     between=st.booleans(),
     told=st.booleans(),
-    plan=st.lists(st.sampled_from("aaaaaaacsu"), min_size=1, max_size=40),
+    plan=st.lists(st.sampled_from("11111135csu"), min_size=1, max_size=30),
 )
 @settings(max_examples=150, deadline=None)
-def test_samples_equal_a_naive_buffers(
-    seed, members, width, rows, n_step, ending, longest, masked, shared, prioritized, between,
-    told, plan,
+def test_samples_equal_a_plain_lists(
+    seed, members, width, rows, n_step, ending, longest, masked, filled, shared, prioritized,
+    between, told, plan,
 ):  # fmt: skip
     n, gamma, rng = members * width, GAMMA[:members], np.random.default_rng(seed)
 
-    def make() -> ReplayBuffer:
-        return ReplayBuffer(
-            rows * n + n - 1, n, members, SPACE, (), np.int64,
-            mask_size=A, shared=shared, n_step=n_step, prioritized=prioritized, between=between,
+    def made() -> ReplayStore:
+        return make(
+            rows * n + n - 1, n, members, shared=shared, n_step=n_step, prioritized=prioritized,
+            between=between,
         )  # fmt: skip
 
-    world = World(make(), n, rng, ending, longest, masked, told and shared)
-    for what in ["a", *plan, "s"]:
-        if what == "a":
-            world.step()
+    world = World(made(), n, rng, ending, longest, masked, filled, told and shared)
+    for what in ["1", *plan, "s"]:
+        store = world.store
+        if what.isdigit():
+            world.add(int(what))
+            live = world.live(rows + 1)
+            assert len(store) == len(live)
+            own = {index % n // (n if shared else width) for index in live}
+            assert store.ready == (len(own) == (1 if shared else members))
         elif what == "c":
             world.cut()
+        elif not store.ready:
+            with pytest.raises(AssertionError, match="before add"):
+                store.sample(1, gamma, generators(members))
         elif what == "u":
-            drawn = world.buffer.sample(4, gamma, generators(members, seed))
+            drawn = store.sample(4, gamma, generators(members, seed))
             new = torch.from_numpy(rng.random((members, 4), dtype=np.float32))
-            world.buffer.update_priorities(drawn.index, new)
+            store.update_priorities(drawn.index, new)
         else:
-            check(world, gamma, n_step, shared, seed)
-            other = make()
-            other.load({k: v.clone() for k, v in world.buffer.state().items()})
-            same_draws = [b.sample(9, gamma, generators(members)) for b in (world.buffer, other)]
+            check(world, rows + 1, gamma, n_step, shared, seed)
+            other = made()
+            other.load({k: v.clone() for k, v in store.state().items()})
+            same_draws = [b.sample(9, gamma, generators(members)) for b in (store, other)]
             assert same(*same_draws)
-            world.buffer = other  # and goes on in the copy
+            world.store = other  # and goes on in the copy
 
 
-def check(world: World, gamma: torch.Tensor, n_step: int, shared: bool, seed: int) -> None:
+def check(
+    world: World, rows: int, gamma: torch.Tensor, n_step: int, shared: bool, seed: int
+) -> None:
     members, n = len(gamma), world.num_envs
-    sample = world.buffer.sample(30, gamma, generators(members, seed))
-    oldest = len(world.history) * n - len(world.buffer)
-    assert oldest <= sample.index.min()
-    assert sample.index.max() < len(world.history) * n
+    sample = world.store.sample(30, gamma, generators(members, seed), progress=0.5)
+    assert sample.progress == 0.5
+    assert set(sample.index.ravel().tolist()) <= world.live(rows)
     for p in range(members):
         own = sample.index[p] % n * members // n == p
         assert shared or own.all()
@@ -292,7 +201,7 @@ def check(world: World, gamma: torch.Tensor, n_step: int, shared: bool, seed: in
             for name, value in expected.items():
                 found = getattr(sample, name)
                 if found is None:
-                    alone = n_step == 1 or not world.buffer._between
+                    alone = n_step == 1 or not world.store._between
                     assert "mask" in name or (alone and "between" in name)
                     assert alone or value.all()
                 elif name in ("between_obs", "between_mask"):  # what counts for nothing is any
@@ -304,42 +213,65 @@ def check(world: World, gamma: torch.Tensor, n_step: int, shared: bool, seed: in
 
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("prioritized", [False, True])
-def test_every_transition_is_drawn_as_often(shared, prioritized):
-    kwargs = {"shared": shared, "prioritized": prioritized}
-    buffer = ReplayBuffer(24, 4, 2, SPACE, (), np.int64, mask_size=A, **kwargs)
-    world = World(buffer, 4, np.random.default_rng(0), 0.3, 1, 0.0)
-    for _ in range(11):
-        world.step()
-    drawn = buffer.sample(12_000, GAMMA[:2], generators(2)).index
+def test_every_transition_is_drawn_as_often_however_long_columns_and_episodes_are(
+    shared, prioritized
+):
+    """Columns are filled 1 : 3 : 9 : 27, and the fullest has overwritten its oldest."""
+    store = make(4 * 16, 4, 2, shared=shared, prioritized=prioritized)
+    world = World(store, 4, np.random.default_rng(0), ending=0.3)
+    for c, rows in enumerate((1, 3, 9, 27)):
+        for _ in range(rows):
+            store.add(world.collect(only=c))
+    live = world.live(17)
+    assert len(store) == len(live)
+    drawn = store.sample(12_000, GAMMA[:2], generators(2)).index
     for p in range(2):
+        own = sorted(i for i in live if shared or i % 4 // 2 == p)
         values, counts = np.unique(drawn[p], return_counts=True)
-        own = [i for i in range(20, 44) if shared or i % 4 // 2 == p]
         assert values.tolist() == own
         expected = 12_000 / len(own)
-        assert ((counts - expected) ** 2 / expected).sum() < 50  # 23 degrees: p about 0.001
+        assert ((counts - expected) ** 2 / expected).sum() < 50  # about 25 degrees: p about 0.002
+
+
+def test_one_filled_column_of_many_is_sampled():
+    store = make(512 * 300, 512)
+    world = World(store, 512, np.random.default_rng(0), ending=0.0)
+    for _ in range(300):
+        store.add(world.collect(only=7))
+    drawn = store.sample(3000, GAMMA[:1], generators(1)).index
+    assert (drawn % 512 == 7).all()
+    assert len(np.unique(drawn)) > 295
 
 
 # Kinds of data
 
 
+def rows_of(obs, action, after, truncated=None) -> Experience:
+    """One row of plain steps."""
+    n = len(action)
+    no = np.zeros((1, n), bool)
+    return Experience(
+        obs[None], action[None], np.zeros((1, n), np.float32), np.ones((1, n), np.int64), no,
+        no if truncated is None else truncated[None], after[None],
+    )  # fmt: skip
+
+
 def test_boxes_of_actions_stay_as_they_are_and_choices_become_int64():
-    action = np.random.default_rng(0).random((2, 3), dtype=np.float32)
-    step = VecStep(
-        *np.zeros((2, 2, 2), np.float32), np.zeros(2), *np.zeros((2, 2), bool), np.ones(2), None, {}
-    )
-    boxes = ReplayBuffer(10, 2, 2, SPACE, (3,), np.float32)
-    boxes.add(step.obs, None, action, step)
+    action, obs = np.random.default_rng(0).random((2, 3), dtype=np.float32), np.zeros((2, 2))
+    boxes = ReplayStore(10, 2, 2, SPACE, (3,), np.float32)
+    boxes.add(rows_of(obs, action, obs))
     sample = boxes.sample(1, GAMMA[:2], generators(2))
     assert torch.equal(sample.action[:, 0], torch.from_numpy(action))
+    assert sample.obs_mask is None
     assert sample.next_obs_mask is None
     assert sample.weight is None
     for choices, bytes_each in (256, 1), (257, 2), (40_000, 4):
-        buffer = ReplayBuffer(10, 2, 2, SPACE, (), np.int64, mask_size=choices)
-        buffer.add(step.obs, None, np.array([0, choices - 1]), step)
-        sample = buffer.sample(1, GAMMA[:2], generators(2))
+        store = ReplayStore(10, 2, 2, SPACE, (), np.int64, mask_size=choices)
+        store.add(rows_of(obs, np.array([0, choices - 1]), obs))
+        sample = store.sample(1, GAMMA[:2], generators(2))
         assert sample.action.dtype == torch.int64
         assert sample.action.tolist() == [[0], [choices - 1]]
-        assert buffer.state()["action"].element_size() == bytes_each
+        assert store.state()["action"].element_size() == bytes_each
 
 
 def test_structured_observations_become_bytes():
@@ -347,52 +279,81 @@ def test_structured_observations_become_bytes():
         {"far": gym.spaces.Box(-1, 1, (2,), np.float64), "near": gym.spaces.Discrete(7)}
     )
     rng, kind = np.random.default_rng(0), obs_dtype(space)
-    first, true, new = (np.zeros(2, kind) for _ in range(3))
-    for obs in (first, true, new):
+    first, true = (np.zeros(2, kind) for _ in range(2))
+    for obs in (first, true):
         obs["far"], obs["near"] = rng.random((2, 2)), rng.integers(7, size=2)
-    new[0] = true[0]
-    step = VecStep(
-        true, new, np.zeros(2), np.zeros(2, bool), np.array([False, True]), np.ones(2), None, {}
-    )
-    buffer = ReplayBuffer(6, 2, 2, space, (), np.int64, mask_size=A)
-    buffer.add(first, None, np.zeros(2), step)
-    other = ReplayBuffer(6, 2, 2, space, (), np.int64, mask_size=A)
-    other.load(buffer.state())
-    for b in buffer, other:
+    store, other = (ReplayStore(6, 2, 2, space, (), np.int64, mask_size=A) for _ in range(2))
+    store.add(rows_of(first, np.zeros(2), true, np.array([False, True])))
+    other.load(store.state())
+    for b in store, other:
         sample = b.sample(1, GAMMA[:2], generators(2))
         for found, expected in (sample.obs, first), (sample.next_obs, true):
             assert found.dtype == torch.uint8
             assert np.array_equal(found.numpy().view(kind).reshape(2), expected)
 
 
-def test_the_buffer_keeps_copies_and_so_does_its_state():
-    world = World(
-        ReplayBuffer(8, 2, 1, SPACE, (), np.int64, mask_size=A, prioritized=True),
-        2, np.random.default_rng(0), 0.3, 10, 1.0,
-    )  # fmt: skip
+def test_samples_are_on_the_learners_device():
+    store = World(make(9, n_step=2, prioritized=True, between=True, device="meta"), 1,
+                  np.random.default_rng(0), masked=1.0)  # fmt: skip
+    store.add(5)
+    sample = store.store.sample(4, GAMMA[:1], generators(1))
+    tensors = [
+        getattr(sample, f.name) for f in fields(Sample) if f.name not in ("index", "progress")
+    ]
+    assert {x.device.type for x in tensors} == {"meta"}
+    assert isinstance(sample.index, np.ndarray)
+
+
+# Going on from a checkpoint
+
+
+def test_the_store_keeps_copies_and_so_does_its_state():
+    store = make(8, 2, prioritized=True)
+    world = World(store, 2, np.random.default_rng(0), longest=10, masked=1.0, filled=0.7)
     for _ in range(7):
-        world.step()
-    state, before = world.buffer.state(), world.buffer.sample(9, GAMMA[:1], generators(1))
+        e = world.collect(2)
+        store.add(e)
+        e.obs += 99
+        e.next_obs += 99
+    state, before = store.state(), store.sample(9, GAMMA[:1], generators(1))
     for _ in range(5):
-        world.step()
-        world.obs += 99
-    world.buffer.load(state)
-    assert same(before, world.buffer.sample(9, GAMMA[:1], generators(1)))
+        world.add()
+    store.load(state)
+    assert same(before, store.sample(9, GAMMA[:1], generators(1)))
     assert before.obs.max() < 99
+    assert before.next_obs.max() < 99
 
 
 def test_a_state_without_masks_and_calls_replaces_one_with_them():
-    def world(masked, longest):
-        buffer = ReplayBuffer(8, 2, 1, SPACE, (), np.int64, mask_size=A)
-        return World(buffer, 2, np.random.default_rng(0), 0.3, longest, masked)
+    def world(masked, longest, rows):
+        store = make(8, 2, shared=True)
+        found = World(store, 2, np.random.default_rng(0), 0.3, longest, masked)
+        found.add(rows)
+        return found
 
-    plain, rich = world(0.0, 1), world(1.0, 10)
-    for _ in range(6):
-        plain.step()
-        rich.step()
-    rich.buffer.load(plain.buffer.state())
-    draws = [w.buffer.sample(9, GAMMA[:1], generators(1)) for w in (plain, rich)]
+    plain, rich = world(0.0, 1, 2), world(1.0, 10, 6)
+    rich.store.load(plain.store.state())
+    draws = [w.store.sample(9, GAMMA[:1], generators(1)) for w in (plain, rich)]
     assert same(*draws)
+    assert len(rich.store) == len(plain.store)
+
+
+def test_a_checkpoint_of_an_older_layout_or_of_other_settings_is_refused():
+    older = {"at": torch.zeros(3), "obs": torch.zeros(4, 2), "end": torch.zeros(4)}
+    with pytest.raises(SkillweaveError, match="written by an older version of Skillweave"):
+        make(8).load(older)
+    state = line([1, 2, 4], capacity=8).state()
+    with pytest.raises(SkillweaveError) as error:
+        ReplayStore(8, 1, 1, gym.spaces.Box(-1, 1, (3,)), (), np.int64).load(state)
+    assert str(error.value) == (
+        "the checkpoint's replay buffer does not fit: 'obs' is torch.float32 (4, 2), where "
+        "torch.float32 (4, 3) belongs; go on with the settings that it was written with, or "
+        "begin a new run"
+    )
+    with pytest.raises(SkillweaveError, match=r"'priority' is missing"):
+        make(8, prioritized=True).load(state)
+    with pytest.raises(SkillweaveError, match=r"'newest' is torch.int64 \(1,\), where .* \(2,\)"):
+        make(8, 2).load(state)
 
 
 # Size
@@ -401,60 +362,86 @@ def test_a_state_without_masks_and_calls_replaces_one_with_them():
 def test_a_million_lunar_lander_transitions_take_at_most_90_megabytes():
     space = gym.spaces.Box(-1, 1, (8,), np.float32)
     for prioritized in False, True:
-        buffer = ReplayBuffer(
+        store = ReplayStore(
             1_000_000, 16, 1, space, (), np.int64, mask_size=4, prioritized=prioritized
         )
-        assert buffer.nbytes <= 90e6
-        zeros, never = np.zeros((16, 8), np.float32), np.zeros(16, bool)
-        step = VecStep(zeros, zeros, np.zeros(16), never, never, np.full(16, 2), None, {})
-        step.mask = np.ones((16, 4), bool)
-        buffer.add(zeros, step.mask, np.zeros(16), step)
-        assert buffer.nbytes <= 90e6  # with masks and calls
-
-
-def test_side_ring_grows_only_as_far_as_ends_are_kept():
-    buffer = ReplayBuffer(256, 1, 1, SPACE, (), np.int64, mask_size=A)
-    world = World(buffer, 1, np.random.default_rng(0), 0.1, 1, 0.5)
-    sizes = []
-    for t in range(1000):
-        world.ending = 0.08 if t < 500 else 1.0  # first few ends, of which some are gone
-        world.step()
-        sizes.append(len(buffer.state()["obs_ends"]))
-        if t % 50 == 0:
-            check(world, GAMMA[:1], 1, False, t)
-    assert sizes[499] == 64
-    assert sorted(set(sizes)) == [64, 128, 256]
+        assert store.nbytes <= (43e6 if prioritized else 39e6)
+        e = rows_of(np.zeros((16, 8)), np.zeros(16), np.zeros((16, 8)))
+        e.steps[:], e.obs_mask = 2, np.ones((1, 16, 4), bool)
+        store.add(e)
+        assert store.nbytes <= 90e6  # with masks and calls
 
 
 def test_more_than_the_memory_is_an_error_that_says_how_much_would_fit():
-    space = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8)
+    config = SimpleNamespace(buffer_size=1_000_000, n_step=1, prioritized=False, priority_alpha=0.6)
+    space, codec = gym.spaces.Box(0, 255, (4, 84, 84), np.uint8), gym.spaces.Discrete(6)
     with (
-        mock.patch.object(memory, "free_memory", return_value=int(11.2 * 2**30)),
+        mock.patch.object(ram, "free_memory", return_value=int(11.2 * 2**30)),
         pytest.raises(SkillweaveError) as error,
     ):
-        ReplayBuffer(1_000_000, 8, 1, space, (), np.int64, mask_size=6)
+        replay_store(config, action_codec(codec), space, num_envs=8)
     assert str(error.value) == (
         "a replay buffer of 1,000,000 transitions of (4, 84, 84) uint8 needs 26.3 GiB, "
-        "but 11.2 GiB are free: lower buffer_size (at most about 425,937)"
+        "but 11.2 GiB are free: lower buffer_size (at most about 425,997)"
     )
-    free = memory.free_memory()
+    free = ram.free_memory()
     assert free is None or 2**20 < free < 2**50
 
 
-def test_too_small_and_empty_buffers_are_errors():
+def test_the_room_for_rewards_of_calls_counts_as_well():
+    def fits(free: int, **kwargs) -> bool:
+        with mock.patch.object(ram, "free_memory", return_value=free):
+            try:
+                make(1000, **kwargs)
+            except SkillweaveError:
+                return False
+        return True
+
+    each = 8 + 1 + 4 + 1  # obs, action, reward, kind
+    assert [fits(1000 * each + k) for k in (-1, 0)] == [False, True]
+    assert [fits(1000 * (each + 12) + k, shared=True) for k in (-1, 0)] == [False, True]
+    assert [fits(1000 * (each + 4) + k, prioritized=True) for k in (-1, 0)] == [False, True]
+    world = World(make(1000, shared=True), 1, np.random.default_rng(0), longest=9, told=True)
+    with (
+        mock.patch.object(ram, "free_memory", return_value=1500),
+        pytest.raises(SkillweaveError, match=r"room for the rewards of .* steps of calls needs"),
+    ):
+        world.add(500)
+
+
+@pytest.mark.parametrize(
+    ("shared", "members", "most"), [(False, 1, 10), (False, 3, 30), (True, 3, 9)]
+)
+def test_a_store_is_made_from_an_algorithms_settings(shared, members, most):
+    config = SimpleNamespace(buffer_size=10, n_step=3, prioritized=True, priority_alpha=0.5)
+    box = action_codec(gym.spaces.Box(-1, 1, (2,)))
+    store = replay_store(config, box, SPACE, members, members, shared=shared, between=True)
+    action = np.zeros((members, 2), np.float32)
+    for _ in range(20):
+        store.add(rows_of(np.zeros((members, 2)), action, np.zeros((members, 2))))
+    assert len(store) == most
+    sample = store.sample(5, GAMMA[:members], generators(members))
+    assert sample.action.shape == (members, 5, 2)
+    assert sample.between_obs.shape == (members, 5, 2, 2)
+    assert sample.weight is not None
+
+
+def test_too_small_and_empty_stores_are_errors():
     with pytest.raises(SkillweaveError, match="buffer_size is 3; it must be at least num_envs, 4"):
-        ReplayBuffer(3, 4, 1, SPACE, (), np.int64)
-    with pytest.raises(AssertionError, match="before add"):
-        ReplayBuffer(4, 4, 1, SPACE, (), np.int64).sample(1, GAMMA[:1], generators(1))
+        make(3, 4)
+    for prioritized in False, True:
+        with pytest.raises(AssertionError, match="before add"):
+            make(4, 4, prioritized=prioritized).sample(1, GAMMA[:1], generators(1))
 
 
 # Priorities
 
 
-def places(buffer: ReplayBuffer, batch: int = 20_000, beta: float = 1.0) -> tuple[dict, dict]:
-    """How often each transition is drawn, and its weight."""
-    sample = buffer.sample(batch, GAMMA[:1], generators(1), beta)
-    values, first, counts = np.unique(sample.index, return_index=True, return_counts=True)
+def places(store: ReplayStore, batch: int = 20_000, beta: float = 1.0) -> tuple[dict, dict]:
+    """How often each transition is drawn, by its time, and its weight."""
+    sample = store.sample(batch, GAMMA[:1], generators(1), beta)
+    time = sample.obs[0, :, 0].numpy().astype(int)
+    values, first, counts = np.unique(time, return_index=True, return_counts=True)
     weights = sample.weight[0].numpy()[first]
     return (
         dict(zip(values.tolist(), (counts / batch).tolist(), strict=True)),
@@ -463,56 +450,65 @@ def places(buffer: ReplayBuffer, batch: int = 20_000, beta: float = 1.0) -> tupl
 
 
 def test_frequencies_and_weights_of_priorities():
-    buffer = line([0, 0, 0], capacity=4, prioritized=True, alpha=0.5)
-    buffer.update_priorities(np.array([[0, 1, 2]]), torch.tensor([[1.0, 4, 25]]))
-    frequency, weight = places(buffer, beta=0.5)
+    store = line([0, 0, 0], capacity=4, prioritized=True, alpha=0.5)
+    store.update_priorities(np.array([[0, 1, 2]]), torch.tensor([[1.0, 4, 25]]))
+    frequency, weight = places(store, beta=0.5)
     # priority^alpha is 1, 2, 5; the weights are (N·P)^-0.5 over that of the rarest
     assert frequency == pytest.approx({0: 1 / 8, 1: 2 / 8, 2: 5 / 8}, abs=1e-3)
     assert weight == pytest.approx({0: 1, 1: 2**-0.5, 2: 5**-0.5})
 
 
 def test_new_transitions_have_the_highest_priority_so_far():
-    buffer = line([0, 0], capacity=4, prioritized=True, alpha=1.0)
-    buffer.update_priorities(np.array([[0, 1]]), torch.tensor([[3.0, 1.0]]))
-    buffer.update_priorities(np.array([[0]]), torch.tensor([[2.0]]))
-    obs, no = np.zeros((1, 2), np.float32), np.zeros(1, bool)
-    buffer.add(obs, None, np.zeros(1), VecStep(obs, obs, np.zeros(1), no, no, np.ones(1), None, {}))
-    frequency, _ = places(buffer)
+    store = line([0, 0], capacity=4, prioritized=True, alpha=1.0)
+    store.update_priorities(np.array([[0, 1]]), torch.tensor([[3.0, 1.0]]))
+    store.update_priorities(np.array([[0]]), torch.tensor([[2.0]]))
+    store.add(rows_of(np.full((1, 2), 2.0), np.zeros(1), np.zeros((1, 2))))
+    frequency, _ = places(store)
     assert frequency == pytest.approx({0: 2 / 6, 1: 1 / 6, 2: 3 / 6}, abs=1e-3)
 
 
 def test_priorities_of_overwritten_transitions_are_skipped():
-    buffer = line(range(9), capacity=4, prioritized=True, alpha=1.0)
-    buffer.update_priorities(np.arange(9)[None], torch.tensor([[9.0] * 5 + [1, 2, 3, 4]]))
-    frequency, _ = places(buffer)
+    store = line(range(9), capacity=4, prioritized=True, alpha=1.0)
+    store.update_priorities(np.arange(9)[None], torch.tensor([[9.0] * 5 + [1, 2, 3, 4]]))
+    frequency, _ = places(store)
     assert frequency == pytest.approx({5: 0.1, 6: 0.2, 7: 0.3, 8: 0.4}, abs=1e-3)
 
 
+def test_boundaries_have_no_priority():
+    store = line(range(9), ".l.t.l", capacity=6, prioritized=True, alpha=1.0)
+    frequency, _ = places(store)
+    assert frequency == pytest.approx(dict.fromkeys([4, 5, 6, 7, 8], 1 / 5), abs=1e-3)
+
+
 def test_members_that_share_transitions_have_priorities_of_their_own():
-    buffer = ReplayBuffer(4, 2, 2, SPACE, (), np.int64, shared=True, prioritized=True, alpha=1.0)
-    world = World(buffer, 2, np.random.default_rng(0), 0.0, 1, 0.0)
-    for _ in range(2):
-        world.step()
+    store = make(4, 2, 2, shared=True, prioritized=True, alpha=1.0)
+    World(store, 2, np.random.default_rng(0), 0.0).add(2)
     new = torch.tensor([[1.0, 1, 1, 7], [7.0, 1, 1, 1]])
-    buffer.update_priorities(np.tile(np.arange(4), (2, 1)), new)
-    drawn = buffer.sample(10_000, GAMMA[:2], generators(2)).index
-    for p in range(2):
-        assert np.bincount(drawn[p]) / 10_000 == pytest.approx(new[p].numpy() / 10, abs=1e-3)
+    store.update_priorities(np.tile(np.arange(4), (2, 1)), new)
+    drawn = store.sample(10_000, GAMMA[:2], generators(2)).index
+    alone = store.sample(10_000, GAMMA[1:2], generators(1), first=1).index
+    for p, index in enumerate([*drawn, *alone]):
+        expected = new[min(p, 1)].numpy() / 10
+        assert np.bincount(index) / 10_000 == pytest.approx(expected, abs=1e-3)
+    store.inherit(np.array([1, 1]))
+    for index in store.sample(10_000, GAMMA[:2], generators(2)).index:
+        assert np.bincount(index) / 10_000 == pytest.approx(new[1].numpy() / 10, abs=1e-3)
 
 
-def test_updating_priorities_of_a_uniform_buffer_does_nothing():
-    buffer = line([1, 2])
-    before = buffer.sample(9, GAMMA[:1], generators(1))
-    buffer.update_priorities(before.index, before.reward)
-    assert same(before, buffer.sample(9, GAMMA[:1], generators(1)))
+def test_updating_priorities_of_a_uniform_store_does_nothing():
+    store = line([1, 2])
+    before = store.sample(9, GAMMA[:1], generators(1))
+    store.update_priorities(before.index, before.reward)
+    store.inherit(np.zeros(1, int))
+    assert same(before, store.sample(9, GAMMA[:1], generators(1)))
 
 
 # Between, and calls that several learn from
 
 
 def test_the_observations_between_n_steps_and_what_rewards_there_count():
-    buffer = line([1, 2, 4, 8, 16], "..t..", n_step=3, steps=[1, 2, 1, 1, 1], between=True)
-    s = buffer.sample(1000, torch.tensor([0.5]), generators(1))
+    store = line([1, 2, 4, 8, 16], "..t..", n_step=3, steps=[1, 2, 1, 1, 1], between=True)
+    s = store.sample(1000, torch.tensor([0.5]), generators(1))
     found = {
         int(t): (x[:, 0].tolist(), d.tolist())
         for t, x, d in zip(s.obs[0, :, 0], s.between_obs[0], s.between_discount[0], strict=True)
@@ -529,35 +525,43 @@ def test_the_observations_between_n_steps_and_what_rewards_there_count():
     assert line([1, 2], between=True).sample(2, GAMMA[:1], generators(1)).between_obs is None
 
 
-def shared_calls(capacity: int) -> ReplayBuffer:
+def call(rewards: np.ndarray) -> Experience:
+    """A call in each of N environments; rewards (N, τ)."""
+    zeros = np.zeros((len(rewards), 2), np.float32)
+    e = rows_of(zeros, np.zeros(len(rewards)), zeros)
+    # Who acted discounted by γ = 0: to them a call paid its first reward alone.
+    e.reward[:], e.steps[:], e.rewards = rewards[:, 0], rewards.shape[1], rewards[None]
+    return e
+
+
+def shared_calls(capacity: int) -> ReplayStore:
     """Two members; first a step of reward 1 each, then calls of 3 steps that pay 1, 2, 4."""
-    buffer = ReplayBuffer(capacity, 2, 2, SPACE, (), np.int64, mask_size=A, shared=True)
-    obs, never = np.zeros((2, 2), np.float32), np.zeros(2, bool)
-    for rewards in ([[1.0]] * 2, *[[[1.0, 2.0, 4.0]] * 2] * 3):
-        steps, told = np.full(2, len(rewards[0])), {"rewards": np.array(rewards, np.float32)}
-        # Who acted discounted by γ = 0: to them a call paid its first reward alone.
-        step = VecStep(obs, obs, np.ones(2, np.float32), never, never, steps, None, told)
-        buffer.add(obs, None, np.zeros(2), step)
-    return buffer
+    store = make(capacity, 2, 2, shared=True)
+    for rewards in ([1.0], *[[1.0, 2.0, 4.0]] * 3):
+        store.add(call(np.tile(np.float32(rewards), (2, 1))))
+    return store
 
 
 @pytest.mark.parametrize(("capacity", "firsts"), [(8, [1.0]), (4, [])])
 def test_every_learner_discounts_within_a_call_by_its_own_gamma(capacity, firsts):
-    buffer = shared_calls(capacity)
+    store = shared_calls(capacity)
     for gammas in ([0.5, 0.1], [0.25, 1.0]):  # a mutation may change them at any time
-        s = buffer.sample(200, torch.tensor(gammas), generators(2))
+        s = store.sample(200, torch.tensor(gammas), generators(2))
         for p, g in enumerate(gammas):
             calls = 1 + 2 * g + 4 * g**2
             found = sorted({round(r, 5) for r in s.reward[p].tolist()})
             assert found == pytest.approx(sorted([*firsts, calls]))
 
 
-def test_rewards_of_calls_that_are_gone_take_no_room():
-    buffer = shared_calls(4)
-    never, obs = np.zeros(2, bool), np.zeros((2, 2), np.float32)
+def test_rewards_of_calls_that_are_gone_take_no_room_though_a_column_stands_still():
+    """One column's call stays for ever, while the other's turn over and over."""
+    store = make(4, 2, 2, shared=True)
+    store.add(call(np.float32([[1, 2, 4]] * 2)))
     for i in range(200):
-        told = {"rewards": np.full((2, 1 + i % 7), 0.5, np.float32)}
-        steps = np.full(2, 1 + i % 7)
-        step = VecStep(obs, obs, np.ones(2, np.float32), never, never, steps, None, told)
-        buffer.add(obs, None, np.zeros(2), step)
-    assert len(buffer.state()["rewards"]) == 64
+        e = call(np.full((2, 1 + i % 7), 0.5, np.float32))
+        e.valid = np.array([[False, True]])
+        store.add(e)
+    assert len(store.state()["rewards"]) <= 64
+    s = store.sample(200, torch.tensor([1.0, 0.5]), generators(2))
+    first = s.reward[torch.from_numpy(s.index == 0)]
+    assert set(first.tolist()) == {7.0, 1 + 2 / 2 + 4 / 4}

@@ -1,101 +1,267 @@
+from dataclasses import fields
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from skillweave.buffers.rollout import RolloutBuffer
-from skillweave.types import VecStep
+from skillweave.buffers.rollout import RolloutStore
+from skillweave.experience import Experience, Rollout
+from skillweave.spaces import obs_dtype
 
-SPACE = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-T, P, B, A = 3, 2, 2, 3
-
-
-def vec_step(t: int, terminated=(), truncated=(), steps=1) -> VecStep:
-    """Observations say (time, column); the true successor of time t is t + 0.5."""
-    columns = np.arange(P * B)
-    obs = np.stack([np.full(P * B, t + 1.0), columns], 1).astype(np.float32)
-    next_obs = obs - np.float32([0.5, 0])
-    ends = [np.isin(columns, rows) for rows in (terminated, truncated)]
-    return VecStep(
-        next_obs, obs, np.float32(10 * t + columns), *ends, np.full(P * B, steps), None, {}
-    )
-
-
-def filled(steps: list[VecStep], masks=None) -> RolloutBuffer:
-    buffer = RolloutBuffer(len(steps), P * B, P, SPACE)
-    obs = np.stack([np.zeros(P * B), np.arange(P * B)], 1).astype(np.float32)
-    for t, step in enumerate(steps):
-        action = torch.arange(P * B).view(P, B) + 100 * t
-        buffer.add(obs, masks and masks[t], action, action[..., None].expand(P, B, A).float(), step)
-        obs = step.obs
-    return buffer
-
-
+T, P, B, A, M = 3, 2, 2, 3, 5
 GAMMA = torch.tensor([0.9, 0.5])
 
 
+def experience(rows=T, terminated=(), truncated=(), steps=1, columns=P * B) -> Experience:
+    """Observations say (time, column), rewards 10 · time + column; the successor is t + 0.5.
+
+    ``terminated`` and ``truncated`` are cells (time, column).
+    """
+    time, column = np.indices((rows, columns))
+    obs = np.stack([time, column], -1).astype(np.float32)
+    ends = [np.zeros((rows, columns), bool) for _ in range(2)]
+    for end, cells in zip(ends, (terminated, truncated), strict=True):
+        for cell in cells:
+            end[cell] = True
+    return Experience(
+        obs, 100 * time + column, (10 * time + column).astype(np.float32),
+        np.broadcast_to(steps, (rows, columns)).copy(), *ends, obs + np.float32([0.5, 0]),
+        head=np.repeat(obs[..., :1] + 7, A, -1),
+        memory=np.repeat(np.float32(column[:1].T), M, 1) if rows else None,
+        starts=time == 0,
+    )  # fmt: skip
+
+
+def rollout(*experiences: Experience, quota=0, **kwargs) -> Rollout:
+    store = RolloutStore(P, quota)
+    for e in experiences:
+        store.add(e)
+    return store.rollout(GAMMA, **kwargs)
+
+
+# All cells valid
+
+
 def test_columns_are_member_after_member():
-    transition = filled([vec_step(t) for t in range(T)]).read(GAMMA)
-    head = transition.head
+    log_std = torch.zeros(P, 1, 1, A)
+    r = rollout(experience(), log_std=log_std, progress=0.25)
     expected = torch.tensor([[[0.0, 1], [10, 11], [20, 21]], [[2, 3], [12, 13], [22, 23]]])
-    assert torch.equal(transition.reward, expected)
-    assert torch.equal(transition.action, (expected + 90 * (expected // 10)).long())
-    assert torch.equal(transition.obs[..., 0], torch.arange(3.0)[None, :, None].expand(P, T, B))
-    assert torch.equal(
-        transition.obs[..., 1], torch.tensor([[0.0, 1], [2, 3]])[:, None].expand(P, T, B)
-    )
-    assert torch.equal(transition.next_obs, transition.obs + torch.tensor([0.5, 0]))
-    assert torch.equal(head, transition.action[..., None].expand(P, T, B, A).float())
-    assert transition.obs_mask is None
+    assert torch.equal(r.reward, expected)
+    assert torch.equal(r.action, (expected + 90 * (expected // 10)).long())
+    assert torch.equal(r.obs[..., 0], torch.arange(3.0)[None, :, None].expand(P, T, B))
+    assert torch.equal(r.obs[..., 1], torch.tensor([[0.0, 1], [2, 3]])[:, None].expand(P, T, B))
+    assert torch.equal(r.next_obs, r.obs + torch.tensor([0.5, 0]))
+    assert torch.equal(r.head, (r.obs[..., :1] + 7).expand(P, T, B, A))
+    assert torch.equal(r.memory[..., 0], torch.tensor([[0.0, 1], [2, 3]]))
+    assert torch.equal(r.starts, r.obs[..., 0] == 0)
+    assert r.log_std is log_std
+    assert r.progress == 0.25
+    assert r.obs_mask is None
+    assert r.valid is None
+    rows = [r.obs, r.action, r.reward, r.next_obs, r.last, r.discount, r.head]
+    assert all(x[p].is_contiguous() for x in rows for p in range(P))
 
 
 def test_each_members_discount_is_its_gamma_to_the_calls_length():
-    transition = filled([vec_step(0, steps=1), vec_step(1, steps=3)]).read(GAMMA)
+    r = rollout(experience(2, steps=np.array([[1], [3]])))
     torch.testing.assert_close(
-        transition.discount,
-        torch.tensor([[[0.9, 0.9], [0.729, 0.729]], [[0.5, 0.5], [0.125, 0.125]]]),
+        r.discount, torch.tensor([[[0.9, 0.9], [0.729, 0.729]], [[0.5, 0.5], [0.125, 0.125]]])
     )
 
 
 def test_a_termination_has_discount_zero_and_a_truncation_has_not_and_both_are_last():
-    steps = [vec_step(0, terminated=[0]), vec_step(1, truncated=[3]), vec_step(2)]
-    transition = filled(steps).read(GAMMA)
-    assert transition.discount[0, :, 0].tolist() == pytest.approx([0.0, 0.9, 0.9])
-    assert transition.discount[1, :, 1].tolist() == pytest.approx([0.5] * 3)
-    assert transition.last[0, :, 0].tolist() == [True, False, True]
-    assert transition.last[1, :, 1].tolist() == [False, True, True]
+    r = rollout(experience(terminated=[(0, 0)], truncated=[(1, 3)]))
+    assert r.discount[0, :, 0].tolist() == pytest.approx([0.0, 0.9, 0.9])
+    assert r.discount[1, :, 1].tolist() == pytest.approx([0.5] * 3)
+    assert r.last[0, :, 0].tolist() == [True, False, True]
+    assert r.last[1, :, 1].tolist() == [False, True, True]
 
 
 def test_the_end_of_the_rollout_cuts_every_trajectory_but_keeps_its_discount():
-    transition = filled([vec_step(t) for t in range(T)]).read(GAMMA)
-    assert transition.last[:, -1].all()
-    assert not transition.last[:, :-1].any()
-    assert (transition.discount > 0).all()
+    r = rollout(experience())
+    assert r.last[:, -1].all()
+    assert not r.last[:, :-1].any()
+    assert (r.discount > 0).all()
 
 
 def test_masks_travel_with_their_observations():
-    masks = [np.eye(A, dtype=bool)[[0, 1, 2, t]] for t in range(T)]
-    transition = filled([vec_step(t) for t in range(T)], masks).read(GAMMA)
+    e = experience()
+    e.obs_mask = np.random.default_rng(0).random((T, P * B, A)) < 0.5
+    r = rollout(e)
     for t in range(T):
-        assert torch.equal(transition.obs_mask[:, t].flatten(0, 1), torch.from_numpy(masks[t]))
+        assert torch.equal(r.obs_mask[:, t].flatten(0, 1), torch.from_numpy(e.obs_mask[t]))
 
 
-def test_a_step_without_a_mask_allows_everything_though_others_have_one():
-    some = np.eye(A, dtype=bool)[[0, 1, 2, 0]]
-    transition = filled([vec_step(t) for t in range(T)], [some, None, some]).read(GAMMA)
-    assert transition.obs_mask.shape == (P, T, B, A)
-    assert transition.obs_mask[:, 1].all()
-    assert torch.equal(transition.obs_mask[:, 2].flatten(0, 1), torch.from_numpy(some))
+def test_rows_of_one_member_are_not_copied():
+    e = experience()
+    store = RolloutStore(1)
+    store.add(e)
+    r = store.rollout(torch.ones(1))
+    for name in ("obs", "action", "reward", "next_obs", "head", "memory"):
+        assert np.shares_memory(getattr(r, name).numpy(), getattr(e, name))
+    assert not e.ended[-1].any()  # and the experience is as it was
 
 
-def test_the_buffer_keeps_copies():
-    obs, step = np.zeros((P * B, 2), np.float32), vec_step(0)
-    buffer = RolloutBuffer(1, P * B, P, SPACE)
-    buffer.add(obs, None, torch.zeros(P, B), torch.zeros(P, B, A), step)
-    obs += 99
-    step.next_obs += 99
-    step.reward += 99
-    transition = buffer.read(GAMMA)
-    assert transition.obs.max() < 99
-    assert transition.next_obs.max() < 99
-    assert transition.reward.max() < 99
+def test_structured_observations_become_bytes():
+    space = gym.spaces.Dict({"a": gym.spaces.Box(-1, 1, (2,), np.float64)})
+    e, kind = experience(), obs_dtype(space)
+    e.obs, e.next_obs = np.zeros((2, T, P * B), kind)
+    e.obs["a"] = np.random.default_rng(0).random((T, P * B, 2))
+    for valid in None, np.arange(P * B) < 3:
+        e.valid = None if valid is None else np.broadcast_to(valid, (T, P * B))
+        found = rollout(e).obs
+        assert found.shape == (P, T, B, kind.itemsize)
+        found = found[1, :, 0].numpy().copy().view(kind).ravel()
+        assert np.array_equal(found, e.obs[:, 2])
+
+
+def test_rollouts_are_on_the_learners_device():
+    store = RolloutStore(P, device="meta")
+    e = experience(steps=2)
+    e.valid, e.obs_mask = np.eye(P * B, dtype=bool)[:T], np.ones((T, P * B, A), bool)
+    store.add(e)
+    r = store.rollout(GAMMA)
+    tensors = [x for f in fields(Rollout) if isinstance(x := getattr(r, f.name), torch.Tensor)]
+    assert len(tensors) == 11
+    assert {x.device.type for x in tensors} == {"meta"}
+
+
+# Gaps
+
+
+def test_without_valid_rows_there_is_nothing_to_learn_from():
+    store = RolloutStore(P)
+    assert store.rollout(GAMMA) is None
+    e = experience()
+    e.valid = np.zeros((T, P * B), bool)
+    store.add(e)
+    store.add(experience(rows=0))
+    assert store.rollout(GAMMA) is None
+    store.add(experience())
+    assert store.rollout(GAMMA).valid is None
+    assert store.rollout(GAMMA) is None  # each is learnt from once
+
+
+def test_valid_rows_come_first_and_the_rectangle_is_as_high_as_the_fullest_column():
+    e = experience(4, terminated=[(1, 0), (2, 1)])
+    e.valid = np.array([[0, 1, 0, 1], [1, 0, 0, 1], [0, 0, 0, 0], [1, 0, 0, 0]], bool)
+    r = rollout(e)
+    assert r.valid.tolist() == [[[True, True], [True, False]], [[False, True], [False, True]]]
+    # Column 0 has times 1 (terminated) and 3, column 1 time 0, column 3 times 0 and 1.
+    assert r.reward[r.valid].tolist() == [10, 1, 30, 3, 13]
+    assert r.last.tolist() == [[[True, True], [True, False]], [[False, False], [False, True]]]
+    assert r.discount[r.valid].tolist() == pytest.approx([0, 0.9, 0.9, 0.5, 0.5])
+    assert r.starts[r.valid].tolist() == [False, True, False, True, False]
+    assert torch.equal(r.memory[..., 0], torch.tensor([[0.0, 1], [2, 3]]))
+
+
+def test_rows_that_are_not_valid_repeat_valid_ones_so_that_nothing_is_out_of_range():
+    e = experience(5)
+    e.valid = np.zeros((5, P * B), bool)
+    e.valid[1:3, 2] = True
+    e.obs_mask = np.repeat(e.valid[..., None], A, -1)  # elsewhere nothing at all is allowed
+    e.obs[~e.valid] = e.reward[~e.valid] = e.head[~e.valid] = np.nan
+    r = rollout(e, experience(3))
+    assert r.obs.shape == (P, 3, 2 * B, 2)
+    assert r.obs_mask.all()
+    for x in r.obs, r.reward, r.head, r.discount:
+        assert x.isfinite().all()
+    assert not r.last[~r.valid].any()
+
+
+# Several experiences, side by side
+
+
+def test_a_quota_collects_until_every_member_has_enough():
+    store = RolloutStore(P, quota=4)
+    e = experience(2)
+    e.valid = np.array([[1, 1, 1, 0], [1, 1, 0, 0]], bool)  # 4 rows of the first, 1 of the other
+    for _ in range(3):
+        store.add(e)
+        assert store.rollout(GAMMA) is None
+    store.add(e)
+    r = store.rollout(GAMMA)
+    assert r.valid.sum((1, 2)).tolist() == [16, 4]
+    assert store.rollout(GAMMA) is None
+
+
+def test_experiences_lie_side_by_side_with_their_memory():
+    """The second is longer, has steps and a mask, which the first has not."""
+    first, second = experience(2), experience(3, terminated=[(0, 0)], steps=2)
+    second.obs_mask = np.zeros((3, P * B, A), bool)
+    second.memory += 50
+    r = rollout(first, second)
+    assert r.valid.tolist() == [[[True] * 4, [True] * 4, [False, False, True, True]]] * P
+    assert r.reward[r.valid].tolist() == [
+        *[0, 1, 0, 1, 10, 11, 10, 11, 20, 21],
+        *[2, 3, 2, 3, 12, 13, 12, 13, 22, 23],
+    ]
+    assert r.memory[..., 0].tolist() == [[0, 1, 50, 51], [2, 3, 52, 53]]
+    assert r.last[0].tolist() == [[False, False, True, False], [True, True, False, False],
+                                  [False, False, True, True]]  # fmt: skip
+    assert r.discount[0, 0].tolist() == pytest.approx([0.9, 0.9, 0.0, 0.81])
+    assert r.obs_mask[:, :2, :2].all()
+    assert not r.obs_mask[:, :, 2:].any()
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shapes=st.lists(st.integers(0, 5), min_size=1, max_size=4),
+    filled=st.sampled_from([1.0, 0.7, 0.2]),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_valid_row_is_there_once_in_its_order_and_cut_at_its_end(seed, shapes, filled):
+    rng, gamma = np.random.default_rng(seed), GAMMA.numpy()
+    store = RolloutStore(P)
+    expected: list[list[list[tuple]]] = [[] for _ in range(P)]  # by member and column, its rows
+    for i, rows in enumerate(shapes):
+        e = experience(rows, steps=rng.integers(1, 4, (rows, P * B)))
+        e.reward += np.float32(1000 * i)
+        e.terminated, e.truncated = rng.random((rows, P * B)) < 0.3, rng.random((rows, P * B)) < 0.1
+        e.valid = rng.random((rows, P * B)) < filled
+        store.add(e)
+        for c in range(P * B) if e.valid.any() else ():  # else it is not kept
+            times = e.valid[:, c].nonzero()[0]
+            discount = gamma[c // B] ** e.steps[:, c] * ~e.terminated[:, c]
+            ends = e.ended[:, c] | (np.arange(rows) == times.max(initial=-1))
+            expected[c // B].append([(e.reward[t, c], discount[t], ends[t]) for t in times])
+    r = store.rollout(GAMMA)
+    if r is None:
+        assert not any(rows for columns in expected for rows in columns)
+        return
+    valid = torch.ones_like(r.last) if r.valid is None else r.valid
+    for p in range(P):
+        assert len(expected[p]) == r.reward.shape[2]
+        for c, rows in enumerate(expected[p]):
+            assert valid[p, :, c].tolist() == [t < len(rows) for t in range(r.reward.shape[1])]
+            for t, (reward, discount, last) in enumerate(rows):
+                assert r.reward[p, t, c] == reward
+                assert r.discount[p, t, c] == pytest.approx(discount)
+                assert r.last[p, t, c] == last
+    assert not r.last[~valid].any()
+
+
+def test_a_state_goes_on_exactly_and_is_a_copy():
+    store, other = RolloutStore(P, quota=10), RolloutStore(P, quota=10)
+    e = experience(2, steps=3)
+    e.valid = np.array([[1, 0, 1, 1], [1, 1, 0, 1]], bool)
+    for _ in range(3):
+        store.add(e)
+    other.add(experience())  # gives way
+    other.load(store.state())
+    found = []
+    for each in store, other:
+        assert each.rollout(GAMMA) is None
+        each.add(experience(2))
+        found.append(each.rollout(GAMMA))
+    for name in (f.name for f in fields(Rollout) if f.name not in ("log_std", "obs_mask")):
+        assert np.array_equal(*(getattr(r, name) for r in found)), name
+    alone = RolloutStore(1)
+    alone.add(e)
+    state = alone.state()
+    e.memory += 99
+    assert (state["0.memory"] < 99).all()
+    assert RolloutStore(1).state() == {}

@@ -1,4 +1,4 @@
-"""Whether a buffer fits into the machine's memory, before it is made."""
+"""Whether something fits into the machine's memory, before it is made."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 from skillweave.types import SkillweaveError
 
 
-def check_memory(
-    capacity: int, each: int, what: str, buffer: str = "replay buffer", lower: str = "buffer_size"
-) -> None:
-    """Raise a SkillweaveError where ``capacity`` transitions of ``each`` bytes do not fit."""
+def check_memory(count: int, each: int, what: str, lower: str) -> None:
+    """Raise a SkillweaveError where ``count`` times ``each`` bytes do not fit.
+
+    ``what`` begins the message, and ``lower`` names the settings that make it smaller.
+    """
     free = free_memory()
-    if free is not None and capacity * each > free:
+    if free is not None and count * each > free:
         raise SkillweaveError(
-            f"a {buffer} of {capacity:,} transitions of {what} needs "
-            f"{capacity * each / 2**30:.1f} GiB, but {free / 2**30:.1f} GiB are free: "
+            f"{what} needs {count * each / 2**30:.1f} GiB, but {free / 2**30:.1f} GiB are free: "
             f"lower {lower} (at most about {free // each:,})"
         )
 

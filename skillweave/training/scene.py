@@ -1,0 +1,87 @@
+"""Where a stage learns: which environments, and what learners do in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.skills import Reflex, Skill
+
+CALL = 16
+"""Environment steps of a call, about, where nothing says how long it lasts."""
+
+
+class MakeCollector(Protocol):
+    """Makes a collector of a scene."""
+
+    def __call__(
+        self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
+    ) -> Collector:
+        """A collector of ``num_envs`` environments.
+
+        Args:
+            acting: the learners; None where they come later.
+            first: the number of the first environment, for messages.
+            shared: several learn from what each does, with a γ of their own.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Environments, and what learners see and choose in them."""
+
+    name: str
+    """What messages call the environment."""
+    observation_space: gym.Space[Any]
+    action_space: gym.Space[Any]
+    """The learner's: a selector chooses among skills."""
+    collector: MakeCollector
+    row_steps: int = 1
+    """Environment steps of a row of experience, about."""
+
+
+def skill_scene(
+    spec: EnvSpec, skill: Skill | None = None, reflexes: Sequence[Reflex] = ()
+) -> Scene:
+    """The environments seen through a skill; None: as they are."""
+
+    def collector(
+        num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
+    ) -> Collector:
+        return SkillCollector(
+            make_engine(spec, num_envs, first=first), acting, skill, tuple(reflexes)
+        )
+
+    return Scene(spec.name, *_spaces(spec), collector)
+
+
+def selector_scene(spec: EnvSpec, skills: SkillSet) -> Scene:
+    """The environments in which a selector calls skills."""
+
+    def collector(
+        num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
+    ) -> Collector:
+        engine = make_engine(spec, num_envs, first=first)
+        return DecisionCollector(engine, acting, skills, keep_rewards=shared)
+
+    observation_space, _ = _spaces(spec)
+    choices = gym.spaces.Discrete(len(skills.skills))
+    return Scene(spec.name, observation_space, choices, collector, skills.call_steps or CALL)
+
+
+def _spaces(spec: EnvSpec) -> tuple[gym.Space[Any], gym.Space[Any]]:
+    env = spec.make()
+    try:
+        return env.observation_space, env.action_space
+    finally:
+        env.close()
