@@ -1,8 +1,8 @@
-"""The replay buffer: bytes and speed with a million LunarLander transitions, against SB3's.
+"""The replay store: bytes and speed with a million LunarLander transitions, against SB3's.
 
     python -m benchmarks.replay [--transitions 1000000]
 
-Random episodes of 200 steps on average stand in for LunarLander's; each buffer is measured in a
+Random episodes of 200 steps on average stand in for LunarLander's; each store is measured in a
 process of its own, so that the growth of the resident memory is its own.
 """
 
@@ -57,16 +57,17 @@ def filled(transitions: int, add: Callable[..., None]) -> float:
 def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
     import torch
 
-    from skillweave.buffers.replay import ReplayBuffer
-    from skillweave.types import VecStep
+    from skillweave.buffers.replay import ReplayStore
+    from skillweave.experience import Experience
 
     torch.set_num_threads(1)
     before = resident()
-    buffer = ReplayBuffer(transitions, NUM_ENVS, 1, SPACE, (), np.int64, mask_size=4, **kwargs)
-    never, ones = np.zeros(NUM_ENVS, bool), np.ones(NUM_ENVS, np.int64)
+    store = ReplayStore(transitions, NUM_ENVS, 1, SPACE, (), np.int64, mask_size=4, **kwargs)
+    never, ones = np.zeros((1, NUM_ENVS), bool), np.ones((1, NUM_ENVS), np.int64)
 
     def add(obs: Any, true: Any, action: Any, reward: Any, ended: Any) -> None:
-        buffer.add(obs, None, action, VecStep(true, true, reward, ended, never, ones, None, {}))
+        row = (x[None] for x in (obs, action, reward))
+        store.add(Experience(*row, ones, ended[None], never, true[None]))
 
     speed = filled(transitions, add)
     grown = resident() - before
@@ -74,11 +75,11 @@ def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
     batch = PRIORITIZED_BATCH if kwargs.get("prioritized") else BATCH
 
     def draw() -> None:
-        sample = buffer.sample(batch, gamma, rngs)
-        buffer.update_priorities(sample.index, sample.reward)
+        sample = store.sample(batch, gamma, rngs)
+        store.update_priorities(sample.index, sample.reward)
 
     return {
-        "bytes_mb": buffer.nbytes / MB,
+        "bytes_mb": store.nbytes / MB,
         "resident_mb": grown,
         "adds_per_second": speed,
         "batch": batch,

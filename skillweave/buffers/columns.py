@@ -210,7 +210,7 @@ class Columns:
         if valid is None:
             self.newest, self._open = place[-1] + 1, ~ended[-1]
             return slot.ravel()
-        column = valid.any(0).nonzero()[0]
+        column = np.flatnonzero(valid.any(0))
         last = len(valid) - 1 - valid[::-1, column].argmax(0), column
         self.newest[column], self._open[column] = place[last] + 1, ~ended[last]
         return slot[valid]
@@ -270,9 +270,11 @@ def _parts(experience: Experience, most: int) -> list[Experience]:
     if 0 < t <= most:
         return [experience]
     named = {f.name: getattr(experience, f.name) for f in fields(experience)}
-    by_row = {k: v for k, v in named.items() if isinstance(v, np.ndarray) and k != "memory"}
-    starts = range(0, t, most)
-    return [replace(experience, **{k: v[s : s + most] for k, v in by_row.items()}) for s in starts]
+    rows = {k: v for k, v in named.items() if isinstance(v, np.ndarray) and k != "memory"}
+    parts: list[dict[str, Any]] = [
+        {k: v[start : start + most] for k, v in rows.items()} for start in range(0, t, most)
+    ]
+    return [replace(experience, **part) for part in parts]
 
 
 def copy_into(arrays: dict[str, Array], state: dict[str, Tensor]) -> None:

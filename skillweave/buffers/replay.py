@@ -44,6 +44,8 @@ def replay_store(
 ) -> ReplayStore:
     """An empty replay store as an algorithm's settings ask for.
 
+    To make one only to see whether it fits costs nothing: what is not written takes no memory.
+
     Args:
         num_envs: of all members together.
         shared: members learn from what all did; ``buffer_size`` is then that of all together.

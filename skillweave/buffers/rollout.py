@@ -38,18 +38,20 @@ class RolloutStore:
         valid = np.ones_like(last) if e.valid is None else e.valid
         if not valid.any():
             return
-        rows = {
+        found = {
             "obs": e.obs, "action": e.action, "reward": e.reward, "steps": e.steps,
             "terminated": e.terminated, "next_obs": e.next_obs, "last": last,
             "obs_mask": e.obs_mask, "head": e.head, "starts": e.starts,
         }  # fmt: skip
-        rows = {k: x for k, x in rows.items() if x is not None}
-        if not valid.all():
+        rows = {k: x for k, x in found.items() if x is not None}
+        if valid.all():
+            last[-1] = True
+        else:
             cells, valid = _valid_first(valid)
             rows = {k: x.reshape(-1, *x.shape[2:])[cells] for k, x in rows.items()}
-        column = valid.any(0).nonzero()[0]
-        rows["last"][valid.sum(0)[column] - 1, column] = True
-        rows["last"] &= valid
+            column = np.flatnonzero(valid[0])
+            rows["last"][valid.sum(0)[column] - 1, column] = True
+            rows["last"] &= valid
         held = {k: self._by_member(x) for k, x in (rows | {"valid": valid}).items()}
         if e.memory is not None:
             held["memory"] = self._by_member(e.memory[None])
@@ -64,13 +66,15 @@ class RolloutStore:
             gamma: (P,), each member's discount of one step.
             log_std, progress: of the ``Rollout``.
         """
-        if not self._held or self._valid_rows() < self._quota:
+        if not self._held or (self._quota and self._valid_rows() < self._quota):
             return None
         named = self._held[0] if len(self._held) == 1 else _side_by_side(self._held)
-        self._held = []
+        self._held, steps, factor = [], named.pop("steps"), gamma.cpu()[:, None, None]
+        factor = factor if (steps == 1).all() else factor**steps
+        named["discount"] = factor * ~named.pop("terminated")
+        if named["valid"].all():
+            del named["valid"]
         named = {name: x.to(self._device) for name, x in named.items()}
-        named["discount"] = gamma.to(self._device)[:, None, None] ** named.pop("steps")
-        named["discount"] *= ~named.pop("terminated")
         memory = named.pop("memory", None)
         return Rollout(
             **named, memory=None if memory is None else memory[:, 0], log_std=log_std,
@@ -94,7 +98,8 @@ class RolloutStore:
 
     def _by_member(self, x: Array) -> Tensor:
         """(T, P·B, …) to (P, T, B, …)."""
-        return to_tensor(x).unflatten(1, (self._members, -1)).transpose(0, 1).contiguous()
+        found: Tensor = to_tensor(x).unflatten(1, (self._members, -1))
+        return found.transpose(0, 1).contiguous()
 
 
 def _valid_first(valid: Array) -> tuple[Array, Array]:

@@ -324,9 +324,10 @@ def test_the_store_keeps_copies_and_so_does_its_state():
     assert before.next_obs.max() < 99
 
 
-def test_a_state_without_masks_and_calls_replaces_one_with_them():
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_a_state_without_masks_and_calls_replaces_one_with_them(prioritized):
     def world(masked, longest, rows):
-        store = make(8, 2, shared=True)
+        store = make(8, 2, shared=True, prioritized=prioritized)
         found = World(store, 2, np.random.default_rng(0), 0.3, longest, masked)
         found.add(rows)
         return found
