@@ -1,4 +1,4 @@
-"""Learning and acting on another device: a fake CUDA device, on which nothing is computed.
+"""Learning and acting on another device: a fake THERE device, on which nothing is computed.
 
 It refuses operations that mix devices, and every question for a value: those make a host wait.
 """
@@ -29,7 +29,7 @@ SMALL: dict[str, Any] = {"network": Network((8,)), "normalize_obs": True}
 SEEN = Box(-1.0, 1.0, (2,), np.float32)
 MIXED = Dict(vector=SEEN, image=Box(0, 255, (8, 8, 1), np.uint8))
 LINE, CHOICE, FORCE = Discrete(3), MultiDiscrete([2, 3]), Box(-1.0, 1.0, (2,), np.float32)
-CUDA = torch.device("cuda", 0)
+THERE = torch.device("meta")
 
 ON: dict[str, tuple[PPO, Any, Any]] = {
     "discrete": (PPO(**SMALL), SEEN, LINE),
@@ -50,7 +50,7 @@ OFF: dict[str, tuple[Any, Any]] = {
 }
 
 
-def moved(x: Any, mode: FakeTensorMode, device: torch.device = CUDA) -> Any:
+def moved(x: Any, mode: FakeTensorMode, device: torch.device = THERE) -> Any:
     """Tensors within ``x`` as fake ones on a device."""
 
     def move(v: Any) -> Any:
@@ -82,8 +82,8 @@ def on_device(algorithm: Any, mode: FakeTensorMode) -> Any:
     """Fresh members whose numbers, but for those that Python decides by, are on the device."""
     state = algorithm.init([Seeds(m) for m in range(P)])
     fake = {k: v if k in state.HOST else mode.from_tensor(v) for k, v in vars(state).items()}
-    state = state_to(type(state)(**fake), CUDA)
-    assert devices(state) == {"cuda", "cpu"} if state.HOST else {"cuda"}
+    state = state_to(type(state)(**fake), THERE)
+    assert devices(state) == {"meta", "cpu"} if state.HOST else {"meta"}
     return state
 
 
@@ -104,12 +104,12 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
         memory=memory, starts=None if memory is None else last,
     )  # fmt: skip
     rng = [Seeds(m).torch() for m in range(P)]
-    with FakeTensorMode() as mode:
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state, batch = on_device(algorithm, mode), moved(batch, mode)
-        assert algorithm.value(state, batch.obs[:, 0]).device == CUDA
+        assert algorithm.value(state, batch.obs[:, 0]).device == THERE
         state, report = algorithm.update(state, batch, rng)
-        assert devices(state) == {"cuda"}
-        assert {v.device.type for v in report.metrics.values()} == {"cuda"}
+        assert devices(state) == {"meta"}
+        assert {v.device.type for v in report.metrics.values()} == {"meta"}
         assert_acts(algorithm, state, mode, batch.obs[:, 0], memory)
 
 
@@ -126,20 +126,20 @@ def test_algorithms_of_replay_learn_and_act_where_their_state_is(name):
         between_discount=torch.zeros(P, B, n - 1) if n > 1 else None,
     )  # fmt: skip
     rng = [Seeds(m).torch() for m in range(P)]
-    with FakeTensorMode() as mode:
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state, batch = on_device(algorithm, mode), moved(batch, mode)
-        assert algorithm.value(state, batch.obs, batch.obs_mask).device == CUDA
-        noise = [x.to(CUDA) for x in algorithm.learning_noise(rng, B, True)]
+        assert algorithm.value(state, batch.obs, batch.obs_mask).device == THERE
+        noise = [x.to(THERE) for x in algorithm.learning_noise(rng, B, True)]
         metrics, error = algorithm.learn(state, batch, algorithm.rate(state, 0.1), noise, True)
         assert {k for k, v in vars(state).items() if v.device.type == "cpu"} == {"updates"}
-        assert {v.device.type for v in (*metrics.values(), error)} == {"cuda"}
+        assert {v.device.type for v in (*metrics.values(), error)} == {"meta"}
         assert_acts(algorithm, state, mode, batch.obs, None)
 
 
 def assert_acts(algorithm: Any, state: Any, mode: Any, obs: Any, memory: Any) -> None:
     """It acts on the device of what it is given; unless told otherwise that is the CPU."""
     noise = algorithm.noise([Seeds(m).torch() for m in range(P)], 1, B)[0]
-    for device in (torch.device("cpu"), CUDA):
+    for device in (torch.device("cpu"), THERE):
         where = {} if device.type == "cpu" else {"device": device}
         params = algorithm.acting_params(state, 0.5, **where)
         given = tree_map(lambda x, d=device: None if x is None else x.to(d), noise)
@@ -161,7 +161,7 @@ def test_what_an_update_draws_is_moved_to_the_batch():
 
 def test_a_question_for_a_value_would_be_noticed():
     with FakeTensorMode(), pytest.raises(DataDependentOutputException):
-        bool(torch.ones(2, device="cuda").any())
+        bool(torch.ones(2, device="meta").any())
 
 
 # Names and helpers

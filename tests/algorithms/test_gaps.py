@@ -24,6 +24,9 @@ CONFIG = PPO(
 )  # fmt: skip
 RECURRENT = replace(CONFIG, network=Network((8,), rnn=RNN("gru", 4)))
 NAN = float("nan")
+CELLS = (
+    "obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts",
+)  # fmt: skip
 
 
 def made(config: PPO, members: int) -> tuple[PPOAlgorithm, State]:
@@ -69,18 +72,7 @@ def with_gaps(rollout: Rollout, seed: int = 0, more: int = 5) -> Rollout:
             found[m, valid[m, :, b], b] = x[m, :, b]
         return found
 
-    cells = [
-        "obs",
-        "action",
-        "reward",
-        "discount",
-        "next_obs",
-        "last",
-        "obs_mask",
-        "head",
-        "starts",
-    ]
-    values = {name: getattr(rollout, name) for name in cells}
+    values = {name: getattr(rollout, name) for name in CELLS}
     changed: dict[str, Any] = {k: None if v is None else spread(v) for k, v in values.items()}
     changed["last"] &= valid
     if rollout.memory is not None:
@@ -131,20 +123,9 @@ def test_columns_of_different_lengths_are_learnt_from_row_by_row(config):
         rollout.memory[:, 0] = 0.0
         rollout.starts[:, 0, 0] = True
     ragged = with_gaps(rollout, more=T)
-    cells = [
-        "obs",
-        "action",
-        "reward",
-        "discount",
-        "next_obs",
-        "last",
-        "obs_mask",
-        "head",
-        "starts",
-    ]
     ragged.valid.zero_()
     ragged.valid[:, :T, 1:B] = ragged.valid[:, T:, 1] = True
-    for name in cells:
+    for name in CELLS:
         if getattr(rollout, name) is not None:
             into, rows = getattr(ragged, name), getattr(rollout, name)
             into[:, :T, :B], into[:, T:, 1] = rows, rows[:, :, 0]
