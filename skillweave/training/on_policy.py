@@ -160,7 +160,7 @@ class _Loop:
         self.collector.cut(self.seeds / "cut" / update)
         return prefixed("collector", self.collector.state())
 
-    @torch.inference_mode()
+    @torch.no_grad()  # not inference_mode: learning may differentiate through the batch
     def collect(self, actor: ActingParams, state: Any, update: int) -> Rollout:
         """A rollout of ``n_steps`` environment steps of each environment.
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from toys import Countdown, Echo, Masked, learn
+from toys import own_algorithm as example
 
 from skillweave import (
     PPO,
@@ -34,19 +33,7 @@ from skillweave.algorithms.registry import make_algorithm
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 
-EXAMPLE = Path(__file__).parents[2] / "examples/own_algorithm.py"
 BOX, LINE = gym.spaces.Box(-1, 1, (2,), np.float32), gym.spaces.Discrete(2)
-
-
-def example() -> Any:
-    """The example as a module, which registers its algorithm."""
-    if "own_algorithm" not in sys.modules:
-        spec = importlib.util.spec_from_file_location("own_algorithm", EXAMPLE)
-        assert spec is not None
-        assert spec.loader is not None
-        sys.modules["own_algorithm"] = module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    return sys.modules["own_algorithm"]
 
 
 @pytest.fixture(autouse=True)
@@ -67,10 +54,10 @@ def own(**settings: Any) -> Any:
 # Learning
 
 
-@pytest.mark.parametrize("asks", ["Discrete", "Box"])
-def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, tmp_path):
+@pytest.mark.parametrize(("asks", "updates"), [("Discrete", 120), ("Box", 300)])
+def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, updates, tmp_path):
     env = Echo(8, "vector", asks)
-    algorithm, state = learn(own(), env, 64 * 120)
+    algorithm, state = learn(own(), env, 64 * updates)
     policy, shown = AgentPolicy.of(algorithm, state), np.arange(4)
     action, _ = policy.act({}, env.show(shown))
     assert env.error(shown, action).mean() < 0.1
@@ -134,7 +121,8 @@ def test_it_trains_skills_selectors_and_populations(tmp_path):
         "CartPole-v1", [Left(), replace_name(Left(), "again")], call_steps=4, algorithm=config,
         selector=config, skill_steps=256, selector_steps=256,
     )  # fmt: skip
-    search = Evolution(population=2, generations=2, episodes=1, mutations=Mutations(activation=0.0))
+    changes = Mutations(none=0.3, activation=0.0)
+    search = Evolution(population=2, generations=2, episodes=1, mutations=changes)
     run = hierarchy.train(tmp_path / "run", quiet=True, evolve={"left": search})
     assert run.evaluate(2).mean > 0
 
@@ -160,9 +148,7 @@ def test_an_algorithm_that_nobody_registered_is_an_error_that_says_what_to_do():
     data = config_to_json(own())
     config = own()
     table._REGISTERED.pop("A2C")
-    says = (
-        r"no algorithm is registered for '?A2C'?; there are: PPO, .*skillweave\.register_algorithm"
-    )
+    says = r"no algorithm is registered for '?A2C'?; there are: PPO, .*\.register_algorithm"
     with pytest.raises(SkillweaveError, match=says):
         config_from_json(data, "run.json", "phases[0].algorithm")
     with pytest.raises(SkillweaveError, match=says):
@@ -208,16 +194,16 @@ def test_what_cannot_be_registered_is_told():
     with pytest.raises(SkillweaveError, match="'drawer'; it must be 'rollout' or 'replay'"):
         register_algorithm(module.A2C, odd)
     bare = type("Bare", (Algorithm,), {})
-    with pytest.raises(SkillweaveError, match="lacks fresh_state, .*, store, action_spaces"):
+    with pytest.raises(SkillweaveError, match=r"lacks fresh_state, .*, store, action_spaces"):
         register_algorithm(module.A2C, bare)
 
 
 def test_a_space_that_it_cannot_act_in_names_those_that_can():
-    with pytest.raises(SkillweaveError, match="A2C cannot act in MultiBinary.*; PPO can"):
+    with pytest.raises(SkillweaveError, match=r"A2C cannot act in MultiBinary.*; PPO can"):
         make_algorithm(own(), BOX, gym.spaces.MultiBinary(2))
-    with pytest.raises(SkillweaveError, match="TD3 cannot act in Discrete.*; PPO, DQN, SAC, A2C"):
-        own()
-        make_algorithm(named_config("TD3", "here"), BOX, LINE)
+    td3 = named_config("TD3", "here")
+    with pytest.raises(SkillweaveError, match=r"TD3 cannot act in Discrete.*; PPO, DQN, SAC, A2C"):
+        make_algorithm(td3, BOX, LINE)
 
 
 def test_settings_that_are_common_are_checked():
