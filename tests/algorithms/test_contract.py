@@ -112,7 +112,7 @@ TABLE: dict[str, Case] = {
         ("ppo with lstm", LSTM, "vector", "Discrete", 3072),
         ("ppo with gru", GRU, "dict", "MultiBinary", 2560),
         ("own", OWN, "vector", "Discrete", 7680),
-        ("own", OWN, "tuple", "Box", 19_200),
+        ("own", replace(OWN, learning_rate=5e-3), "tuple", "Box", 25_600),
         ("own", OWN, "image, channels last", "Discrete", 7680),
         ("dqn", Q, "vector", "Discrete", 400),
         ("dqn", Q, "multi-discrete", "Discrete", 400),
