@@ -4,7 +4,7 @@ It trains plain agents, skills, selectors and populations, as the library's own 
 Everything is stacked: tensors begin with the member axis P, and a single agent is P = 1.
 """
 
-import sys
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -131,8 +131,16 @@ class A2CAlgorithm(Algorithm):
 register_algorithm(A2C, A2CAlgorithm)
 
 
+def main() -> None:
+    """Train it on CartPole, and say how well it does."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=200_000)
+    parser.add_argument("--out", default="runs/own_algorithm")
+    asked = parser.parse_args()
+    config = A2C(num_envs=32, learning_rate=3e-3)
+    run = train_agent("CartPole-v1", config, asked.steps, asked.out)
+    print("mean return:", run.evaluate(20).mean)
+
+
 if __name__ == "__main__":
-    run = train_agent(
-        "CartPole-v1", A2C(num_envs=32, learning_rate=3e-3), 200_000, "runs/own_algorithm"
-    )
-    print(run.evaluate(20), file=sys.stderr)
+    main()

@@ -234,7 +234,7 @@ class PPOAlgorithm(Algorithm):
             old_value=None if cfg.clip_value is None else (value - mean) / scale,
             mask=mask,
             valid=valid,
-            most=value.shape[1],
+            most=cells.most,
         )
         if memory is not None:
             samples = samples.changed(cells.unflat)

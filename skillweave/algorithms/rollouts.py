@@ -79,9 +79,13 @@ class Cells:
 
     def __init__(self, rollout: Rollout, *, all_cells: bool) -> None:
         self.shape = rollout.reward.shape[1:]
+        self.most = self.shape.numel()
+        """The number of valid cells, of the member that has most."""
         self._rows: Tensor | None = None
-        if rollout.valid is not None and not all_cells:
-            self._rows = rows_where(rollout.valid.flatten(1))
+        if rollout.valid is not None:
+            valid = rollout.valid.flatten(1)
+            (self.most,) = on_host(valid.sum(1).max())
+            self._rows = None if all_cells else _first_true(valid, self.most)
 
     def flat(self, x: Tensor) -> Tensor:
         """(P, T, B, …) to (P, N, …)."""

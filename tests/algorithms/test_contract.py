@@ -21,9 +21,10 @@ from toys import (
     Recall,
     SeedsOfMember,
     learn,
+    own_algorithm,
 )
 
-from skillweave.algorithms.config import DQN, PPO, SAC, TD3, AlgorithmConfig
+from skillweave.algorithms.config import DQN, PPO, SAC, TD3, AlgorithmConfig, OnPolicy
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.networks.config import CNN, RNN, Network
@@ -44,6 +45,10 @@ BUFFERED: dict[str, Any] = {
 ON = PPO(
     num_envs=8, n_steps=16, batch_size=32, learning_rate=1e-2, gamma=0.5, ent_coef=0.0,
     normalize_obs=False, network=Network((32,)),
+)  # fmt: skip
+OWN = own_algorithm().A2C(
+    num_envs=8, n_steps=8, gamma=0.5, learning_rate=2e-2, normalize_obs=False, ent_coef=0.0,
+    network=Network((16,)),
 )  # fmt: skip
 SQUASHED = replace(ON, squash_actions=True)
 STATE_STD = replace(ON, action_std="state", learning_rate=5e-3)
@@ -79,6 +84,8 @@ class Case:
         """Settings for trainings of a few updates."""
         if isinstance(self.config, PPO):
             return replace(self.config, num_envs=4, n_steps=6, batch_size=12, update_epochs=2)
+        if isinstance(self.config, OnPolicy):
+            return replace(self.config, num_envs=4, n_steps=3)
         return replace(
             self.config, num_envs=4, learning_starts=16, buffer_size=240, batch_size=8,
             update_ratio=0.75, adam_eps=1e-4,  # else gradients of nearly 0 make steps by rounding
@@ -104,6 +111,9 @@ TABLE: dict[str, Case] = {
         ("ppo with state's deviation", STATE_STD, "tuple", "Box", 4096),
         ("ppo with lstm", LSTM, "vector", "Discrete", 3072),
         ("ppo with gru", GRU, "dict", "MultiBinary", 2560),
+        ("own", OWN, "vector", "Discrete", 7680),
+        ("own", replace(OWN, learning_rate=5e-3), "tuple", "Box", 25_600),
+        ("own", OWN, "image, channels last", "Discrete", 7680),
         ("dqn", Q, "vector", "Discrete", 400),
         ("dqn", Q, "multi-discrete", "Discrete", 400),
         ("dqn", Q, "image, channels first", "Discrete", 400),
@@ -263,6 +273,7 @@ EXACT: dict[str, Any] = {
 COLD = {"ent_coef": 1e-4, "learn_ent_coef": False}
 VALUED: dict[str, AlgorithmConfig] = {
     "ppo": replace(ON, gamma=GAMMA),
+    "own": replace(OWN, gamma=GAMMA),
     "ppo with lstm": replace(LSTM, gamma=GAMMA),
     "dqn": DQN(**EXACT),
     "dqn of three steps": DQN(**EXACT, n_step=3),
@@ -285,7 +296,7 @@ def acted_in(env: Any, name: str) -> Any:
 def trained(env: Any, name: str, each: int = 1, scale: float = 1.0) -> tuple[Any, Any]:
     """Trained for a number of calls of so many steps."""
     config = VALUED[name]
-    calls = 4096 if isinstance(config, PPO) else 900
+    calls = {PPO: 4096, type(OWN): 16_384}.get(type(config), 900)
     return learn(config, env, int(calls * each * scale))
 
 
@@ -360,7 +371,7 @@ def test_a_forbidden_action_is_never_taken(name):
     env, config = Masked(8), VALUED[name]
     if isinstance(config, DQN) and not config.noisy:
         config = replace(config, exploration_final_eps=0.5)
-    algorithm, state = learn(config, env, 3072 if isinstance(config, PPO) else 400)
+    algorithm, state = learn(config, env, 3072 if isinstance(config, OnPolicy) else 400)
     assert env.taken_though_forbidden == 0
     policy, obs = AgentPolicy.of(algorithm, state), np.arange(300) % 3
     mask = np.arange(3)[None] != obs[:, None]
@@ -372,7 +383,7 @@ def test_a_forbidden_action_is_never_taken(name):
         assert (some != obs).all()
 
 
-@pytest.mark.parametrize("name", [name for name in CHOOSERS if "ppo" not in name])
+@pytest.mark.parametrize("name", [name for name in CHOOSERS if name != "own" and "ppo" not in name])
 def test_a_forbidden_action_is_never_drawn_at_random_before_learning(name):
     env = Masked(8)
     algorithm, _ = learn(replace(VALUED[name], learning_starts=4000), env, 2000)

@@ -2,14 +2,18 @@ import math
 
 import pytest
 import torch
-from torch.distributions import Categorical, Normal
+from torch.distributions import Categorical, Normal, TanhTransform, TransformedDistribution
 
 from skillweave.ops.distributions import (
     categorical_sample,
     categorical_stats,
     gumbel,
     mask_logits,
+    masked_log_probs,
     normal_stats,
+    smoothed_action,
+    squashed_entropy,
+    squashed_sample,
     tanh_log_det,
 )
 
@@ -100,3 +104,36 @@ def test_tanhs_log_derivative_is_exact_where_the_plain_formula_is_not():
     far = torch.tensor([-300.0, 300.0], requires_grad=True)
     tanh_log_det(far).sum().backward()
     assert far.grad.tolist() == [2.0, -2.0]  # −2·tanh
+
+
+def test_log_probabilities_of_forbidden_actions_have_no_weight_and_a_finite_product():
+    logits = torch.tensor([[0.0, 5.0, 0.0]])
+    found = masked_log_probs(logits, torch.tensor([[True, False, True]]))
+    assert found.exp().tolist() == [[0.5, 0.0, 0.5]]
+    assert (found * found.exp()).isfinite().all()
+    assert torch.equal(masked_log_probs(logits, None), logits.log_softmax(-1))
+
+
+def test_squashed_samples_and_their_density_are_those_of_torchs_distributions():
+    g = torch.Generator().manual_seed(0)
+    mean, log_std, z = (torch.randn(4, 2, generator=g, dtype=torch.float64) for _ in range(3))
+    law = TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform(cache_size=1))
+    action, log_prob = squashed_sample(mean, log_std, z)
+    u = mean + log_std.exp() * z
+    torch.testing.assert_close(action, u.tanh())
+    torch.testing.assert_close(log_prob, law.log_prob(law.transforms[0](u)).sum(-1))
+
+
+def test_the_entropy_of_narrow_squashed_normals_is_near_the_mean_of_minus_log_density():
+    mean, log_std = torch.tensor([[0.5, -1.0]]), torch.full((1, 2), -4.0)
+    z = torch.randn(100_000, 2, generator=torch.Generator().manual_seed(0))
+    _, log_prob = squashed_sample(mean, log_std, z)
+    found = squashed_entropy(mean, log_std).item()
+    assert found == pytest.approx(-log_prob.mean().item(), abs=0.01)
+
+
+def test_an_action_is_smoothed_by_clipped_noise_within_the_bounds():
+    action, noise = torch.tensor([[[0.0, 0.9]], [[0.0, 0.9]]]), torch.tensor([[[2.0, 2.0]]] * 2)
+    std, bound = torch.tensor([[[0.1]], [[1.0]]]), torch.tensor([[[0.3]], [[0.3]]])
+    found = smoothed_action(action, noise, std, bound)
+    torch.testing.assert_close(found, torch.tensor([[[0.2, 1.0]], [[0.3, 1.0]]]))

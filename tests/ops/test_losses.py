@@ -6,6 +6,8 @@ import torch
 from skillweave.ops.losses import (
     approximate_kl,
     categorical_projection,
+    critic_loss,
+    expected_soft_value,
     ppo_policy_loss,
     td_loss,
     value_loss,
@@ -139,3 +141,35 @@ def test_a_projection_keeps_the_mean_within_the_atoms():
     reward, discount = torch.linspace(-1.0, 1.0, 20)[None], torch.full((1, 20), 0.5)
     mean = (categorical_projection(p, atoms, reward, discount) * atoms).sum(-1)
     torch.testing.assert_close(mean, reward + 0.5 * (p * atoms).sum(-1), rtol=1e-4, atol=1e-4)
+
+
+VALID = torch.tensor([[True, False, True]])
+
+
+def test_losses_of_ppo_are_means_over_valid_samples():
+    g = torch.Generator().manual_seed(0)
+    new, old, advantage, weight = (torch.randn(1, 3, generator=g) for _ in range(4))
+    clip, kept = torch.tensor([0.2]), [x[:, [0, 2]] for x in (new, old, advantage, weight)]
+    found = ppo_policy_loss(new, old, advantage, clip, weight, VALID)
+    torch.testing.assert_close(found, ppo_policy_loss(*kept[:3], clip, kept[3]))
+    torch.testing.assert_close(
+        value_loss(new, old, advantage, clip, VALID), value_loss(*kept[:3], clip)
+    )
+    found = approximate_kl(new, old, weight, VALID)
+    torch.testing.assert_close(found, approximate_kl(kept[0], kept[1], kept[3]))
+
+
+def test_critics_learn_one_target_by_half_the_squared_error():
+    q, target = torch.tensor([[[1.0, 2.0], [3.0, 5.0]]]), torch.tensor([[2.0, 2.0]])
+    loss, error, mean = critic_loss(q, target, torch.tensor([[1.0, 0.5]]))
+    # Sample 0: ½·(1 + 1); sample 1: ½·(0 + 9), which counts half.
+    assert loss.item() == pytest.approx((1.0 + 0.5 * 4.5) / 2)
+    assert error.tolist() == [[1.0, 1.5]]
+    assert mean.item() == pytest.approx(11 / 4)
+
+
+def test_the_soft_value_by_hand():
+    p, q = torch.tensor([[[0.25, 0.75]]]), torch.tensor([[[4.0, 8.0]]])
+    found = expected_soft_value(p.log(), q, torch.tensor([[0.5]]))
+    entropy = -(0.25 * math.log(0.25) + 0.75 * math.log(0.75))
+    assert found.item() == pytest.approx(7.0 + 0.5 * entropy)

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skillweave.ops.moments import explained_variance, normalise
-from skillweave.ops.returns import gae
+from skillweave.ops.returns import discounted, gae, td_target
 
 
 def one(*numbers: float) -> torch.Tensor:
@@ -89,3 +89,10 @@ def test_explained_variance_is_one_for_the_target_and_zero_for_a_constant():
 
 def test_explained_variance_of_a_constant_target_is_finite():
     assert torch.isfinite(explained_variance(torch.zeros(1, 4), torch.ones(1, 4))).all()
+
+
+def test_a_target_by_hand_and_what_follows_an_end_may_be_anything():
+    reward, discount = torch.tensor([1.0, 2.0]), torch.tensor([0.0, 0.5])
+    value = torch.tensor([float("nan"), 8.0])
+    assert discounted(discount, value).tolist() == [0.0, 4.0]
+    assert td_target(reward, discount, value).tolist() == [1.0, 6.0]

@@ -1,0 +1,222 @@
+"""Rollouts with gaps: only valid rows are learnt from, as if there were no others."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete
+
+from skillweave.algorithms.config import PPO
+from skillweave.algorithms.ppo import PPOAlgorithm, State
+from skillweave.algorithms.rollouts import rows_where, without_gaps
+from skillweave.experience import Rollout
+from skillweave.networks.config import RNN, Network
+from skillweave.seeding import Seeds
+
+T, B, OBS, ACTIONS = 6, 4, 3, 5
+CONFIG = PPO(
+    num_envs=B, n_steps=T, batch_size=8, update_epochs=2, network=Network((8,)),
+    normalize_obs=True, clip_value=0.2,
+)  # fmt: skip
+RECURRENT = replace(CONFIG, network=Network((8,), rnn=RNN("gru", 4)))
+NAN = float("nan")
+CELLS = (
+    "obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts",
+)  # fmt: skip
+
+
+def made(config: PPO, members: int) -> tuple[PPOAlgorithm, State]:
+    algorithm = PPOAlgorithm(config, Box(-np.inf, np.inf, (OBS,)), Discrete(ACTIONS))
+    return algorithm, algorithm.init([Seeds(m) for m in range(members)])
+
+
+def full(algorithm: PPOAlgorithm, members: int, steps: int = T, columns: int = B) -> Rollout:
+    """Trajectories that hang together, without gaps."""
+    g, lead = torch.Generator().manual_seed(3), (members, steps, columns)
+    last = torch.rand(lead, generator=g) < 0.3
+    last[:, -1] = True
+    obs, next_obs = (1.0 + 2.0 * torch.randn(*lead, OBS, generator=g) for _ in range(2))
+    next_obs[:, :-1] = torch.where(last[:, :-1, :, None], next_obs[:, :-1], obs[:, 1:])
+    mask = torch.rand(*lead, ACTIONS, generator=g) < 0.6
+    mask[..., 0] = True
+    starts = torch.zeros_like(last)
+    starts[:, 1:] = last[:, :-1]
+    memory = torch.randn(members, columns, algorithm.memory_size, generator=g)
+    return Rollout(
+        obs, torch.zeros(lead, dtype=torch.int64), torch.randn(lead, generator=g),
+        0.9 * torch.rand(lead, generator=g).round(), next_obs, last, mask,
+        head=torch.randn(*lead, ACTIONS, generator=g),
+        memory=memory if algorithm.memory_size else None,
+        starts=starts if algorithm.memory_size else None,
+    )  # fmt: skip
+
+
+def with_gaps(rollout: Rollout, seed: int = 0, more: int = 5) -> Rollout:
+    """The same rows in ``more`` rows more, which hold anything, and an empty column at the end."""
+    members, steps, columns = rollout.reward.shape
+    rng = np.random.default_rng(seed)
+    valid = torch.zeros(members, steps + more, columns + 1, dtype=torch.bool)
+    for m, b in np.ndindex(members, columns):
+        rows = rng.choice(steps + more, steps, replace=False)
+        valid[m, rows, b] = True
+
+    def spread(x: torch.Tensor) -> torch.Tensor:
+        anything: Any = NAN if x.is_floating_point() else 1
+        shape = (members, steps + more, columns + 1, *x.shape[3:])
+        found = torch.full(shape, anything, dtype=x.dtype)
+        for m, b in np.ndindex(members, columns):
+            found[m, valid[m, :, b], b] = x[m, :, b]
+        return found
+
+    values = {name: getattr(rollout, name) for name in CELLS}
+    changed: dict[str, Any] = {k: None if v is None else spread(v) for k, v in values.items()}
+    changed["last"] &= valid
+    if rollout.memory is not None:
+        changed["memory"] = torch.cat([rollout.memory, rollout.memory[:, :1] * NAN], 1)
+    return replace(rollout, **changed, valid=valid)
+
+
+def some(x: Any, rows: slice) -> Any:
+    """The members ``rows`` of a state or a rollout, as a copy."""
+    values = {f.name: getattr(x, f.name) for f in fields(x)}
+    copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
+    return type(x)(**{**values, **copied})
+
+
+def learnt(algorithm: PPOAlgorithm, state: State, rollout: Rollout, first: int = 0) -> Any:
+    """State and metrics after an update; members have random streams by their number."""
+    rng = [Seeds(first + m).torch() for m in range(len(state.params))]
+    return algorithm.update(state, rollout, rng)
+
+
+def assert_alike(one: State, other: State, exactly: bool = False) -> None:
+    rtol, atol = (0.0, 0.0) if exactly else (1e-4, 1e-5)
+    for f in fields(State):
+        a, b = getattr(one, f.name), getattr(other, f.name)
+        torch.testing.assert_close(a, b, rtol=rtol, atol=atol, msg=lambda x, f=f: f"{f.name}: {x}")
+
+
+@pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
+def test_a_rollout_with_gaps_is_learnt_from_as_the_full_one_with_the_same_rows(config):
+    algorithm, state = made(config, 2)
+    rollout = full(algorithm, 2)
+    there, report = learnt(algorithm, some(state, slice(0, 2)), rollout)
+    here, other = learnt(algorithm, some(state, slice(0, 2)), with_gaps(rollout))
+    assert not torch.equal(there.params, state.params)
+    assert_alike(here, there, exactly=True)
+    assert {k: v.tolist() for k, v in other.metrics.items()} == {
+        k: v.tolist() for k, v in report.metrics.items()
+    }
+    assert report.metrics["samples"].tolist() == [T * B] * 2
+
+
+@pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
+def test_columns_of_different_lengths_are_learnt_from_row_by_row(config):
+    # Column 0 after column 1, in one column: the same rows, as all of them are one minibatch.
+    algorithm, state = made(replace(config, batch_size=T * B, update_epochs=3), 1)
+    rollout = full(algorithm, 1)
+    if rollout.memory is not None and rollout.starts is not None:
+        rollout.memory[:, 0] = 0.0
+        rollout.starts[:, 0, 0] = True
+    ragged = with_gaps(rollout, more=T)
+    ragged.valid.zero_()
+    ragged.valid[:, :T, 1:B] = ragged.valid[:, T:, 1] = True
+    for name in CELLS:
+        if getattr(rollout, name) is not None:
+            into, rows = getattr(ragged, name), getattr(rollout, name)
+            into[:, :T, :B], into[:, T:, 1] = rows, rows[:, :, 0]
+    there, _ = learnt(algorithm, some(state, slice(0, 1)), rollout)
+    here, report = learnt(algorithm, some(state, slice(0, 1)), ragged)
+    assert report.metrics["samples"].tolist() == [T * B]
+    assert_alike(here, there)
+
+
+def test_networks_without_memory_run_on_valid_rows_alone(monkeypatch):
+    algorithm, state = made(CONFIG, 1)
+    rollout, seen = with_gaps(full(algorithm, 1), more=40), []
+    run = type(algorithm.critic_net).__call__
+
+    def counted(net: Any, views: Any, inputs: Any, extra: Any = None) -> Any:
+        seen.append(inputs["vector"].shape[1])
+        return run(net, views, inputs, extra)
+
+    monkeypatch.setattr(type(algorithm.critic_net), "__call__", counted)
+    learnt(algorithm, state, rollout)
+    assert max(seen) == T * B
+
+
+@pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
+def test_a_stack_with_gaps_learns_what_its_members_learn_alone(config):
+    algorithm, state = made(config, 3)
+    rollout = with_gaps(full(algorithm, 3))
+    rollout.valid[:, 2, 1] = rollout.valid[:, 5, 1] = False  # as many of each member, or nearly
+    rollout.last |= rollout.valid  # so that a row may be missing between two others
+    equal = int(rollout.valid.flatten(1).sum(1).min())
+    for m in range(3):  # as many of each member
+        cells = rollout.valid[m].flatten().nonzero()[:, 0]
+        rollout.valid[m].view(-1)[cells[equal:]] = False
+    stack, _ = learnt(algorithm, some(state, slice(0, 3)), rollout)
+    if config is RECURRENT:
+        # Whole columns are shuffled, and members may have different numbers of them.
+        assert stack.params.isfinite().all()
+        return
+    for m in range(3):
+        part = slice(m, m + 1)
+        alone, _ = learnt(algorithm, some(state, part), some(rollout, part), m)
+        assert_alike(some(stack, part), alone)
+
+
+@pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
+def test_members_with_fewer_rows_are_padded_with_rows_that_do_not_count(config):
+    algorithm, state = made(replace(config, batch_size=T * B, update_epochs=3), 2)
+    rollout = with_gaps(full(algorithm, 2))
+    rollout.valid[1, :, 2:] = False
+    stack, report = learnt(algorithm, some(state, slice(0, 2)), rollout)
+    assert report.metrics["samples"].tolist() == [T * B, T * 2]
+    for m in range(2):
+        part = slice(m, m + 1)
+        alone, own = learnt(algorithm, some(state, part), some(rollout, part), m)
+        assert_alike(some(stack, part), alone)
+        for name, value in own.metrics.items():
+            torch.testing.assert_close(report.metrics[name][part], value, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
+@pytest.mark.parametrize("members", [1, 2])
+def test_a_member_without_rows_stays_as_it_is(config, members):
+    algorithm, state = made(config, members)
+    rollout, before = with_gaps(full(algorithm, members)), some(state, slice(0, members))
+    rollout.valid[0] = False
+    after, report = learnt(algorithm, state, rollout)
+    for name in ("params", "mu", "nu", "count", "obs_mean", "obs_var", "return_mean"):
+        assert torch.equal(getattr(after, name)[0], getattr(before, name)[0]), name
+    assert all(v.isfinite().all() for v in report.metrics.values())
+    assert members == 1 or not torch.equal(after.params[1], before.params[1])
+
+
+def test_rows_come_to_the_front_of_their_columns_in_order():
+    algorithm, _ = made(CONFIG, 1)
+    rollout = full(algorithm, 1)
+    assert without_gaps(rollout) is rollout
+    again = without_gaps(with_gaps(rollout))
+    assert again.valid is None
+    for f in fields(Rollout):
+        one, other = getattr(again, f.name), getattr(rollout, f.name)
+        assert one is other or torch.equal(one, other), f.name
+    cut = with_gaps(rollout)
+    cut.valid[0, :, 1] &= torch.arange(T + 5) < 4
+    cut.last[0, :, 1] = False
+    short = without_gaps(cut)
+    kept = int(cut.valid[0, :, 1].sum())
+    assert short.valid[0, :, 1].tolist() == [True] * kept + [False] * (T - kept)
+    assert short.last[0, :, 1].nonzero().tolist() == [[kept - 1]]  # nothing follows it
+    assert not short.obs[0, kept:, 1].any()
+
+
+def test_rows_that_are_true_come_first():
+    flags = torch.tensor([[0, 1, 0, 1, 1], [1, 0, 0, 0, 0]], dtype=torch.bool)
+    assert rows_where(flags).tolist() == [[1, 3, 4], [0, 1, 2]]

@@ -1,0 +1,214 @@
+"""Algorithms of users' own: they are registered, learn what the library's own learn, are saved."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from toys import Countdown, Echo, Masked, learn
+from toys import own_algorithm as example
+
+from skillweave import (
+    PPO,
+    SAC,
+    Algorithm,
+    Evolution,
+    Hierarchy,
+    Mutations,
+    Network,
+    Skill,
+    SkillweaveError,
+    register_algorithm,
+    train_agent,
+)
+from skillweave.algorithms import config as table
+from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.registry import make_algorithm
+from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.seeding import Seeds
+
+BOX, LINE = gym.spaces.Box(-1, 1, (2,), np.float32), gym.spaces.Discrete(2)
+
+
+@pytest.fixture(autouse=True)
+def known_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test registers is forgotten after it."""
+    monkeypatch.setattr(table, "_REGISTERED", dict(table._REGISTERED))
+    sys.modules.pop("own_algorithm", None)
+
+
+def own(**settings: Any) -> Any:
+    small: dict[str, Any] = {
+        "num_envs": 8, "n_steps": 8, "gamma": 0.5, "learning_rate": 2e-2, "normalize_obs": False,
+        "network": Network((16,)), "ent_coef": 0.0,
+    }  # fmt: skip
+    return example().A2C(**small | settings)
+
+
+# Learning
+
+
+@pytest.mark.parametrize(("asks", "updates"), [("Discrete", 120), ("Box", 300)])
+def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, updates, tmp_path):
+    env = Echo(8, "vector", asks)
+    algorithm, state = learn(own(), env, 64 * updates)
+    policy, shown = AgentPolicy.of(algorithm, state), np.arange(4)
+    action, _ = policy.act({}, env.show(shown))
+    assert env.error(shown, action).mean() < 0.1
+    write_tensors(tmp_path / "agent", *policy.to_file())
+    loaded = AgentPolicy.from_file(*read_tensors(tmp_path / "agent"), "agent")
+    assert np.array_equal(loaded.act({}, env.show(shown))[0], action)
+
+
+def test_its_values_are_those_of_the_ends_that_it_meets():
+    algorithm, state = learn(own(), Countdown(8), 64 * 150)
+    found = algorithm.value(state, torch.arange(5)[None])[0].tolist()
+    assert found == pytest.approx([sum(0.5**i for i in range(5 - t)) for t in range(5)], rel=0.1)
+
+
+def test_it_never_takes_a_forbidden_action():
+    env = Masked(8)
+    learn(own(), env, 64 * 10)
+    assert env.taken_though_forbidden == 0
+
+
+def test_a_stack_of_it_learns_what_its_members_learn_alone():
+    algorithm = make_algorithm(own(), BOX, LINE)
+    g = torch.Generator().manual_seed(0)
+    lead = (3, 8, 4)
+    last = torch.rand(lead, generator=g) < 0.3
+    valid = torch.rand(lead, generator=g) < 0.7
+    rollout = example().Rollout(
+        torch.randn(*lead, 2, generator=g), torch.zeros(lead, dtype=torch.int64),
+        torch.randn(lead, generator=g), torch.full(lead, 0.9), torch.randn(*lead, 2, generator=g),
+        last, valid=valid,
+    )  # fmt: skip
+    stack, _ = algorithm.update(algorithm.init([Seeds(m) for m in range(3)]), rollout, [])
+    for m in range(3):
+        part = {
+            k: v[m : m + 1] if isinstance(v, torch.Tensor) else v
+            for k, v in ((k, getattr(rollout, k)) for k in rollout.__dataclass_fields__)
+        }
+        alone, _ = algorithm.update(algorithm.init([Seeds(m)]), type(rollout)(**part), [])
+        torch.testing.assert_close(stack.params[m], alone.params[0], rtol=1e-4, atol=1e-6)
+
+
+# From end to end
+
+
+class Left(Skill):
+    """To the left."""
+
+    def reward(self, step: Any) -> Any:
+        return -step.next_obs[:, 0]
+
+
+def test_it_trains_a_plain_agent(tmp_path):
+    config = own(num_envs=4, n_steps=16)
+    run = train_agent("CartPole-v1", config, 512, tmp_path / "run", quiet=True)
+    assert run.evaluate(2).mean > 0
+
+
+def test_it_trains_skills_selectors_and_populations(tmp_path):
+    config = own(num_envs=4, n_steps=16)
+    hierarchy = Hierarchy(
+        "CartPole-v1", [Left(), replace_name(Left(), "again")], call_steps=4, algorithm=config,
+        selector=config, skill_steps=256, selector_steps=256,
+    )  # fmt: skip
+    changes = Mutations(none=0.3, activation=0.0)
+    search = Evolution(population=2, generations=2, episodes=1, mutations=changes)
+    run = hierarchy.train(tmp_path / "run", quiet=True, evolve={"left": search})
+    assert run.evaluate(2).mean > 0
+
+
+def replace_name(skill: Skill, name: str) -> Skill:
+    skill.name = name
+    return skill
+
+
+# Names and files
+
+
+def test_settings_are_found_by_name_and_survive_json():
+    config = own(ent_coef=0.25)
+    data = config_to_json(config)
+    assert data["algorithm"] == "A2C"
+    assert config_from_json(data) == config
+    assert named_config("a2c", "here") == example().A2C()
+    assert isinstance(make_algorithm(config, BOX, LINE), example().A2CAlgorithm)
+
+
+def test_an_algorithm_that_nobody_registered_is_an_error_that_says_what_to_do():
+    data = config_to_json(own())
+    config = own()
+    table._REGISTERED.pop("A2C")
+    says = r"no algorithm is registered for '?A2C'?; there are: PPO, .*\.register_algorithm"
+    with pytest.raises(SkillweaveError, match=says):
+        config_from_json(data, "run.json", "phases[0].algorithm")
+    with pytest.raises(SkillweaveError, match=says):
+        make_algorithm(config, BOX, LINE)
+    with pytest.raises(SkillweaveError, match=says):
+        train_agent("CartPole-v1", config, 100, "nowhere")
+
+
+def test_the_latest_of_a_name_counts_and_the_librarys_own_stay():
+    first = example().A2C
+    sys.modules.pop("own_algorithm")
+    again = example().A2C
+    assert again is not first
+    assert type(config_from_json(config_to_json(again()))) is again
+
+    taken = dataclass(frozen=True)(type("PPO", (OnPolicy,), {}))
+    with pytest.raises(SkillweaveError, match="PPO is an algorithm of this library"):
+        register_algorithm(taken, example().A2CAlgorithm)
+
+
+@pytest.mark.parametrize("method", ["fresh_state", "parameter_groups", "act", "value", "update"])
+def test_a_method_that_is_missing_is_named(method):
+    kind = example().A2CAlgorithm
+    lacking = type("Half", (kind,), {method: getattr(Algorithm, method)})
+    with pytest.raises(SkillweaveError, match=rf"Half lacks {method}; see skillweave\.Algorithm"):
+        register_algorithm(example().A2C, lacking)
+    algorithm = lacking(own(), BOX, LINE)
+    given = {"fresh_state": 1, "parameter_groups": 0, "act": 4, "value": 2, "update": 3}[method]
+    with pytest.raises(SkillweaveError, match=rf"Half has no method '{method}'"):
+        getattr(algorithm, method)(*[None] * given)
+
+
+def test_what_cannot_be_registered_is_told():
+    module = example()
+    with pytest.raises(SkillweaveError, match=r"int is no subclass of skillweave\.Algorithm"):
+        register_algorithm(module.A2C, int)  # type: ignore[arg-type]
+    other = type("Other", (module.A2CAlgorithm,), {"store": "replay"})
+    with pytest.raises(SkillweaveError, match="must be a frozen dataclass on OffPolicy"):
+        register_algorithm(module.A2C, other)
+    with pytest.raises(SkillweaveError, match="must be a frozen dataclass on OnPolicy"):
+        register_algorithm(SAC, module.A2CAlgorithm)
+    odd = type("Odd", (module.A2CAlgorithm,), {"store": "drawer"})
+    with pytest.raises(SkillweaveError, match="'drawer'; it must be 'rollout' or 'replay'"):
+        register_algorithm(module.A2C, odd)
+    bare = type("Bare", (Algorithm,), {})
+    with pytest.raises(SkillweaveError, match=r"lacks fresh_state, .*, store, action_spaces"):
+        register_algorithm(module.A2C, bare)
+
+
+def test_a_space_that_it_cannot_act_in_names_those_that_can():
+    with pytest.raises(SkillweaveError, match=r"A2C cannot act in MultiBinary.*; PPO can"):
+        make_algorithm(own(), BOX, gym.spaces.MultiBinary(2))
+    td3 = named_config("TD3", "here")
+    with pytest.raises(SkillweaveError, match=r"TD3 cannot act in Discrete.*; PPO, DQN, SAC, A2C"):
+        make_algorithm(td3, BOX, LINE)
+
+
+def test_settings_that_are_common_are_checked():
+    with pytest.raises(SkillweaveError, match=r"A2C\.gamma is 2"):
+        own(gamma=2.0)
+    with pytest.raises(SkillweaveError, match=r"A2C\.device is 'tpu'; it must be one of"):
+        own(device="tpu")
+    assert replace(PPO(), device="auto").device == "auto"
