@@ -109,16 +109,15 @@ def read_agent(
     return AgentPolicy.from_file(tensors, header, str(path))
 
 
-def read_weights(
-    declaration: Declaration, tensors: dict[str, Tensor], header: dict[str, Any], path: Path
-) -> Policy:
-    """A hierarchy from what ``open_weights`` found in ``path``.
-
-    The declaration takes over the file's call length.
+def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | AgentPolicy:
+    """The inverse of ``write_weights``; the declaration takes over the file's call length.
 
     Raises:
         SkillweaveError: the file is damaged, or belongs to other skills or another environment.
     """
+    tensors, header = open_weights(path)
+    if header["kind"] == "agent":
+        return read_agent(declaration.spec, tensors, header, path)
     names = [s.name for s in declaration.skills]
     if header["skills"] != names or header["env"] != declaration.spec.name:
         theirs = ", ".join(header["skills"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -127,13 +128,11 @@ class OneAgent:
         target = self.stage.target
 
         def on_tick(tick: Tick) -> None:
-            metrics = tick.metrics
-            metrics |= self.evaluation.due(
-                tick.steps, lambda: AgentPolicy.of(self.algorithm, tick.state)
-            )
+            policy = functools.partial(AgentPolicy.of, self.algorithm, tick.state)
+            found = self.evaluation.due(tick.steps, policy)
             log.at["evaluation_steps"] += self.evaluation.spent()
-            log.tick(tick.update, tick.steps, tick.seconds, metrics)
-            if target is not None and target.reached(metrics) is not None:
+            log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
+            if target is not None and target.reached(found, self.stage.name) is not None:
                 # No checkpoint: who resumes from the one before comes here again.
                 raise _TargetReached
             if tick.cut:
