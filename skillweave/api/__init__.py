@@ -65,6 +65,11 @@ class Agent(PlainAgent):
         config = config_from_json(stage["algorithm"])
         return cls(_spec_of(manifest), config, int(stage["budget"]))
 
+    def load_weights(self, path: str | Path) -> Run:
+        """This agent with the weights of one file (see ``Run.save_weights``)."""
+        path = as_path(path, "path")
+        return Run(self, path, read_agent(self.spec, *open_weights(path), path))
+
     @classmethod
     def from_weights(cls, path: str | Path) -> Run:
         """A plain agent with its environment, from the file that ``Run.save_weights`` wrote."""

@@ -104,6 +104,8 @@ def read_agent(
     Raises:
         SkillweaveError: the file is damaged, or belongs to another environment.
     """
+    if header["kind"] != "agent":
+        raise SkillweaveError(f"{path} holds a {header['kind']}, not a plain agent")
     if (env := header.get("env", spec.name)) != spec.name:
         raise SkillweaveError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
     return AgentPolicy.from_file(tensors, header, str(path))
