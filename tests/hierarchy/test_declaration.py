@@ -221,6 +221,8 @@ SETTINGS = {
     "selector.learning_rate_schedule=constant": (
         lambda d: d.selector.learning_rate_schedule == "constant"
     ),
+    "selector_target_return=200": lambda d: d.selector_target_return == 200.0,
+    "skills.center.target_return=1e1": lambda d: d.skill("center").target_return == 10.0,
     "flat.learning_rate=1e-4": (
         lambda d: d.flat and d.flat.learning_rate == 1e-4 and d.algorithm.learning_rate == 1e-3
     ),
