@@ -80,7 +80,7 @@ def main() -> None:
         api.Progress = plain  # type: ignore[misc]
         hierarchy(given.length, given.steps).resume(broken, quiet=True)
         weights = [
-            read_tensors(run / "policies" / "flat.safetensors")[0] for run in (whole, broken)
+            read_tensors(run / "policies" / "agent.safetensors")[0] for run in (whole, broken)
         ]
         lines = [list(RunDirectory.open(run).metrics()) for run in (whole, broken)]
     for line in (*lines[0], *lines[1]):

@@ -25,7 +25,7 @@ from skillweave import (
     Reflex,
     Skill,
 )
-from skillweave.api import Run, Task
+from skillweave.api import Agent, Run
 
 SEED = 3
 """Of every training."""
@@ -95,14 +95,12 @@ def leans_left(obs: Any) -> Any:
 class Kind:
     """One training: how it is declared, and how it evolves."""
 
-    declare: Callable[[], Hierarchy]
-    flat: bool = True
+    declare: Callable[[], Hierarchy | Agent]
     evolve: Evolution | None = None
 
     def train(self, run: Path) -> Run:
         """Train from the start."""
-        how: dict[str, Any] = {"flat": self.flat, "evolve": self.evolve}
-        return self.declare().train(run, seed=SEED, quiet=True, **how)
+        return self.declare().train(run, seed=SEED, quiet=True, evolve=self.evolve)
 
     def go_on(self, run: Path) -> Run:
         """Do what a user does after a kill: resume the run, or begin where there is none."""
@@ -133,19 +131,17 @@ def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
     )  # fmt: skip
 
 
-def alone(env: Any, algorithm: Any, steps: int) -> Hierarchy:
+def alone(env: Any, algorithm: Any, steps: int) -> Agent:
     """One agent."""
-    return Hierarchy(
-        env, [Task()], algorithm=algorithm, flat_steps=steps, cut_every=max(1, steps // 5)
-    )
+    return Agent(env, algorithm, steps, cut_every=max(1, steps // 5))
 
 
 KINDS: dict[str, Kind] = {
     "skills and selector": Kind(
-        lambda: woven(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)), flat=False
+        lambda: woven(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
     ),
     "skills and selector, replay": Kind(
-        lambda: woven(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS)), flat=False
+        lambda: woven(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS))
     ),
     "replay of continuous actions": Kind(
         lambda: alone(TINY, SAC(**REPLAYS, normalize_obs=True, n_step=3), 800)
@@ -174,7 +170,6 @@ KINDS: dict[str, Kind] = {
             selector_steps=600, cut_every=150, eval_every=200, eval_episodes=2,
             reflexes=[Reflex(leans_left, 0)],
         ),
-        flat=False,
     ),
     "populations of skills and selector": Kind(
         lambda: Hierarchy(
@@ -184,7 +179,6 @@ KINDS: dict[str, Kind] = {
             ),
             selector=DQN(**REPLAYS), selector_steps=300,
         ),
-        flat=False,
         evolve=Evolution(**EVOLVES | {"population": 2, "generations": 2}),
     ),
     "population, replay": Kind(

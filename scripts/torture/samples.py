@@ -20,7 +20,7 @@ from scripts.torture.compare import tensors_and_header
 from scripts.torture.kinds import CART, KINDS, LEARNS, NET, Balance, Kind, Tiny, woven
 from skillweave import PPO, EnvSpec, Hierarchy, Skill, from_onnx
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.api import Run, train_agent
+from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import actions, commands
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
@@ -104,7 +104,8 @@ def from_data(folder: Path, changed: str) -> Play:
     run = folder / "run"
     looked_at(run, changed)
     manifest = RunDirectory.open(run).manifest
-    return play(Hierarchy.from_manifest(manifest).load(run))
+    kind = Agent if manifest["kind"] == "agent" else Hierarchy
+    return play(kind.from_manifest(manifest).load(run))
 
 
 def resumed(kind: Kind) -> Callable[[Path, str], Play]:
@@ -265,7 +266,7 @@ def agent(folder: Path) -> None:
 
 
 SHORT = Kind(
-    lambda: woven(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)), flat=False
+    lambda: woven(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
 )  # fmt: skip
 """Few steps to resume."""
 SAMPLES: dict[str, Sample] = {

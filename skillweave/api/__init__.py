@@ -11,6 +11,7 @@ import gymnasium as gym
 
 from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
+from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.run import Run, as_path
 from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
@@ -63,6 +64,11 @@ class Agent(PlainAgent):
         (stage,) = manifest["stages"]
         config = config_from_json(stage["algorithm"])
         return cls(_spec_of(manifest), config, int(stage["budget"]))
+
+    def load_weights(self, path: str | Path) -> Run:
+        """This agent with the weights of one file (see ``Run.save_weights``)."""
+        path = as_path(path, "path")
+        return Run(self, path, read_agent(self.spec, *open_weights(path), path))
 
     @classmethod
     def from_weights(cls, path: str | Path) -> Run:
@@ -123,13 +129,16 @@ class Hierarchy(Declaration):
         self._adopt_run_config(run)
         return Run(_declared(self, run), run.path, training.load(self, run))
 
+    def plain_agent(self) -> Agent:
+        """The flat baseline: one agent on the task itself, without skills and reflexes."""
+        return Agent(**vars(super().plain_agent()))
+
     def load_weights(self, path: str | Path) -> Run:
         """This hierarchy with the weights of one file (see ``Run.save_weights``)."""
         path = as_path(path, "path")
-        tensors, header = open_weights(path)
-        if header["kind"] == "agent":
-            return Run(self.plain_agent(), path, read_agent(self.spec, tensors, header, path))
-        return Run(self, path, read_weights(self, tensors, header, path))
+        policy = read_weights(self, path)
+        plain = isinstance(policy, AgentPolicy)
+        return Run(self.plain_agent() if plain else self, path, policy)
 
     @staticmethod
     def pretrained(name: str) -> Run:
@@ -236,10 +245,11 @@ def _go_on(declared: Hierarchy | Agent, run: RunDirectory, quiet: bool, evolve: 
     return Run(_declared(declared, run), run.path, policy)
 
 
-def _declared(declared: Hierarchy | Agent, run: RunDirectory) -> Declaration | PlainAgent:
+def _declared(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
     """What a run trained: a hierarchy, or its flat baseline."""
-    flat = run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy)
-    return declared.plain_agent() if flat else declared  # type: ignore[union-attr]
+    if run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy):
+        return declared.plain_agent()
+    return declared
 
 
 def _check_run(declared: Hierarchy | Agent, run: RunDirectory) -> None:

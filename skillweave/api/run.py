@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
 from skillweave.messages import short, whole_number
@@ -18,15 +17,18 @@ from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.plain_agent import AGENT, PlainAgent
 from skillweave.types import Memory, Policy, SkillweaveError
 
+if TYPE_CHECKING:
+    from skillweave.api import Agent, Hierarchy
+
 
 class Run:
     """A trained policy with its declaration: evaluate, watch or save it, use it as a skill."""
 
-    def __init__(self, declaration: Declaration | PlainAgent, path: Path, policy: Policy) -> None:
+    def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
         self.declaration, self.path, self.policy = declaration, path, policy
 
     @property
-    def hierarchy(self) -> Declaration:
+    def hierarchy(self) -> Hierarchy:
         """The hierarchy that was trained.
 
         Raises:

@@ -14,7 +14,9 @@ from skillweave.algorithms.config import named_config
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.types import SkillweaveError
 
-PLAIN = tuple(f.name for f in fields(Declaration) if f.type in ("int", "int | None", "bool"))
+PLAIN = tuple(
+    f.name for f in fields(Declaration) if f.type in ("int", "int | None", "float | None", "bool")
+)
 CONFIGS = ("algorithm", "selector", "flat")
 
 
@@ -38,6 +40,8 @@ def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
             setattr(declaration, head, _parse(name, text, hint))
         elif head == "skills" and len(rest) == 2 and rest[1] == "steps":
             declaration.skill(rest[0]).steps = _parse(name, text, int)
+        elif head == "skills" and len(rest) == 2 and rest[1] in ("target_return", "target_success"):
+            setattr(declaration.skill(rest[0]), rest[1], _parse(name, text, float | None))
         elif head == "skills" and len(rest) == 1:
             kinds[head, rest[0]] = text
         elif head == "skills" and len(rest) >= 2:

@@ -104,21 +104,22 @@ def read_agent(
     Raises:
         SkillweaveError: the file is damaged, or belongs to another environment.
     """
+    if header["kind"] != "agent":
+        raise SkillweaveError(f"{path} holds a {header['kind']}, not a plain agent")
     if (env := header.get("env", spec.name)) != spec.name:
         raise SkillweaveError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
     return AgentPolicy.from_file(tensors, header, str(path))
 
 
-def read_weights(
-    declaration: Declaration, tensors: dict[str, Tensor], header: dict[str, Any], path: Path
-) -> Policy:
-    """A hierarchy from what ``open_weights`` found in ``path``.
-
-    The declaration takes over the file's call length.
+def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | AgentPolicy:
+    """The inverse of ``write_weights``; the declaration takes over the file's call length.
 
     Raises:
         SkillweaveError: the file is damaged, or belongs to other skills or another environment.
     """
+    tensors, header = open_weights(path)
+    if header["kind"] == "agent":
+        return read_agent(declaration.spec, tensors, header, path)
     names = [s.name for s in declaration.skills]
     if header["skills"] != names or header["env"] != declaration.spec.name:
         theirs = ", ".join(header["skills"])

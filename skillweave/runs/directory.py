@@ -27,6 +27,7 @@ from skillweave.reading import read_file, shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.files import (
     TEMPORARY,
+    make_directory,
     read_signed,
     remove,
     write_bytes,
@@ -78,8 +79,9 @@ class RunDirectory:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SkillweaveError(f"could not make {path}: {error.strerror}") from error
-        content = {"id": identity(manifest), **manifest}
-        run = cls(path, {"versions": versions(), "created": _now(), **content})
+        created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+        content = {"versions": versions(), "created": created, "id": identity(manifest)}
+        run = cls(path, content | manifest)
         run.save()
         return run
 
@@ -105,9 +107,8 @@ class RunDirectory:
             return
         self._lock = Lock(self.path)
         try:
-            self.manifest.update(
-                read_manifest(self.path)
-            )  # another process may have gone on with it
+            # Another process may have gone on with it.
+            self.manifest.update(read_manifest(self.path))
             self._clear()
         except BaseException:
             self.close()
@@ -118,8 +119,9 @@ class RunDirectory:
         for directory in (self.path, self.path / "policies"):
             for path in directory.glob(TEMPORARY):
                 remove(path)
-        done = [p["name"] for p in self.manifest["stages"] if p["status"] == "done"]
-        self._checkpoints.clear(done)
+        self._checkpoints.clear(
+            [s["name"] for s in self.manifest["stages"] if s["status"] == "done"]
+        )
 
     def save(self) -> None:
         """Write ``run.json``."""
@@ -133,11 +135,11 @@ class RunDirectory:
 
     def stage(self, name: str) -> dict[str, Any]:
         """The manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
-        for stage in self.manifest["stages"]:
-            if stage["name"] == name:
-                found: dict[str, Any] = stage
-                return found
-        names = ", ".join(p["name"] for p in self.manifest["stages"])
+        entries: list[dict[str, Any]] = self.manifest["stages"]
+        for entry in entries:
+            if entry["name"] == name:
+                return entry
+        names = ", ".join(entry["name"] for entry in entries)
         raise SkillweaveError(f"{self.path} has no stage {shown(name)}; it has: {names}")
 
     @property
@@ -156,8 +158,7 @@ class RunDirectory:
         """
         tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
-        header = self._place(header["stage"]) | header
-        header |= {"metrics_bytes": self.metrics_size(), "lineage_bytes": self.lineage.size}
+        header = self._place(header["stage"]) | header | self.line_bytes()
         self._check()
         self._checkpoints.save(tensors, header)
 
@@ -189,17 +190,16 @@ class RunDirectory:
         if names != set(tensors):
             what = "finish the run with the version that began it, or delete the file to begin anew"
             raise SkillweaveError(f"{path} does not hold what this Skillweave resumes from: {what}")
-        if kind is None:
-            return None, header, extra
-        state = kind(**tensors) if like is None else state_from(tensors, like, str(path))
-        return state, header, extra
+        if like is not None:
+            return state_from(tensors, like, str(path)), header, extra
+        return None if kind is None else kind(**tensors), header, extra
 
     def save_policy(self, stage: str, policy: AgentPolicy) -> None:
         """Write the policy of a finished stage; ``save`` then binds it to the run."""
         self._check()
         tensors, header = policy.to_file()
         path = self.policy_path(stage)
-        self._make(path.parent)
+        make_directory(path.parent)
         sha256 = write_tensors(path, tensors, header | self._place(stage), make_directories=False)
         self.stage(stage)["sha256"] = sha256
 
@@ -244,7 +244,7 @@ class RunDirectory:
             path = self._copy_path(skill, policy)
             if not path.exists():  # a run that goes on has it
                 self._check()
-                self._make(path.parent)
+                make_directory(path.parent)
                 write_bytes(path, content, make_directories=False)
 
     def ready_policy(self, skill: str, policy: Policy) -> Policy:
@@ -262,13 +262,6 @@ class RunDirectory:
 
         return as_recorded(policy, entry.get("policy"), read, f"{self.path}: skill {skill!r}")
 
-    def _make(self, directory: Path) -> None:
-        """Make a directory in the run, not the run itself."""
-        try:
-            directory.mkdir(exist_ok=True)
-        except OSError as error:
-            raise SkillweaveError(f"could not make {directory}: {error.strerror}") from error
-
     def _copy_path(self, skill: str, policy: Foreign) -> Path:
         return self.path / "policies" / f"{skill}{policy.suffix}"
 
@@ -281,9 +274,14 @@ class RunDirectory:
         self._check()
         self._metrics.append([record])
 
-    def rewind_metrics(self, size: int | None) -> None:
-        """Drop what was written after ``size`` bytes: training is about to write it again."""
-        self._metrics.rewind(size)
+    def line_bytes(self) -> dict[str, int]:
+        """How long ``metrics.jsonl`` and ``lineage.jsonl`` are, for ``rewind``."""
+        return {"metrics_bytes": self._metrics.size, "lineage_bytes": self.lineage.size}
+
+    def rewind(self, at: Mapping[str, Any]) -> None:
+        """Drop the lines after those that ``line_bytes`` told: training writes them again."""
+        self._metrics.rewind(at.get("metrics_bytes"))
+        self.lineage.rewind(at.get("lineage_bytes"))
 
     def metrics(self) -> Iterator[dict[str, Any]]:
         """The lines of ``metrics.jsonl``; a half-written last line is left out."""
@@ -296,11 +294,3 @@ class RunDirectory:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-
-    def metrics_size(self) -> int:
-        """Bytes in ``metrics.jsonl``."""
-        return self._metrics.size
-
-
-def _now() -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%S%z")

@@ -68,6 +68,18 @@ def move(source: Path, target: Path) -> None:
         raise _unwritten(target, error) from error
 
 
+def make_directory(path: Path) -> None:
+    """Make a directory in one that is there.
+
+    Raises:
+        SkillweaveError: it cannot be made.
+    """
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise SkillweaveError(f"could not make {path}: {error.strerror}") from error
+
+
 def remove(path: Path) -> None:
     """Delete a file, if it is there.
 

@@ -204,6 +204,10 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise SkillweaveError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
+    if manifest["kind"] == "agent" and len(manifest["stages"]) != 1:
+        raise SkillweaveError(
+            f"{file}: stages has {len(manifest['stages'])} entries, but a plain agent has one"
+        )
     for i, stage in enumerate(manifest["stages"]):
         where = f"stages[{i}]"
         config_from_json(stage["algorithm"], file, f"{where}.algorithm")

@@ -27,10 +27,24 @@ class Target:
     at_least: float
     """The value that is good enough."""
 
-    def reached(self, metrics: Mapping[str, float]) -> float | None:
-        """The value in an evaluation's metrics, where it is good enough."""
-        value = metrics.get(f"eval_{self.of}")
-        return value if value is not None and value >= self.at_least else None
+    def reached(self, evaluation: Mapping[str, float], stage: str) -> float | None:
+        """The value that an evaluation found, where it is good enough.
+
+        Args:
+            evaluation: its metrics; empty where there was none.
+            stage: its name, for messages.
+
+        Raises:
+            SkillweaveError: it cannot tell, as nobody says which episodes succeed.
+        """
+        if not evaluation:
+            return None
+        if (value := evaluation.get(f"eval_{self.of}")) is None:
+            raise SkillweaveError(
+                f"stage {stage!r} has target_success, but its environment does not say which "
+                "episodes succeed: info['success'] must be there in an episode's last step"
+            )
+        return value if value >= self.at_least else None
 
 
 def target_of(target_return: Any, target_success: Any, where: str) -> Target | None:

@@ -47,11 +47,8 @@ class StageLog:
         self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: Mapping[str, Any]
     ) -> None:
         self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), dict(at)
-        run.rewind_metrics(self.at.get("metrics_bytes", self.entry.get("metrics_bytes")))
-        run.lineage.rewind(self.at.get("lineage_bytes", self.entry.get("lineage_bytes")))
-        self.entry.setdefault("metrics_bytes", run.metrics_size())
-        self.entry.setdefault("lineage_bytes", run.lineage.size)
-        self.entry["status"] = "training"
+        run.rewind(self.entry | self.at)
+        self.entry.update(run.line_bytes() | self.entry, status="training")
         run.save()
         for listener in listeners:
             listener.stage(name, int(self.entry["budget"]))

@@ -144,7 +144,7 @@ class OneAgent:
             found = self.evaluation.due(tick.steps, policy)
             log.at["evaluation_steps"] += self.evaluation.spent()
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
-            if target is not None and target.reached(found) is not None:
+            if target is not None and target.reached(found, self.stage.name) is not None:
                 # No checkpoint: who resumes from the one before comes here again.
                 raise _TargetReached
             if tick.cut:

@@ -17,6 +17,7 @@ from skillweave import (
     PPO,
     SAC,
     TD3,
+    Agent,
     EnvSpec,
     Evolution,
     Heir,
@@ -157,8 +158,7 @@ def test_a_killed_population_ends_with_the_very_same_weights(name, tmp_path, mon
         with pytest.raises(KeyboardInterrupt):
             train(name, path, seed=3)
         monkeypatch.undo()
-        hierarchy = whole.hierarchy
-        again = hierarchy.resume(path, quiet=True)
+        again = whole.declaration.resume(path, quiet=True)
         assert (path / "lineage.jsonl").read_text() == (whole.path / "lineage.jsonl").read_text()
         for key, value in whole.policy.weights.items():
             assert torch.equal(value, again.policy.weights[key]), key
@@ -279,16 +279,12 @@ def test_a_selection_of_ones_own_is_asked_for_again_when_a_run_goes_on(tmp_path,
     with pytest.raises(KeyboardInterrupt):
         train("ppo", tmp_path / "run", by)
     monkeypatch.undo()
-    hierarchy = Hierarchy(spec("ppo"), [Task()], algorithm=CONFIGS["ppo"], flat_steps=256)
+    agent = Agent(spec("ppo"), CONFIGS["ppo"], 256)
     with pytest.raises(SkillweaveError, match="Copycat"):
-        hierarchy.resume(tmp_path / "run", quiet=True)
-    run = hierarchy.resume(tmp_path / "run", quiet=True, evolve=by)
+        agent.resume(tmp_path / "run", quiet=True)
+    run = agent.resume(tmp_path / "run", quiet=True, evolve=by)
     assert [x["mutation"] for x in lineage(run.path)] == ["start"] * 3 + ["goes on"] * 6
     assert len({x["member"] for x in lineage(run.path)[3:6]}) == 3
-
-
-class Task(Skill):
-    """What ``train_agent`` declares."""
 
 
 class Left(Skill):

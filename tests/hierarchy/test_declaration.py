@@ -11,7 +11,6 @@ from gymnasium.spaces import Box, Dict, Discrete, Text
 from skillweave import DQN, PPO, SAC, EnvSpec, Hierarchy, Reflex, Skill, SkillweaveError, recipes
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Run
-from skillweave.hierarchy.declaration import check_budgets
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.settings import apply_settings, list_settings
 from skillweave.hierarchy.weights import read_weights, write_weights
@@ -19,6 +18,7 @@ from skillweave.networks.config import CNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.training.stage import check_stages
 
 torch.set_num_threads(1)
 OBS, ACTION = gym.make("CartPole-v1").observation_space, Discrete(2)
@@ -221,6 +221,8 @@ SETTINGS = {
     "selector.learning_rate_schedule=constant": (
         lambda d: d.selector.learning_rate_schedule == "constant"
     ),
+    "selector_target_return=200": lambda d: d.selector_target_return == 200.0,
+    "skills.center.target_return=1e1": lambda d: d.skill("center").target_return == 10.0,
     "flat.learning_rate=1e-4": (
         lambda d: d.flat and d.flat.learning_rate == 1e-4 and d.algorithm.learning_rate == 1e-3
     ),
@@ -401,7 +403,7 @@ def test_the_file_says_how_long_calls_last_and_whether_skills_are_greedy(
     tmp_path, call_steps, greedy
 ):
     d = declare(call_steps=call_steps, greedy_skills=greedy)
-    write_weights(tmp_path / "w", d, trained(d), None)
+    write_weights(tmp_path / "w", d, trained(d))
     skills = read_weights(declare(), tmp_path / "w").skills
     assert (skills.call_steps, skills.greedy) == (call_steps, greedy)
 
@@ -417,7 +419,7 @@ def test_the_file_says_how_long_calls_last_and_whether_skills_are_greedy(
 def test_weights_of_another_hierarchy_say_whose_they_are(tmp_path, make, says):
     d = declare()
     path = tmp_path / "weights.safetensors"
-    write_weights(path, d, trained(d), None)
+    write_weights(path, d, trained(d))
     other = make()
     before = other.call_steps
     with pytest.raises(SkillweaveError, match=says) as raised:
@@ -431,7 +433,7 @@ def test_weights_without_a_skill_that_is_to_be_trained_say_which(tmp_path):
         pass
 
     d = declare(Center(), Lean())
-    write_weights(tmp_path / "w", d, trained(d), None)
+    write_weights(tmp_path / "w", d, trained(d))
     with pytest.raises(SkillweaveError, match="no weights of 'center'"):
         read_weights(declare(), tmp_path / "w")
 
@@ -439,7 +441,7 @@ def test_weights_without_a_skill_that_is_to_be_trained_say_which(tmp_path):
 @pytest.mark.parametrize("change", ["missing", "shape", "kind"])
 def test_a_file_that_does_not_hold_what_it_says_is_named(tmp_path, change):
     d, path = declare(), tmp_path / "weights.safetensors"
-    write_weights(path, d, trained(d), None)
+    write_weights(path, d, trained(d))
     tensors, header = read_tensors(path)
     name = next(k for k in tensors if k.startswith("lean/actor"))
     if change == "missing":
@@ -473,7 +475,7 @@ def test_a_whole_hierarchy_is_a_skill_of_another(tmp_path):
     assert (outer.budget(skill), outer.is_data) == (0, False)
     policy = trained(outer)
     assert policy.labels == ("stand", "center")
-    write_weights(tmp_path / "w", outer, policy, None)
+    write_weights(tmp_path / "w", outer, policy)
     again = read_weights(declare(skill, Center()), tmp_path / "w")
     assert acts(again) == acts(policy)
 
@@ -518,11 +520,11 @@ def test_a_budget_that_ends_before_learning_begins_is_refused(tmp_path, flat):
 
 def test_each_members_budget_counts_not_the_populations(tmp_path):
     stage = {"name": "x", "budget": 4_000, "algorithm": {"learning_starts": 1_000}}
-    check_budgets([stage])
+    check_stages([stage], None)
     says = "'x'.*1,000 steps for each member, but it begins to learn only after 1,000"
     with pytest.raises(SkillweaveError, match=says):
-        check_budgets([stage | {"evolution": {"population": 4}}])
-    check_budgets([{"name": "x", "budget": 1, "algorithm": {}}])
+        check_stages([stage | {"evolution": {"population": 4}}], None)
+    check_stages([{"name": "x", "budget": 1, "algorithm": {}}], None)
 
 
 class Plain(Skill):

@@ -135,7 +135,7 @@ def test_a_model_of_sb3_in_memory_is_kept_by_its_weights(tmp_path):
 
 
 def test_a_run_that_is_resumed_goes_on_with_what_it_has_kept(tmp_path, monkeypatch):
-    import skillweave.evolution.stage as training
+    import skillweave.training.trainer as training
 
     whole = declare(skill("a", linear())).train(tmp_path / "whole", quiet=True)
     with monkeypatch.context() as patch:

@@ -28,9 +28,11 @@ from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
-STAGES = [
-    {"name": "landing", "status": "training", "budget": 10, "algorithm": ALGORITHM},
-    {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM},
+STAGES: list[dict[str, Any]] = [
+    {"name": "landing", "status": "training", "budget": 10, "algorithm": ALGORITHM}
+    | {"kind": "skill", "learns": ["landing"], "decides": None},
+    {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM}
+    | {"kind": "selector", "learns": ["selector"], "decides": "selector"},
 ]
 AT = {"seconds": 1.0, "evaluation_steps": 0, "metrics": {}}
 
@@ -326,8 +328,8 @@ def test_metrics_come_back_in_order(run: RunDirectory) -> None:
 
 def test_a_run_without_metrics_has_none(run: RunDirectory) -> None:
     assert list(run.metrics()) == []
-    assert run.metrics_size() == 0
-    run.rewind_metrics(0)
+    assert run.line_bytes()["metrics_bytes"] == 0
+    run.rewind({"metrics_bytes": 0})
     assert not (run.path / "metrics.jsonl").exists()
 
 
@@ -339,7 +341,7 @@ def test_rewinding_drops_what_came_after_the_checkpoint(run: RunDirectory) -> No
         run.log({"update": i})
     found = run.load_checkpoint(Learnt, "landing")
     assert found is not None
-    run.rewind_metrics(found[1]["metrics_bytes"])
+    run.rewind({"metrics_bytes": found[1]["metrics_bytes"]})
     assert [r["update"] for r in run.metrics()] == [0, 1, 2]
     run.log({"update": 3})
     assert [r["update"] for r in run.metrics()] == [0, 1, 2, 3]
@@ -347,7 +349,7 @@ def test_rewinding_drops_what_came_after_the_checkpoint(run: RunDirectory) -> No
 
 def test_rewinding_to_beyond_the_end_changes_nothing(run: RunDirectory) -> None:
     run.log({"update": 0})
-    run.rewind_metrics(10_000)
+    run.rewind({"metrics_bytes": 10_000})
     assert [r["update"] for r in run.metrics()] == [0]
 
 
@@ -396,6 +398,13 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
             "stages[0].status is 5; it must be one of wait",
         ),
         (lambda m: m["stages"][0].pop("status"), "damaged: stages[0] has no field 'status'"),
+        (lambda m: m["stages"][0].update(learns=[]), "stages[0].learns is []; it must be at least"),
+        (lambda m: m["stages"][0].update(kind="x"), "stages[0].kind is 'x'; it must be one of ag"),
+        (
+            lambda m: m["stages"][0].update(target={"of": "return", "at_least": None}),
+            "stages[0].target.at_least is None; it must be a finite number",
+        ),
+        (lambda m: m.update(kind="agent"), "stages has 2 entries, but a plain agent has one"),
         (lambda m: m["stages"][0].update(status="done"), "stages[0] is done, but has no field 's"),
         (lambda m: m["stages"][1].update(name="landing"), "stages[1].name is 'landing', a second"),
         (

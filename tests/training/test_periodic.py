@@ -1,4 +1,4 @@
-"""A look at an agent while it trains."""
+"""Evaluating an agent while it trains."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from skillweave.training.probe import Probe, episode_returns
 
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.training.periodic import PeriodicEvaluation, first_episodes
 from tests.toys import Calls, Clockwork, Countdown, Identity
 
 
@@ -34,7 +34,7 @@ def played_by_hand(env: Any, seeds: Seeds) -> list[float]:
 def test_only_first_episodes_count_though_they_differ_in_length():
     env = Clockwork(range(6))
     policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    got = episode_returns(policy, env, Seeds(0))
+    got, _ = first_episodes(policy, env, Seeds(0))
     assert got.tolist() == played_by_hand(Clockwork(range(6)), Seeds(0))
     assert len(set(got.tolist())) > 1
 
@@ -48,7 +48,7 @@ def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit():
             return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated, steps
 
     policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    assert episode_returns(policy, Forever(2), Seeds(0), max_steps=8).tolist() == [5.0, 8.0]
+    assert first_episodes(policy, Forever(2), Seeds(0), max_steps=8)[0].tolist() == [5.0, 8.0]
 
 
 def test_the_limit_counts_environment_steps_not_decisions():
@@ -56,26 +56,24 @@ def test_the_limit_counts_environment_steps_not_decisions():
         """Takes the call of 10 steps, which pays 3."""
 
     policy = Choice(lambda obs: np.ones(len(obs), np.int64))
-    assert episode_returns(policy, Calls(1), Seeds(0), max_steps=25).tolist() == [9.0]
+    assert first_episodes(policy, Calls(1), Seeds(0), max_steps=25)[0].tolist() == [9.0]
 
 
 def test_equal_seeds_give_equal_starts_and_others_other_ones():
     env, wrong = Identity(50), ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    first, again, other = (episode_returns(wrong, env, Seeds(s)) for s in (1, 1, 2))
+    first, again, other = (first_episodes(wrong, env, Seeds(s))[0] for s in (1, 1, 2))
     assert first.tolist() == again.tolist() != other.tolist()
 
 
-def test_a_probe_looks_once_in_every_so_many_steps_also_after_a_resume():
+def test_an_evaluation_is_made_once_in_every_so_many_steps_also_after_a_resume():
     policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    probe = Probe(lambda n, gamma: Countdown(n), 0.9, Seeds(0), 100, 3)
-    probe.start(250)
-    looks = [
-        steps for steps in (260, 299, 300, 350, 520, 599, 601) if probe.look(steps, lambda: policy)
-    ]
-    assert looks == [300, 520, 601]
-    assert probe.look(700, lambda: policy) == {"eval_return": 5.0, "eval_return_min": 5.0}
-    silent = Probe(lambda n, gamma: Countdown(n), 0.9, Seeds(0), None, 3)
-    assert silent.look(10**6, lambda: policy) == {}
+    evaluation = PeriodicEvaluation(lambda n, gamma: Countdown(n), 0.9, Seeds(0), 100, 3)
+    evaluation.start(250)
+    ticks = (260, 299, 300, 350, 520, 599, 601)
+    assert [t for t in ticks if evaluation.due(t, lambda: policy)] == [300, 520, 601]
+    assert evaluation.due(700, lambda: policy) == {"eval_return": 5.0, "eval_return_min": 5.0}
+    never = PeriodicEvaluation(lambda n, gamma: Countdown(n), 0.9, Seeds(0), None, 3)
+    assert never.due(10**6, lambda: policy) == {}
 
 
 class Balance(Skill):
@@ -90,7 +88,7 @@ SMALL = Network((8,), "relu")
     [PPO(num_envs=4, n_steps=16, batch_size=32, network=SMALL),
      DQN(num_envs=4, learning_starts=100, batch_size=8, network=SMALL)],
 )  # fmt: skip
-def test_a_run_logs_what_it_saw_at_every_level_and_looking_changes_nothing(tmp_path, algorithm):
+def test_a_run_is_evaluated_at_every_level_and_that_changes_nothing(tmp_path, algorithm):
     weights = []
     for every in (1000, None):
         hierarchy = Hierarchy(

@@ -1,0 +1,286 @@
+"""A stage that ends early at a target."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from skillweave import (
+    DQN,
+    PPO,
+    Agent,
+    Array,
+    EnvSpec,
+    Evolution,
+    Hierarchy,
+    Network,
+    Skill,
+    SkillweaveError,
+    Step,
+    train_agent,
+)
+from skillweave.envs import engine as engines
+from skillweave.hierarchy import training
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_tensors
+from skillweave.training import trainer
+from skillweave.training.periodic import PeriodicEvaluation
+
+NET = Network((8,))
+SMALL = PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=1, network=NET)
+REPLAY = DQN(num_envs=2, learning_starts=20, batch_size=8, update_ratio=0.1, network=NET)
+
+
+class Walk(gym.Env[Any, Any]):
+    """Episodes of 10 steps, each paying 1; ``info["success"]`` at the end of every other one."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.t, self.lucky = 0, bool(self.np_random.random() < 0.5)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        info = {"success": self.t == 10 and self.lucky}
+        return np.array([self.t / 10], np.float32), 1.0, self.t == 10, False, info
+
+
+class Start(Skill):
+    """Succeeds where it stops after three steps."""
+
+    max_steps = 3
+
+    def success(self, step: Step) -> Array:
+        return step.timed_out
+
+
+WALK = EnvSpec(Walk, engine="sync")
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts the steps that Gymnasium's engines make."""
+    count, plain = [0], engines.GymnasiumEngine.step
+
+    def step(self: Any, action: Any, ids: Any = None) -> Any:
+        count[0] += len(action)
+        return plain(self, action, ids)
+
+    monkeypatch.setattr(engines.GymnasiumEngine, "step", step)
+    return count
+
+
+@pytest.mark.parametrize("algorithm", [SMALL, REPLAY])
+def test_training_ends_at_the_first_evaluation_that_is_good_enough(
+    tmp_path: Path, algorithm: Any, made: list[int]
+) -> None:
+    run = train_agent(
+        WALK, algorithm, 2_000, tmp_path / "run", target_return=10.0, eval_every=200,
+        eval_episodes=3, quiet=True,
+    )  # fmt: skip
+    (entry,) = run.info()["stages"]
+    assert entry["target"] == {"of": "return", "at_least": 10.0}
+    assert entry["reached"] == {"steps": entry["steps"], "value": 10.0}
+    assert entry["status"] == "done"
+    lines = list(RunDirectory.open(run.path).metrics())
+    assert [line["eval_return"] for line in lines if "eval_return" in line] == [10.0]
+    assert 200 <= lines[-1]["steps"] <= entry["steps"] <= lines[-1]["steps"] + 16
+    # Every step is counted, that of a rollout from which nothing was learnt included.
+    assert entry["steps"] + entry["evaluation_steps"] == made[0]
+    assert run.evaluate(2).mean == 10.0
+
+
+def test_a_target_that_is_not_reached_changes_nothing(tmp_path: Path) -> None:
+    weights = []
+    for target in (None, 11.0):
+        run = train_agent(
+            WALK, SMALL, 400, tmp_path / str(target), target_return=target, eval_every=100,
+            eval_episodes=2, quiet=True,
+        )  # fmt: skip
+        (entry,) = run.info()["stages"]
+        assert "reached" not in entry
+        assert entry["steps"] == 400
+        weights.append(read_tensors(run.path / "policies" / "agent.safetensors")[0])
+    assert all(torch.equal(v, weights[1][k]) for k, v in weights[0].items())
+
+
+@pytest.mark.parametrize("algorithm", [SMALL, REPLAY])
+@pytest.mark.parametrize("where", ["an evaluation before", "the target", "its policy"])
+def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: Any, where: str
+) -> None:
+    # Evaluations every 100 steps tell 1, 2, 3, …; each falls together with a clean cut.
+    def due(self: Any, steps: int, policy: Any) -> dict[str, float]:
+        before, self._last = self._last, steps
+        return {"eval_return": float(steps // 100)} if steps // 100 > before // 100 else {}
+
+    monkeypatch.setattr(PeriodicEvaluation, "due", due)
+    agent = Agent(WALK, algorithm, 2_000, target_return=4.0, eval_every=100, cut_every=100)
+    whole = agent.train(tmp_path / "whole", quiet=True)
+    reached = whole.info()["stages"][0]["reached"]
+    assert reached["value"] == 4.0
+
+    with monkeypatch.context() as patch:
+        if where == "its policy":
+            patch.setattr(RunDirectory, "save_policy", lambda *_: 1 / 0)
+        else:
+            at, reached_at = [0], trainer.Target.reached
+
+            def dies(self: Any, metrics: Any, stage: str) -> Any:
+                at[0] = max(at[0], int(metrics.get("eval_return", 0)))
+                if at[0] == (2 if where == "an evaluation before" else 4):
+                    raise ZeroDivisionError
+                return reached_at(self, metrics, stage)
+
+            patch.setattr(trainer.Target, "reached", dies)
+        with pytest.raises(ZeroDivisionError):
+            agent.train(tmp_path / "run", quiet=True)
+    assert not RunDirectory.open(tmp_path / "run").finished
+    again = agent.resume(tmp_path / "run", quiet=True)
+    ours, theirs = again.info()["stages"][0], whole.info()["stages"][0]
+    assert (ours["reached"], ours["steps"]) == (theirs["reached"], theirs["steps"])
+    for key, value in whole.policy.weights.items():  # type: ignore[attr-defined]
+        assert torch.equal(value, again.policy.weights[key]), key  # type: ignore[attr-defined]
+    records = (list(RunDirectory.open(r.path).metrics()) for r in (whole, again))
+    for a, b in zip(*records, strict=True):
+        assert {**a, "seconds": 0} == {**b, "seconds": 0}
+
+
+def test_skills_and_selector_have_targets_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kinds = {"max_steps": 3, "target_return": 3.0}
+    quick = type("Quick", (Skill,), kinds)()
+    sure = type("Sure", (Start,), {"target_success": 1.0})()
+    plain = type("Plain", (Skill,), {"max_steps": 3})()
+    h = Hierarchy(
+        WALK, [quick, sure, plain], call_steps=3, algorithm=SMALL, selector=SMALL,
+        skill_steps=320, selector_steps=320, selector_target_return=10.0, eval_every=50,
+        eval_episodes=2,
+    )  # fmt: skip
+    run = h.train(tmp_path / "run")
+    found = {s["name"]: s for s in run.info()["stages"]}
+    assert {k: v["reached"]["value"] for k, v in found.items() if "reached" in v} == {
+        "quick": 3.0, "sure": 1.0, "selector": 10.0,
+    }  # fmt: skip
+    assert found["plain"]["steps"] == 320
+    assert all(found[k]["steps"] < 200 for k in ("quick", "sure", "selector"))
+    said = capsys.readouterr().err
+    assert "sure: target reached after" in said
+    assert "success 1, at least 1 was asked" in said
+
+
+def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path: Path) -> None:
+    agent = Agent(WALK, SMALL, 640, target_success=0.99, eval_every=100, eval_episodes=20)
+    run = agent.train(tmp_path / "run", quiet=True)
+    (entry,) = run.info()["stages"]
+    assert "reached" not in entry, "about half of the episodes succeed"
+    told = [m["eval_success"] for m in RunDirectory.open(run.path).metrics() if "eval_return" in m]
+    assert told
+    assert all(0.1 < x < 0.9 for x in told)
+
+
+def test_a_success_that_nobody_tells_is_an_error(tmp_path: Path) -> None:
+    agent = Agent("CartPole-v1", SMALL, 200, target_success=0.5, eval_every=50, eval_episodes=1)
+    with pytest.raises(SkillweaveError, match=r"agent.*target_success.*info\['success'\]"):
+        agent.train(tmp_path / "run", quiet=True)
+
+
+def test_a_population_ends_at_its_stages_target(tmp_path: Path) -> None:
+    how: Any = {"evolve": Evolution(2, 5, 1), "quiet": True}
+    run = train_agent(WALK, SMALL, 500, tmp_path / "run", target_return=10.0, **how)
+    (entry,) = run.info()["stages"]
+    assert entry["winner"]["generations"] == 1
+    assert entry["reached"]["value"] == 10.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"target_return": 1.0}, "stage 'agent'.*set eval_every"),
+        ({"target_return": "x", "eval_every": 9}, "agent: target_return is 'x'; it must be a"),
+        ({"target_return": float("nan"), "eval_every": 9}, "target_return is nan"),
+        ({"target_success": 2, "eval_every": 9}, "target_success is 2; it is a share"),
+        (
+            {"target_success": 0.5, "target_return": 1.0, "eval_every": 9},
+            "target_return or target_success, not both",
+        ),
+        (
+            {"target_success": 0.5, "eval_every": 9, "evolve": Evolution(2, 2, 1)},
+            "it evolves.*must be target_return",
+        ),
+    ],
+)
+def test_a_target_that_cannot_be_is_refused_before_anything_is_written(
+    tmp_path: Path, settings: Any, says: str
+) -> None:
+    with pytest.raises(SkillweaveError, match=says):
+        train_agent(WALK, SMALL, 100, tmp_path / "run", quiet=True, **settings)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_skill_without_success_has_no_target_success() -> None:
+    blind = type("Blind", (Skill,), {"target_success": 0.5})()
+    with pytest.raises(SkillweaveError, match=r"skill 'blind'.*define success\(\)"):
+        Hierarchy(WALK, [blind])
+    odd = type("Odd", (Skill,), {"target_return": "much"})()
+    with pytest.raises(SkillweaveError, match="skill 'odd': target_return is 'much'"):
+        Hierarchy(WALK, [odd])
+
+
+# The stage itself
+
+
+def test_an_algorithm_without_a_loop_is_an_error() -> None:
+    with pytest.raises(SkillweaveError, match="no training loop is known for"):
+        trainer.run_loop(object(), None, None, None, 10, {})  # type: ignore[arg-type]
+
+
+def test_a_stage_says_who_learns_and_who_decides(tmp_path: Path) -> None:
+    h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL)
+    entries = training.manifest(h, seed=0, flat=False)["stages"]
+    keys = ("name", "kind", "learns", "decides")
+    assert [tuple(e[k] for k in keys) for e in entries] == [
+        ("start", "skill", ["start"], None),
+        ("selector", "selector", ["selector"], "selector"),
+    ]
+    told = training.manifest(h, seed=0, flat=True)
+    assert told["kind"] == "agent"
+    assert "skills" not in told
+    assert [tuple(e[k] for k in keys) for e in told["stages"]] == [
+        ("agent", "agent", ["agent"], None)
+    ]
+
+
+def test_an_agent_is_loaded_without_a_hierarchy(tmp_path: Path) -> None:
+    agent = Agent("CartPole-v1", SMALL, 64)
+    run = agent.train(tmp_path / "run", seed=2, quiet=True)
+    again = agent.load(run.path)
+    assert isinstance(again.declaration, Agent)
+    assert again.evaluate(3).returns == run.evaluate(3).returns
+    saved = Agent.from_weights(run.save_weights(tmp_path / "a.safetensors"))
+    assert saved.evaluate(3).returns == run.evaluate(3).returns
+    for what in (lambda: run.hierarchy, lambda: run.evaluate(1, skill="x")):
+        with pytest.raises(SkillweaveError, match="plain agent"):
+            what()
+    flat = Hierarchy("CartPole-v1", [Start()], algorithm=SMALL).load(run.path)
+    assert isinstance(flat.declaration, Agent)
+    json.dumps(run.info())
+
+
+def test_a_hierarchys_run_is_no_agents(tmp_path: Path) -> None:
+    h = Hierarchy(
+        WALK, [Start()], algorithm=SMALL, selector=SMALL, skill_steps=16, selector_steps=16
+    )
+    h.train(tmp_path / "run", quiet=True)
+    with pytest.raises(SkillweaveError, match="the run of a hierarchy, not of a plain agent"):
+        Agent(WALK, SMALL, 64).load(tmp_path / "run")
