@@ -18,8 +18,8 @@ from toys import Echo
 
 from skillweave import DQN, SAC, TD3, Hierarchy, Network, recipes
 from skillweave.cli import main
+from skillweave.cli.overrides import apply_overrides
 from skillweave.hierarchy import training
-from skillweave.hierarchy.settings import apply_settings
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.phase import Phase, train_phase
@@ -253,7 +253,7 @@ def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stoppe
     def hierarchy() -> Hierarchy:
         found = recipes.load("lunar-lander")
         budgets = ["skills.stabilize.steps=1", "skills.center.steps=1", "selector_steps=1"]
-        apply_settings(found, [*budgets, "skills.landing.steps=24000", "cut_every=1"])
+        apply_overrides(found, [*budgets, "skills.landing.steps=24000", "cut_every=1"])
         return found
 
     hierarchy().train(tmp_path / "whole", seed=0, quiet=True)
@@ -326,7 +326,7 @@ def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
 
     def changed() -> Hierarchy:
         hierarchy = recipes.load(recipe)
-        apply_settings(hierarchy, [setting])
+        apply_overrides(hierarchy, [setting])
         return hierarchy
 
     changed().train(tmp_path / "whole", seed=3, quiet=True)

@@ -18,13 +18,13 @@ from torch import Tensor
 from skillweave.algorithms.base import Family
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
-from skillweave.networks import growth
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
-from skillweave.networks.growth import Units
 from skillweave.networks.stacked import Views
+from skillweave.networks.units import Units
 from skillweave.types import SkillweaveError
 
 Alter = Callable[[Views, bool], dict[str, Tensor]]

@@ -15,7 +15,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.calls import SkillSet
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
-from skillweave.skills.foreign import fitted
+from skillweave.skills.foreign_policy import fitted
 from skillweave.spaces import action_codec, obs_codec, obs_dtype, obs_shape
 from skillweave.types import Policy, SkillweaveError
 

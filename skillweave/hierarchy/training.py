@@ -15,7 +15,7 @@ from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill, ready_policy
-from skillweave.skills.foreign import source_of
+from skillweave.skills.foreign_policy import source_of
 from skillweave.training.phase import Listener, Phase, Trainer, train_phase
 from skillweave.training.probe import MakeEnv
 from skillweave.types import Policy, VecEnv

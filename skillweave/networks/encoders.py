@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from skillweave.networks.config import CNN, Activation
-from skillweave.networks.growth import Part, Units
 from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
+from skillweave.networks.units import Part, Units
 from skillweave.spaces import ObsCodec
 from skillweave.types import SkillweaveError
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
-from skillweave.networks.growth import Joint, Units, units_of
 from skillweave.networks.recurrent import (
     cell,
     memory_size,
@@ -20,6 +19,7 @@ from skillweave.networks.recurrent import (
     sequence,
 )
 from skillweave.networks.stacked import Views, mlp, mlp_init_, mlp_shapes, orthogonal_
+from skillweave.networks.units import Joint, Units, units_of
 from skillweave.spaces import ObsCodec
 
 

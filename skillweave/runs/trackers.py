@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -95,37 +94,8 @@ def make_trackers(
     return tuple(TensorBoard(run) if name == "tensorboard" else WandB(run) for name in names)
 
 
-def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None = None) -> Any:
-    """A run of Weights & Biases in a loop of one's own; offline without a login or a key.
-
-    Raises:
-        MissingExtra: wandb is not installed.
-    """
-    try:
-        import wandb
-    except ImportError as error:
-        raise MissingExtra("tracking with wandb", "wandb") from error
-    stay_offline()
-    if key is not None:
-        wandb.login(key=key)
-    mode: Any = None if key is None else "online"
-    return wandb.init(project=project, name=name, config=config, mode=mode)
-
-
-def stay_offline() -> None:
-    """Without a login let wandb stay offline instead of asking for one; said where it is used."""
-    if "WANDB_MODE" not in os.environ and wandb_mode() == "offline":
-        os.environ["WANDB_MODE"] = "offline"
-        _to_say.append("no login to Weights & Biases, so its runs stay offline")
-    if "wandb" in sys.modules and _to_say:
-        print(f"skillweave: {_to_say.pop()}", file=sys.stderr)
-
-
-_to_say: list[str] = []
-
-
 def wandb_mode() -> Any:
-    """What WANDB_MODE says; without it online where there is a login, else offline."""
+    """The value of WANDB_MODE if it is set; else online if there is a login, else offline."""
     login = bool(os.environ.get("WANDB_API_KEY")) or _has_netrc()
     return os.environ.get("WANDB_MODE") or ("online" if login else "offline")
 

@@ -18,7 +18,7 @@ PLAIN = tuple(f.name for f in fields(Declaration) if f.type in ("int", "int | No
 CONFIGS = ("algorithm", "selector", "flat")
 
 
-def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
+def apply_overrides(declaration: Declaration, settings: Sequence[str]) -> None:
     """Change a declaration in place by ``name=value`` strings; their order does not matter.
 
     The name of an agent alone takes an algorithm: ``selector=DQN``, ``skills.center=SAC``.

@@ -12,7 +12,7 @@ from skills.foreign_models import WEIGHT, linear, onnx_file, poisoned, sb3_zip
 
 from skillweave import from_function, from_onnx, from_sb3, from_torch
 from skillweave.skills import Skill, ready_policy
-from skillweave.skills.foreign import Foreign, as_recorded, fitted, source_of
+from skillweave.skills.foreign_policy import Foreign, as_recorded, fitted, source_of
 from skillweave.types import MissingExtra, SkillweaveError
 
 OBS, ACTION = gym.make("CartPole-v1").observation_space, Discrete(2)

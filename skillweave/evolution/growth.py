@@ -1,67 +1,24 @@
-"""Networks that grow and shrink: units and layers added to, or taken from, named parameters.
+"""Networks that grow and shrink: units and layers are added to named parameters, or removed.
 
 Growth leaves the function as it was (Net2Net, Chen et al. 2016, in the form of zero outgoing
 weights): new units are read with weight zero, a new layer computes the identity.
 
-Letters in shapes: R rows, one a network (a member, or a member's critic).
+Letters in shapes: R rows, one per network (of a member, or of its critic).
 """
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from skillweave.networks.config import Activation
 from skillweave.networks.stacked import Views
+from skillweave.networks.units import Joint, Units
 
 IDENTITY: tuple[Activation, ...] = ("relu", "elu", "silu", "gelu")
 """Activations through which a new layer can compute the identity; through tanh it cannot."""
 PAIRED: tuple[Activation, ...] = ("silu", "gelu")
 """For these ``f(x) − f(−x) = x``: the new layer has two units for each of the layer before."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """Where a layer's units lie in a parameter: unit u from ``start + u·block`` on of an axis."""
-
-    name: str
-    axis: int  # from the end: negative
-    start: int = 0
-    block: int = 1
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units that stand side by side: what computes them, and what reads them."""
-
-    count: int
-    own: tuple[Part, ...]
-    onward: tuple[Part, ...]
-
-
-def units_of(
-    shapes: Mapping[str, tuple[int, ...]], count: int, layer: str, readers: Sequence[str]
-) -> Units:
-    """The units of a layer of weights (in, out), read by the weights named; noise goes along."""
-    names = (f"{name}{sigma}" for name in readers for sigma in ("", "_sigma"))
-    return Units(
-        count,
-        tuple(Part(name, -1) for name in shapes if name.startswith(f"{layer}.")),
-        tuple(Part(name, -2) for name in names if name in shapes),
-    )
-
-
-@dataclass(frozen=True)
-class Joint:
-    """Where a layer can be added or taken away: behind the last hidden layer."""
-
-    prefix: str
-    depth: int
-    readers: tuple[tuple[str, str], ...]  # weight and bias of what reads it
-    kinds: tuple[str, ...]  # parameters of a layer: weight, bias, and perhaps their sigmas
 
 
 def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) -> dict[str, Tensor]:
@@ -200,9 +157,3 @@ def _moved(name: str, joint: Joint, by: int) -> str:
     if not name.startswith(head):
         return name
     return f"{joint.prefix}.{joint.depth + by}.{name[len(head) :]}"
-
-
-__all__ = [
-    "IDENTITY", "PAIRED", "Joint", "Part", "Units", "deepened", "fresh", "most_read",
-    "narrowed", "shallower", "units_of", "widened", "with_kernel",
-]  # fmt: skip
