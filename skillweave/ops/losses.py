@@ -8,14 +8,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from skillweave.shapes import Float
+
 
 def ppo_policy_loss(
-    log_prob: Tensor,
-    old_log_prob: Tensor,
-    advantage: Tensor,
-    clip_coef: Tensor,
-    weight: Tensor | None = None,
-) -> Tensor:
+    log_prob: Float[Tensor, "P B"],
+    old_log_prob: Float[Tensor, "P B"],
+    advantage: Float[Tensor, "P B"],
+    clip_coef: Float[Tensor, " P"],
+    weight: Float[Tensor, "P B"] | None = None,
+) -> Float[Tensor, " P"]:
     """Clipped surrogate, ``−E[w·min(ρA, clip(ρ, 1−ε, 1+ε)A)]`` (Schulman et al. 2017, eq. 7).
 
     ρ is the ratio to the policy from which clipping counts. Where another policy acted, w is the
@@ -37,8 +39,11 @@ def ppo_policy_loss(
 
 
 def value_loss(
-    value: Tensor, target: Tensor, old_value: Tensor | None = None, clip: Tensor | None = None
-) -> Tensor:
+    value: Float[Tensor, "P B"],
+    target: Float[Tensor, "P B"],
+    old_value: Float[Tensor, "P B"] | None = None,
+    clip: Float[Tensor, " P"] | None = None,
+) -> Float[Tensor, " P"]:
     """Half the mean squared error, optionally with PPO's value clipping.
 
     With ``clip`` (P,) the error is the larger of that of the value and that of the value
@@ -58,7 +63,11 @@ def value_loss(
     return 0.5 * error.mean(1)
 
 
-def approximate_kl(log_prob: Tensor, old_log_prob: Tensor, weight: Tensor | None = None) -> Tensor:
+def approximate_kl(
+    log_prob: Float[Tensor, "P B"],
+    old_log_prob: Float[Tensor, "P B"],
+    weight: Float[Tensor, "P B"] | None = None,
+) -> Float[Tensor, " P"]:
     """``E[w·((ρ − 1) − log ρ)]``, the low-variance estimator k3 of KL(old‖new); (P, B) to (P,).
 
     Schulman 2020, "Approximating KL divergence". ``weight`` as of ``ppo_policy_loss``: samples of
@@ -69,14 +78,21 @@ def approximate_kl(log_prob: Tensor, old_log_prob: Tensor, weight: Tensor | None
     return (kl if weight is None else weight * kl).mean(1)
 
 
-def td_loss(value: Tensor, target: Tensor, kind: str) -> Tensor:
+def td_loss(
+    value: Float[Tensor, "*#batch"], target: Float[Tensor, "*#batch"], kind: str
+) -> Float[Tensor, "*batch"]:
     """Huber (threshold 1; Mnih et al. 2015) or half squared error of each sample; any shape."""
     if kind == "huber":
         return torch.nn.functional.smooth_l1_loss(value, target, reduction="none")
     return 0.5 * (value - target).square()
 
 
-def categorical_projection(p: Tensor, atoms: Tensor, reward: Tensor, discount: Tensor) -> Tensor:
+def categorical_projection(
+    p: Float[Tensor, "P B N"],
+    atoms: Float[Tensor, " N"],
+    reward: Float[Tensor, "P B"],
+    discount: Float[Tensor, "P B"],
+) -> Float[Tensor, "P B N"]:
     """The distribution of ``r + discount·Z`` on the atoms of Z (Bellemare et al. 2017, eq. 7).
 
     Args:

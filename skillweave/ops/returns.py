@@ -5,15 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from skillweave.shapes import Bool, Float
+
 
 def gae(
-    reward: Tensor,
-    discount: Tensor,
-    value: Tensor,
-    next_value: Tensor,
-    last: Tensor,
-    gae_lambda: Tensor,
-) -> Tensor:
+    reward: Float[Tensor, "P T B"],
+    discount: Float[Tensor, "P T B"],
+    value: Float[Tensor, "P T B"],
+    next_value: Float[Tensor, "P T B"],
+    last: Bool[Tensor, "P T B"],
+    gae_lambda: Float[Tensor, " P"],
+) -> Float[Tensor, "P T B"]:
     """Generalised advantage estimates, exact for semi-MDPs and time limits.
 
     ``δ = r + discount·V(next) − V``; ``A = δ + discount·λ·(1 − last)·A⁺``
@@ -40,14 +42,16 @@ def gae(
     return advantage
 
 
-def normalise(x: Tensor, eps: float = 1e-8) -> Tensor:
+def normalise(x: Float[Tensor, "P *rest"], eps: float = 1e-8) -> Float[Tensor, "P *rest"]:
     """Zero mean and unit deviation over all axes but the first; (P, ...) to (P, ...)."""
     dims = tuple(range(1, x.ndim))
     std, mean = torch.std_mean(x, dim=dims, keepdim=True, unbiased=False)
     return (x - mean) / (std + eps)
 
 
-def explained_variance(value: Tensor, target: Tensor) -> Tensor:
+def explained_variance(
+    value: Float[Tensor, "P *rest"], target: Float[Tensor, "P *rest"]
+) -> Float[Tensor, " P"]:
     """``1 − Var(target − value) / Var(target)`` per member; (P, ...) to (P,)."""
     dims = tuple(range(1, value.ndim))
     residual = (target - value).var(dim=dims, unbiased=False)
