@@ -30,13 +30,27 @@ def check_shapes(*modules: str) -> None:
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``function``, but a call raises where an array does not fit its annotation."""
+    """``function``, but a call raises where an array does not fit its annotation.
+
+    Calls with the same shapes and types are checked once: the outcome would be the same.
+    """
     wrapped = jaxtyping.jaxtyped(function, typechecker=beartype.beartype)
+    passed: set[Any] = set()
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         if torch.compiler.is_compiling():  # torch cannot compile the checks
             return function(*args, **kwargs)
-        return wrapped(*args, **kwargs)
+        key = (*map(signature, args), *((k, signature(v)) for k, v in kwargs.items()))
+        if key in passed:
+            return function(*args, **kwargs)
+        result = wrapped(*args, **kwargs)
+        passed.add(key)
+        return result
 
     return call
+
+
+def signature(value: Any) -> Any:
+    """All that a check of ``value`` depends on."""
+    return (value.shape, value.dtype) if isinstance(value, torch.Tensor) else type(value)
