@@ -1,4 +1,4 @@
-"""What each command does."""
+"""Carries out each command of the command line."""
 
 from __future__ import annotations
 

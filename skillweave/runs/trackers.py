@@ -1,4 +1,4 @@
-"""Where metrics go besides ``metrics.jsonl``: TensorBoard and Weights & Biases."""
+"""Sends metrics to TensorBoard or Weights & Biases, besides ``metrics.jsonl``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TensorBoard:
         self._writer: Any = SummaryWriter(str(run.path / "tensorboard"))
 
     def phase(self, name: str, budget: int) -> None:
-        """Nothing to say."""
+        """TensorBoard needs nothing here."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Write every metric."""
@@ -34,7 +34,7 @@ class TensorBoard:
         self._writer.flush()
 
     def message(self, text: str) -> None:
-        """Nothing to draw."""
+        """Messages are not tracked."""
 
     def close(self) -> None:
         """Close the files."""
@@ -42,7 +42,7 @@ class TensorBoard:
 
 
 class WandB:
-    """One Weights & Biases run; offline where there is no login, never a prompt."""
+    """One Weights & Biases run; offline if there is no login. It never asks for one."""
 
     def __init__(self, run: RunDirectory) -> None:
         import wandb
@@ -57,7 +57,7 @@ class WandB:
         )
 
     def phase(self, name: str, budget: int) -> None:
-        """Metrics of this phase are drawn over its own steps."""
+        """Plot the metrics of this phase over its own steps."""
         self._run.define_metric(f"{name}/*", step_metric=f"{name}/steps")
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
@@ -65,10 +65,10 @@ class WandB:
         self._run.log({f"{name}/{k}": v for k, v in (metrics | {"steps": steps}).items()})
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Nothing more to say."""
+        """Weights & Biases needs nothing here."""
 
     def message(self, text: str) -> None:
-        """Nothing to draw."""
+        """Messages are not tracked."""
 
     def close(self) -> None:
         """Finish the run."""
@@ -78,7 +78,7 @@ class WandB:
 def make_trackers(
     names: Sequence[str], run: RunDirectory | None
 ) -> tuple[TensorBoard | WandB, ...]:
-    """The trackers of these names; with ``run`` None only check that they can be made.
+    """The trackers with these names; if ``run`` is None, only check that they can be made.
 
     Raises:
         SkillweaveError: no such tracker.
