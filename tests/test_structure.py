@@ -36,7 +36,7 @@ ROOMS: dict[str, set[str]] = {
     "envs": BASE | {"spaces", "skills"},
     "buffers": BASE | {"ops", "spaces"},
     "algorithms": BASE | {"ops", "spaces", "networks"},
-    "runs": BASE | {"spaces", "networks", "algorithms", "skills"},
+    "runs": BASE | {"algorithms", "skills"},
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
