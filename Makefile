@@ -7,6 +7,8 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SEED ?= 0
+# One process for each core; a process that has no tests left takes some of another's.
+PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
 .PHONY: demo test check torture bench figures weights smoke clean
 
@@ -28,13 +30,13 @@ smoke: .venv/demo
 	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --scale 0.02 --evaluate 5
 
 test: .venv/dev
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 torture: .venv/dev
 	$(BIN)/python -m scripts.torture --seed $(SEED)

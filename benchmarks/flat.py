@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import argparse
 
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.training.collector import Collector
+from skillweave.training.on_policy import Tick, train_on_policy
+
 from benchmarks.common import median, report, table, warm_up
 from skillweave import recipes
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.envs.make import make_engine
-from skillweave.envs.skill_env import SkillEnv
 from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
 from skillweave.training.evaluation import evaluate
-from skillweave.training.on_policy import Tick, train_on_policy
 
 
 def learn(seed: int, steps: int, every: float) -> dict[str, object]:

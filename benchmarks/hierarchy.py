@@ -22,10 +22,10 @@ from benchmarks.common import median, report, run_command, table
 def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, object]:
     """Train and score in this process."""
     from skillweave import recipes
-    from skillweave.hierarchy.settings import apply_settings
+    from skillweave.cli.overrides import apply_overrides
 
     hierarchy = recipes.load(recipe)
-    apply_settings(hierarchy, settings)
+    apply_overrides(hierarchy, settings)
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", seed=seed, flat=flat, quiet=True)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from skillweave.envs.skill_env import SkillEnv
+from skillweave.training.collector import Collector
+from skillweave.training.off_policy import train_off_policy
 
 from benchmarks.common import median, report, table
 from skillweave import DQN, SAC, TD3, EnvSpec, Network
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.make import make_engine
-from skillweave.envs.skill_env import SkillEnv
 from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
-from skillweave.training.off_policy import train_off_policy
 
 SIZES = {
     "dqn": {"small": (64, 64), "zoo": (256, 256)},

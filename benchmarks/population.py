@@ -24,12 +24,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from skillweave.envs.skill_env import SkillEnv
 
 from benchmarks.common import median, report, run_command, table, warm_up
 from benchmarks.updates import rollout, seconds
 from skillweave import PPO, EnvSpec, Evolution, Network
 from skillweave.envs.make import make_engine
-from skillweave.envs.skill_env import SkillEnv
 from skillweave.evolution.architecture import Change, rebuilt
 from skillweave.evolution.population import Population
 from skillweave.evolution.stacks import Member, join, split

@@ -14,7 +14,7 @@ from gymnasium import Space
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from skillweave.seeding import Seeds
+    pass
 
 T = TypeVar("T")
 Array: TypeAlias = NDArray[Any]
@@ -82,99 +82,6 @@ class Step:
         self.action, self.reward = read_only(self.action), read_only(self.reward)
         self.terminated, self.truncated = read_only(self.terminated), read_only(self.truncated)
         self.timed_out, self.elapsed = read_only(self.timed_out), read_only(self.elapsed)
-
-
-@dataclass(slots=True)
-class VecStep:
-    """What a vectorised environment answers to one action in each of n environments.
-
-    ``next_obs`` is the true successor, ``obs`` is what to act on next: the same, or the first
-    observation of the new episode where this one ended. ``steps`` is the number of primitive
-    steps that the action lasted (1, or τ for a call).
-    """
-
-    next_obs: Array  # (n, *obs_shape)
-    obs: Array  # (n, *obs_shape)
-    reward: Array  # (n,) float32; for a call the discounted sum
-    terminated: Array  # (n,) bool
-    truncated: Array  # (n,) bool
-    steps: Array  # (n,) int64
-    mask: Array | None  # (n, A) bool, allowed actions in ``obs``; None: all
-    info: dict[str, Any]
-    next_mask: Array | None = None
-    """(n, A) bool, allowed actions in ``next_obs``; None: as ``mask`` where the episode goes on,
-    all where it ended."""
-
-    @property
-    def ended(self) -> Array:
-        """(n,) bool: the episode ended here, by termination or truncation."""
-        ended: Array = self.terminated | self.truncated
-        return ended
-
-
-class Restorable(Protocol):
-    """What can be brought back to where it was, in another process too.
-
-    ``state`` is asked for right after ``renew``, before anything else is done.
-    """
-
-    @property
-    def steps_made(self) -> int:
-        """Steps that the environments have made together, of whatever kind."""
-        ...
-
-    def renew(self, seeds: Seeds) -> Array:
-        """Take new seeds, so that the past need not be kept.
-
-        Returns:
-            (k,) int64, environments that begin anew: their episodes were too long to be kept.
-        """
-        ...
-
-    def state(self) -> dict[str, Array]:
-        """All that ``restore`` needs."""
-        ...
-
-    def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says, open episodes included.
-
-        Returns:
-            (k,) int64, environments that begin anew: they did not repeat themselves.
-        """
-        ...
-
-    def set_gamma(self, gamma: Array) -> None:
-        """γ of one step in each environment, (N,), from now on; used where actions last longer."""
-        ...
-
-
-class VecEnv(Restorable, Protocol):
-    """A vectorised environment with one auto-reset meaning; see ``envs/``."""
-
-    num_envs: int
-    observation_space: Space[Any]
-    action_space: Space[Any]
-
-    @property
-    def obs(self) -> Array:
-        """(N, *obs_shape), what to act on next."""
-        ...
-
-    def reset(self, seeds: Seeds) -> Array:
-        """Start every environment anew from a node of the seed tree; (N, *obs_shape)."""
-        ...
-
-    def mask(self) -> Array | None:
-        """(N, A) bool, the actions allowed now, or None where all always are."""
-        ...
-
-    def step(self, action: Array) -> VecStep:
-        """Act in every environment; ended episodes start anew within the call."""
-        ...
-
-    def close(self) -> None:
-        """Release processes and memory."""
-        ...
 
 
 class Policy(Protocol):

@@ -1,6 +1,19 @@
+"""One torch thread, the same examples of hypothesis in each run, shapes checked."""
+
+import importlib.util
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # here, in each worker, and in what tests start
+
 import torch
 from hypothesis import settings
 
 torch.set_num_threads(1)
 settings.register_profile("skillweave", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("skillweave")
+
+if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"):
+    from shape_checks import check_shapes
+
+    # Before anything else imports these: `from … import gae` then finds what is checked.
+    check_shapes("returns", "losses", "distributions", "optim")

@@ -69,8 +69,8 @@ def test_stable_baselines3_is_told_final_observations_and_time_limits():
     import numpy as np
 
     from skillweave import EnvSpec, OptionsEnv
-    from skillweave.envs.make import make_engine
     from skillweave.collecting.calls import SkillSet
+    from skillweave.envs.make import make_engine
 
     module = adapter()
     skills = (module.DriftLeft(), module.DriftRight())

@@ -22,8 +22,11 @@ def test_the_readme_examples_run_as_they_stand(
     train = Hierarchy.train
 
     def train_briefly(self: Hierarchy, *args: Any, **kwargs: Any) -> Any:
-        if self.selector_steps > 100_000:  # not yet scaled
-            self.scale(0.02)  # more than the learning_starts of an off-policy agent
+        self.skill_steps, self.selector_steps = 1_000, 1_000
+        self.flat_steps = None if self.flat_steps is None else 1_000
+        for owner, field in [(self, "selector"), *((x, "algorithm") for x in (self, *self.skills))]:
+            if hasattr(config := getattr(owner, field), "learning_starts"):
+                setattr(owner, field, replace(config, learning_starts=900))
         if kwargs.get("evolve"):
             small = {"generations": 2, "population": 3, "episodes": 1}
             kwargs["evolve"] = {k: replace(v, **small) for k, v in kwargs["evolve"].items()}

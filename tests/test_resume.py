@@ -18,8 +18,8 @@ from toys import Echo
 
 from skillweave import DQN, SAC, TD3, Hierarchy, Network, recipes
 from skillweave.cli import main
+from skillweave.cli.overrides import apply_overrides
 from skillweave.hierarchy import training
-from skillweave.hierarchy.settings import apply_settings
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.stage import Stage
@@ -254,7 +254,7 @@ def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stoppe
     def hierarchy() -> Hierarchy:
         found = recipes.load("lunar-lander")
         budgets = ["skills.stabilize.steps=1", "skills.center.steps=1", "selector_steps=1"]
-        apply_settings(found, [*budgets, "skills.landing.steps=24000", "cut_every=1"])
+        apply_overrides(found, [*budgets, "skills.landing.steps=24000", "cut_every=1"])
         return found
 
     hierarchy().train(tmp_path / "whole", seed=0, quiet=True)
@@ -307,27 +307,21 @@ def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Refe
 # What a resumed run must take from the run, not from the recipe
 
 
-SETTINGS = [
-    "reflexes_in_training=false",
-    "greedy_skills=true",
-    "call_steps=9",
-    "cut_every=250",
-    "skills.left.gamma=0.9",
-    "skills.left.steps=400",
-    "selector.learning_rate=0.01",
-    "selector_steps=700",
+SETTINGS = [  # a run that lost any of them would end otherwise
+    ["reflexes_in_training=false", "skills.left.gamma=0.9", "cut_every=250", "selector_steps=700"],
+    ["greedy_skills=true", "call_steps=9", "skills.left.steps=400", "selector.learning_rate=0.01"],
 ]
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("settings", SETTINGS)
 def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
-    tmp_path: Path, setting: str
+    tmp_path: Path, settings: list[str]
 ) -> None:
     recipe = str(write_recipe(tmp_path))
 
     def changed() -> Hierarchy:
         hierarchy = recipes.load(recipe)
-        apply_settings(hierarchy, [setting])
+        apply_overrides(hierarchy, settings)
         return hierarchy
 
     changed().train(tmp_path / "whole", seed=3, quiet=True)

@@ -11,15 +11,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from skillweave.training.collector import Collector
+from skillweave.training.off_policy import train_off_policy
+from skillweave.training.on_policy import train_on_policy
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
-from skillweave.training.collector import Collector
-from skillweave.training.off_policy import train_off_policy
-from skillweave.training.on_policy import train_on_policy
 from skillweave.types import Array, VecStep
 
 

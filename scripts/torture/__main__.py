@@ -70,7 +70,7 @@ def parse() -> argparse.Namespace:
 def preload() -> None:
     """Import all that a case may need, so that a forked process has it."""
     backends = [f"matplotlib.backends.backend_{kind}" for kind in ("agg", "svg")]
-    others = ("envpool", "onnx", "onnxruntime", "rich.console", "skillweave.cli.actions")
+    others = ("envpool", "onnx", "onnxruntime", "rich.console", "skillweave.cli.execute")
     for name in ("matplotlib.font_manager", *backends, *others):
         try:
             importlib.import_module(name)

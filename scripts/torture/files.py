@@ -40,7 +40,7 @@ from scripts.torture.report import (
     Outcome,
 )
 from scripts.torture.samples import SAMPLES, Play, Sample
-from skillweave.runs import pickles
+from skillweave.compat import pickles
 from skillweave.types import SkillweaveError
 
 SECONDS = 4

@@ -48,7 +48,7 @@ CALLS: tuple[tuple[str, str, tuple[Any, ...]], ...] = (
     ("numpy", "fromfile", ("/etc/passwd",)),
     ("numpy.testing._private.utils", "runstring", (f"open('{MARK}','w')", {})),
     ("skillweave.runs.files", "write_bytes", (MARK, b"x")),
-    ("skillweave.runs.pickles", "read_torch_pickle", (MARK,)),
+    ("skillweave.compat.pickles", "read_torch_pickle", (MARK,)),
     ("torch._utils", "_rebuild_tensor_v2.__globals__", ()),
     ("torch._utils", "_rebuild_tensor_v2.__class__", ()),
     ("collections", "OrderedDict.__subclasses__", ()),

@@ -21,11 +21,11 @@ from scripts.torture.kinds import CART, KINDS, LEARNS, NET, Balance, Kind, Tiny,
 from skillweave import PPO, EnvSpec, Hierarchy, Skill, from_onnx
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
-from skillweave.cli import actions, commands
+from skillweave.cli import commands, execute
+from skillweave.compat.agent_files import load_agent
+from skillweave.compat.agilerl_files import convert
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
-from skillweave.runs.agents import load_agent
-from skillweave.runs.agilerl import convert
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
@@ -80,7 +80,7 @@ def plays(policy: Policy) -> Play:
 def looked_at(run: Path, changed: str) -> None:
     """The commands that only read."""
     with contextlib.redirect_stdout(io.StringIO()):
-        actions.run(commands.Info(target=str(run)))
+        execute.run(commands.Info(target=str(run)))
     found = RunDirectory.open(run)
     if changed.endswith(".jsonl"):
         list(found.metrics())
@@ -133,7 +133,7 @@ def flat_weights(folder: Path, changed: str) -> Play:
     """Score a flat agent's weights on the command line."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
-        actions.run(commands.Evaluate(target=str(folder / "w.safetensors"), episodes=1, json=True))
+        execute.run(commands.Evaluate(target=str(folder / "w.safetensors"), episodes=1, json=True))
     return {"printed": out.getvalue().replace(str(folder), "")}
 
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from skillweave.cli.overrides import replaced
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.settings import replaced
 from skillweave.hierarchy.training import stages_of
 from skillweave.types import SkillweaveError
 

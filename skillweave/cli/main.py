@@ -1,4 +1,4 @@
-"""Entry point: parse, call ``actions``, print, and turn errors into exit codes."""
+"""Entry point: parse, call ``execute``, print, and turn errors into exit codes."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from skillweave.types import SkillweaveError
 
     try:
-        from skillweave.cli import actions
+        from skillweave.cli import execute
 
-        return actions.run(command)
+        return execute.run(command)
     except SkillweaveError as error:
         return _fail(command, str(error), 1)
     except KeyboardInterrupt as error:

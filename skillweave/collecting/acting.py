@@ -67,9 +67,7 @@ class Acting:
         """
         self._request, self._at = request, 0
         self._noises: list[Any] = []
-        self._generators = [
-            [s.torch() for s in self._seeds(i)] for i in range(len(self.stacks))
-        ]
+        self._generators = [[s.torch() for s in self._seeds(i)] for i in range(len(self.stacks))]
         if every_step and not (request.at_random or request.greedy):
             self._noises = [
                 algorithm.noise(generators, request.rows, self.each)
@@ -132,7 +130,7 @@ class Acting:
         # A member that has diverged must not spoil what all learn from.
         if not self.keeps_head:
             action, head = action.nan_to_num(), None
-        return Acted(*(None if x is None else x.flatten(0, 1).numpy() for x in (action, head, after)))  # type: ignore[arg-type]
+        return Acted(_rows(action), _rows_or_none(head), _rows_or_none(after))
 
     def _seeds(self, stack: int) -> list[Seeds]:
         first = sum(count for _, count in self.stacks[:stack])
@@ -144,6 +142,16 @@ def by_member(rows: Array, members: int) -> Tensor:
     """Rows of environments (P·B, …) to (P, B, …), member 0's first."""
     tensor = to_tensor(rows)
     return tensor.view(members, -1, *tensor.shape[1:])
+
+
+def _rows(x: Tensor) -> Array:
+    """(P, B, …) to (P·B, …)."""
+    rows: Array = x.flatten(0, 1).numpy()
+    return rows
+
+
+def _rows_or_none(x: Tensor | None) -> Array | None:
+    return None if x is None else _rows(x)
 
 
 def _part(x: Array | None, part: slice) -> Array | None:

@@ -228,9 +228,7 @@ def side_by_side(parts: Sequence[Collected], members: int) -> Collected:
     names = [k for k in Experience.__dataclass_fields__ if k != "spent"]
     found = {k: _beside([getattr(e, k) for e in experiences], members, k) for k in names}
     spent = sum(e.spent for e in experiences)
-    return Collected(
-        Experience(**found, spent=spent), np.concatenate([p.episodes for p in parts])
-    )
+    return Collected(Experience(**found, spent=spent), np.concatenate([p.episodes for p in parts]))
 
 
 def _higher(experience: Experience, height: int) -> Experience:
@@ -256,7 +254,9 @@ def _beside(values: list[Any], members: int, name: str) -> Any:
     if known is None:
         return None
     if name in _FREE:
-        values = [np.ones((*known.shape[:2], *known.shape[2:]), bool) if v is None else v for v in values]
+        values = [
+            np.ones((*known.shape[:2], *known.shape[2:]), bool) if v is None else v for v in values
+        ]
     if name == "rewards":
         longest = max(v.shape[2] for v in values)
         values = [np.pad(v, ((0, 0), (0, 0), (0, longest - v.shape[2]))) for v in values]

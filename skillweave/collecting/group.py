@@ -36,9 +36,7 @@ class Collectors:
 
     def collect(self, request: Request) -> Collected:
         """``request.rows`` steps of each environment."""
-        found = [
-            part.collect(request.of_collector(i)) for i, part in enumerate(self.parts)
-        ]
+        found = [part.collect(request.of_collector(i)) for i, part in enumerate(self.parts)]
         return self._joined(found)
 
     def cut(self, seeds: Seeds) -> Array:
@@ -69,9 +67,7 @@ class Collectors:
         count = len(ids)
         each = self.num_envs // self.members  # of a member
         own = each // count  # of a member, in one collector
-        found = [
-            part // own * each + number * own + part % own for number, part in enumerate(ids)
-        ]
+        found = [part // own * each + number * own + part % own for number, part in enumerate(ids)]
         return np.sort(np.concatenate(found))
 
 

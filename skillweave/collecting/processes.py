@@ -181,7 +181,7 @@ class ProcessCollectors(Collectors):
 
     def _begin(self, worker: _Worker) -> None:
         ours, theirs = self._context.Pipe()
-        make: Any = CloudpickleWrapper(self._make)  # type: ignore[type-var,arg-type]
+        make: Any = CloudpickleWrapper(self._make)  # type: ignore[arg-type]
         about = worker.number, make, self._each, theirs, ours, os.getpid()
         worker.pipe = ours
         worker.process = self._context.Process(

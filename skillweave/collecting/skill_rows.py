@@ -101,7 +101,9 @@ class SkillCollector(Collector):
             if playing is not None:
                 memory[~playing] = 0
         self.obs = raw.next_obs
-        over = ended if playing is None else np.where(playing, ended, raw.terminated | raw.truncated)
+        over = (
+            ended if playing is None else np.where(playing, ended, raw.terminated | raw.truncated)
+        )
         ids = np.flatnonzero(over)
         if len(ids):
             told = ids if playing is None else np.flatnonzero(playing & ended)

@@ -150,9 +150,7 @@ class Watch:
         first: the number of the first environment, for messages.
     """
 
-    def __init__(
-        self, name: str, space: gym.Space[Any], num_envs: int, first: int = 0
-    ) -> None:
+    def __init__(self, name: str, space: gym.Space[Any], num_envs: int, first: int = 0) -> None:
         self._name, self._num_envs, self._first = name, num_envs, first
         self._places = tuple(_real(obs_dtype(space)))
         self._elapsed = np.zeros(num_envs, np.int64)

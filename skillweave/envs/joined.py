@@ -63,7 +63,11 @@ class JoinedEngines:
     def _split(self, ids: Array) -> list[tuple[int, Array, Array]]:
         """For each part concerned: its number, the rows of ``ids``, and its own ids."""
         part, own = np.divmod(ids, self._each)
-        return [(int(i), rows, own[rows]) for i in np.unique(part) if len(rows := np.flatnonzero(part == i))]
+        return [
+            (int(i), rows, own[rows])
+            for i in np.unique(part)
+            if len(rows := np.flatnonzero(part == i))
+        ]
 
 
 def _in_order(ids: Array, found: Sequence[tuple[Array, Array]]) -> Array:

@@ -129,9 +129,7 @@ class EnvSpec:
         return isinstance(self.env, str) and ":" not in self.env and not self.wrappers
 
 
-def make_engine(
-    spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0
-) -> Engine:
+def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0) -> Engine:
     """The engine for ``num_envs`` environments of this kind.
 
     Args:

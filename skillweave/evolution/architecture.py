@@ -18,9 +18,9 @@ from torch import Tensor
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
-from skillweave.networks import growth
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
 from skillweave.networks.stacked import Views

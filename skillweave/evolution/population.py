@@ -61,7 +61,9 @@ class Population:
         self.next_number = len(members)
         each = members[0].config.num_envs
         self.replays = members[0].algorithm(self.spaces).store == "replay"
-        self.places = [scene.collector(each, None, i * each, self.replays) for i in range(len(members))]
+        self.places = [
+            scene.collector(each, None, i * each, self.replays) for i in range(len(members))
+        ]
         """Where they act: an heir goes on with its place's open episodes."""
         self.episodes = Episodes()
         self.rounds = 0

@@ -9,11 +9,11 @@ from typing import Any
 import gymnasium as gym
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
-from skillweave.envs.make import EnvSpec
 from skillweave.collecting.calls import SkillSet
+from skillweave.envs.make import EnvSpec
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
-from skillweave.skills.foreign import fitted
+from skillweave.skills.foreign_policy import fitted
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.plain_agent import (
     AGENT,

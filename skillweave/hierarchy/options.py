@@ -9,10 +9,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from skillweave.collecting.calls import SkillSet
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import allowed_rows
-from skillweave.collecting.calls import SkillSet
 from skillweave.seeding import Seeds
 from skillweave.spaces import unpack
 from skillweave.types import Array, SkillweaveError, Step
@@ -42,9 +42,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
-    def __init__(
-        self, engine: Engine, skills: SkillSet, gamma: float, seed: int = 0
-    ) -> None:
+    def __init__(self, engine: Engine, skills: SkillSet, gamma: float, seed: int = 0) -> None:
         self.engine, self.skills = engine, skills
         self.num_envs = engine.num_envs
         self.single_observation_space = engine.observation_space

@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave.collecting.calls import SkillSet
 from skillweave.skills import apply_reflexes
-from skillweave.skills.foreign import checksum, source_of
+from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.types import Array, Memory, Policy, Step
 
 _SELECTOR = "selector."

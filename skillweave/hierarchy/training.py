@@ -10,7 +10,7 @@ from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
-from skillweave.skills.foreign import source_of
+from skillweave.skills.foreign_policy import source_of
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.training.scene import Scene, selector_scene, skill_scene
 from skillweave.training.stage import Policies, Stage, target_of

@@ -18,7 +18,7 @@ from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.reading import Positive, fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.skills.foreign import Foreign, Source, as_recorded, source_of
+from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT, PlainAgent
 from skillweave.types import Policy, SkillweaveError

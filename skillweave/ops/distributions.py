@@ -8,10 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skillweave.shapes import Bool, Float, Int
+
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
-def mask_logits(logits: Tensor, mask: Tensor | None) -> Tensor:
+def mask_logits(
+    logits: Float[Tensor, "*batch A"], mask: Bool[Tensor, "*#batch A"] | None
+) -> Float[Tensor, "*batch A"]:
     """Logits with forbidden actions at the smallest finite number; both (..., A).
 
     A finite number keeps entropy and gradients finite (Huang & Ontañón 2022).
@@ -21,26 +25,34 @@ def mask_logits(logits: Tensor, mask: Tensor | None) -> Tensor:
     return logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
 
 
-def gumbel(uniform: Tensor) -> Tensor:
+def gumbel(uniform: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Gumbel noise ``−log(−log u)`` from uniform noise in [0, 1); any shape."""
     tiny = torch.finfo(uniform.dtype).tiny
     exponential = (-torch.log(uniform.clamp_min(tiny))).clamp_min(tiny)
     return -torch.log(exponential)
 
 
-def categorical_sample(logits: Tensor, noise: Tensor) -> Tensor:
+def categorical_sample(
+    logits: Float[Tensor, "*#batch A"], noise: Float[Tensor, "*#batch A"]
+) -> Int[Tensor, "*batch"]:
     """A sample by the Gumbel-max trick; logits and Gumbel noise (..., A) to (...) int64."""
     return torch.argmax(logits + noise, dim=-1)
 
 
-def categorical_stats(logits: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+def categorical_stats(
+    logits: Float[Tensor, "*batch A"], action: Int[Tensor, "*batch"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Log-probability of ``action`` and entropy; (..., A), (...) int64 to (...), (...)."""
     log_p = torch.log_softmax(logits, dim=-1)
     chosen = log_p.gather(-1, action.unsqueeze(-1)).squeeze(-1)
     return chosen, -(log_p.exp() * log_p).sum(-1)
 
 
-def normal_stats(mean: Tensor, log_std: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+def normal_stats(
+    mean: Float[Tensor, "*batch A"],
+    log_std: Float[Tensor, "*#batch A"],
+    action: Float[Tensor, "*batch A"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Log-density and entropy of independent normals; (..., A) to (...), (...)."""
     z = (action - mean) * torch.exp(-log_std)
     log_prob = (-0.5 * z.square() - log_std - _HALF_LOG_TWO_PI).sum(-1)
@@ -63,7 +75,7 @@ class _ClampInward(torch.autograd.Function):
         return grad.masked_fill(outward, 0.0), None, None
 
 
-def clamp_inward(x: Tensor, low: float, high: float) -> Tensor:
+def clamp_inward(x: Float[Tensor, "*shape"], low: float, high: float) -> Float[Tensor, "*shape"]:
     """``x.clamp(low, high)``, but what lies outside still learns to come back; any shape.
 
     A clamp has no gradient outside its bounds, so what got there would stay for ever. Here only
@@ -73,7 +85,7 @@ def clamp_inward(x: Tensor, low: float, high: float) -> Tensor:
     return found
 
 
-def tanh_log_det(x: Tensor) -> Tensor:
+def tanh_log_det(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """``log(1 − tanh²(x))``, the log-derivative of tanh, without cancellation; any shape.
 
     ``2·(log 2 − x − softplus(−2x))``, as in the SAC authors' code (Haarnoja et al. 2018, app. C).

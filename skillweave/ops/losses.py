@@ -11,16 +11,17 @@ import torch
 from torch import Tensor
 
 from skillweave.ops.moments import masked_mean
+from skillweave.shapes import Float
 
 
 def ppo_policy_loss(
-    log_prob: Tensor,
-    old_log_prob: Tensor,
-    advantage: Tensor,
-    clip_coef: Tensor,
-    weight: Tensor | None = None,
+    log_prob: Float[Tensor, "P B"],
+    old_log_prob: Float[Tensor, "P B"],
+    advantage: Float[Tensor, "P B"],
+    clip_coef: Float[Tensor, " P"],
+    weight: Float[Tensor, "P B"] | None = None,
     valid: Tensor | None = None,
-) -> Tensor:
+) -> Float[Tensor, " P"]:
     """Clipped surrogate, ``−E[w·min(ρA, clip(ρ, 1−ε, 1+ε)A)]`` (Schulman et al. 2017, eq. 7).
 
     ρ is the ratio to the policy from which clipping counts. Where another policy acted, w is the
@@ -43,12 +44,12 @@ def ppo_policy_loss(
 
 
 def value_loss(
-    value: Tensor,
-    target: Tensor,
-    old_value: Tensor | None = None,
-    clip: Tensor | None = None,
+    value: Float[Tensor, "P B"],
+    target: Float[Tensor, "P B"],
+    old_value: Float[Tensor, "P B"] | None = None,
+    clip: Float[Tensor, " P"] | None = None,
     valid: Tensor | None = None,
-) -> Tensor:
+) -> Float[Tensor, " P"]:
     """Half the mean squared error, optionally with PPO's value clipping.
 
     With ``clip`` (P,) the error is the larger of that of the value and that of the value
@@ -70,11 +71,11 @@ def value_loss(
 
 
 def approximate_kl(
-    log_prob: Tensor,
-    old_log_prob: Tensor,
-    weight: Tensor | None = None,
+    log_prob: Float[Tensor, "P B"],
+    old_log_prob: Float[Tensor, "P B"],
+    weight: Float[Tensor, "P B"] | None = None,
     valid: Tensor | None = None,
-) -> Tensor:
+) -> Float[Tensor, " P"]:
     """``E[w·((ρ − 1) − log ρ)]``, the low-variance estimator k3 of KL(old‖new); (P, B) to (P,).
 
     Schulman 2020, "Approximating KL divergence". ``weight`` and ``valid`` as of
@@ -85,7 +86,9 @@ def approximate_kl(
     return masked_mean(kl if weight is None else weight * kl, valid)
 
 
-def td_loss(value: Tensor, target: Tensor, kind: str) -> Tensor:
+def td_loss(
+    value: Float[Tensor, "*#batch"], target: Float[Tensor, "*#batch"], kind: str
+) -> Float[Tensor, "*batch"]:
     """Huber (threshold 1; Mnih et al. 2015) or half squared error of each sample; any shape."""
     if kind == "huber":
         return torch.nn.functional.smooth_l1_loss(value, target, reduction="none")

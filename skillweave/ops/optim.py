@@ -7,8 +7,12 @@ import math
 import torch
 from torch import Tensor
 
+from skillweave.shapes import Bool, Float, Int
 
-def clip_grad_norm_(grad: Tensor, max_norm: Tensor) -> Tensor:
+
+def clip_grad_norm_(
+    grad: Float[Tensor, "P D"], max_norm: Float[Tensor, " P"]
+) -> Float[Tensor, " P"]:
     """Scale each member's gradient (P, D) in place to at most ``max_norm`` (P,).
 
     Returns:
@@ -20,17 +24,17 @@ def clip_grad_norm_(grad: Tensor, max_norm: Tensor) -> Tensor:
 
 
 def adam_(
-    params: Tensor,
-    grad: Tensor,
-    mu: Tensor,
-    nu: Tensor,
-    count: Tensor,
-    learning_rate: Tensor,
+    params: Float[Tensor, "P D"],
+    grad: Float[Tensor, "P D"],
+    mu: Float[Tensor, "P D"],
+    nu: Float[Tensor, "P D"],
+    count: Int[Tensor, "P *each"],
+    learning_rate: Float[Tensor, " P"],
     *,
     beta1: float = 0.9,
     beta2: float = 0.999,
     eps: float = 1e-5,
-    active: Tensor | None = None,
+    active: Bool[Tensor, " P"] | None = None,
 ) -> None:
     """One Adam step in place (Kingma & Ba 2015, algorithm 1, in its efficient form).
 
@@ -61,8 +65,12 @@ def adam_(
 
 
 def kl_adapted_rate(
-    learning_rate: Tensor, kl: Tensor, target_kl: Tensor, low: float, high: float
-) -> Tensor:
+    learning_rate: Float[Tensor, " P"],
+    kl: Float[Tensor, " P"],
+    target_kl: Float[Tensor, " P"],
+    low: float,
+    high: float,
+) -> Float[Tensor, " P"]:
     """Learning rate divided by 1.5 where the KL is over 2·target, times 1.5 where under half.
 
     Schulman et al. 2017, sec. 4 (there for the KL penalty); the factor as in rl_games. All (P,).

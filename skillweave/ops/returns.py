@@ -5,15 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from skillweave.shapes import Bool, Float
+
 
 def gae(
-    reward: Tensor,
-    discount: Tensor,
-    value: Tensor,
-    next_value: Tensor,
-    last: Tensor,
-    gae_lambda: Tensor,
-) -> Tensor:
+    reward: Float[Tensor, "P T B"],
+    discount: Float[Tensor, "P T B"],
+    value: Float[Tensor, "P T B"],
+    next_value: Float[Tensor, "P T B"],
+    last: Bool[Tensor, "P T B"],
+    gae_lambda: Float[Tensor, " P"],
+) -> Float[Tensor, "P T B"]:
     """Generalised advantage estimates, exact for semi-MDPs and time limits.
 
     ``δ = r + discount·V(next) − V``; ``A = δ + discount·λ·(1 − last)·A⁺``

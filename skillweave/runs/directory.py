@@ -34,7 +34,7 @@ from skillweave.runs.files import (
     write_json,
     write_tensors,
 )
-from skillweave.runs.lines import JsonLines
+from skillweave.runs.jsonl import JsonLines
 from skillweave.runs.lock import Lock
 from skillweave.runs.manifest import (
     Checkpoint,
@@ -44,7 +44,7 @@ from skillweave.runs.manifest import (
     read_manifest,
     versions,
 )
-from skillweave.skills.foreign import Foreign, as_recorded
+from skillweave.skills.foreign_policy import Foreign, as_recorded
 from skillweave.types import Policy, SkillweaveError, unprefixed
 
 S = TypeVar("S")

@@ -18,7 +18,7 @@ from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
 from skillweave.runs.files import read_json
 from skillweave.runs.older import manifest_today
 from skillweave.skills.base import NAME
-from skillweave.skills.foreign import Source
+from skillweave.skills.foreign_policy import Source
 from skillweave.types import SkillweaveError
 
 Name = Annotated[

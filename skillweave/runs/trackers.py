@@ -1,10 +1,9 @@
-"""Where metrics go besides ``metrics.jsonl``: TensorBoard and Weights & Biases."""
+"""Sends metrics to TensorBoard or Weights & Biases, besides ``metrics.jsonl``."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,7 +34,7 @@ class TensorBoard:
         self._writer.flush()
 
     def message(self, text: str) -> None:
-        """Nothing to draw."""
+        """Messages are not tracked."""
 
     def close(self) -> None:
         """Close the files."""
@@ -43,7 +42,7 @@ class TensorBoard:
 
 
 class WandB:
-    """One Weights & Biases run; offline where there is no login, never a prompt."""
+    """One Weights & Biases run; offline if there is no login. It never asks for one."""
 
     def __init__(self, run: RunDirectory) -> None:
         import wandb
@@ -66,10 +65,10 @@ class WandB:
         self._run.log({f"{name}/{k}": v for k, v in (metrics | {"steps": steps}).items()})
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Nothing more to say."""
+        """Weights & Biases needs nothing here."""
 
     def message(self, text: str) -> None:
-        """Nothing to draw."""
+        """Messages are not tracked."""
 
     def close(self) -> None:
         """Finish the run."""
@@ -79,7 +78,7 @@ class WandB:
 def make_trackers(
     names: Sequence[str], run: RunDirectory | None
 ) -> tuple[TensorBoard | WandB, ...]:
-    """The trackers of these names; with ``run`` None only check that they can be made.
+    """The trackers with these names; if ``run`` is None, only check that they can be made.
 
     Raises:
         SkillweaveError: no such tracker.
@@ -95,37 +94,8 @@ def make_trackers(
     return tuple(TensorBoard(run) if name == "tensorboard" else WandB(run) for name in names)
 
 
-def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None = None) -> Any:
-    """A run of Weights & Biases in a loop of one's own; offline without a login or a key.
-
-    Raises:
-        MissingExtra: wandb is not installed.
-    """
-    try:
-        import wandb
-    except ImportError as error:
-        raise MissingExtra("tracking with wandb", "wandb") from error
-    stay_offline()
-    if key is not None:
-        wandb.login(key=key)
-    mode: Any = None if key is None else "online"
-    return wandb.init(project=project, name=name, config=config, mode=mode)
-
-
-def stay_offline() -> None:
-    """Without a login let wandb stay offline instead of asking for one; said where it is used."""
-    if "WANDB_MODE" not in os.environ and wandb_mode() == "offline":
-        os.environ["WANDB_MODE"] = "offline"
-        _to_say.append("no login to Weights & Biases, so its runs stay offline")
-    if "wandb" in sys.modules and _to_say:
-        print(f"skillweave: {_to_say.pop()}", file=sys.stderr)
-
-
-_to_say: list[str] = []
-
-
 def wandb_mode() -> Any:
-    """What WANDB_MODE says; without it online where there is a login, else offline."""
+    """The value of WANDB_MODE if it is set; else online if there is a login, else offline."""
     login = bool(os.environ.get("WANDB_API_KEY")) or _has_netrc()
     return os.environ.get("WANDB_MODE") or ("online" if login else "offline")
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.messages import short
-from skillweave.skills.actions import as_array, at_step, called, checked_actions
+from skillweave.skills.outputs import as_array, at_step, called, checked_actions
 from skillweave.types import Array, SkillweaveError, Step, finite, read_only
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.reading import check_file
-from skillweave.skills.actions import decoded
-from skillweave.skills.foreign import Foreign, checksum
+from skillweave.skills.foreign_policy import Foreign, checksum
+from skillweave.skills.outputs import decoded
 from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
 
 NUMBERS = {

@@ -13,8 +13,8 @@ from gymnasium.spaces import Box
 
 from skillweave.messages import short
 from skillweave.reading import read_file
-from skillweave.skills.actions import checked_actions
-from skillweave.skills.foreign import Foreign, checksum
+from skillweave.skills.foreign_policy import Foreign, checksum
+from skillweave.skills.outputs import checked_actions
 from skillweave.skills.torch_module import weights_of, with_weights
 from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from skillweave.messages import short
-from skillweave.skills.actions import as_array, called, checked_actions
-from skillweave.skills.foreign import Foreign, qualified
+from skillweave.skills.foreign_policy import Foreign, qualified
+from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.types import Array, Memory, SkillweaveError, read_only
 
 

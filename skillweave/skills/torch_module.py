@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.messages import short
-from skillweave.skills.actions import decoded
-from skillweave.skills.foreign import Foreign, checksum, qualified
+from skillweave.skills.foreign_policy import Foreign, checksum, qualified
+from skillweave.skills.outputs import decoded
 from skillweave.types import Array, Memory, SkillweaveError
 
 if TYPE_CHECKING:

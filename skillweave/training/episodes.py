@@ -65,10 +65,12 @@ class Tick:
     """What else resuming needs: where the environments are, and the replay buffer."""
 
 
-def to_numbers(metrics: dict[str, Any], update: int, *, skip_diverged: bool = False) -> dict[str, float]:
+def to_numbers(
+    metrics: dict[str, Any], update: int, *, skip_diverged: bool = False
+) -> dict[str, float]:
     """Member means; a value that is not finite stops the run, saying which and where.
 
-    If ``skip_diverged`` it is left out of the mean: whoever trains a population replaces its member.
+    If ``skip_diverged`` it is left out of the mean: who trains a population replaces its member.
     """
     numbers: dict[str, float] = {}
     for name, value in metrics.items():

@@ -311,7 +311,7 @@ def crossed(every: int, before: int, after: int) -> bool:
 
 def _flat(rows: Tensor, members: int) -> Tensor:
     """(T, P·B, …) to (P, T·B, …)."""
-    split: Tensor = rows.unflatten(1, (members, -1)).transpose(0, 1)  # type: ignore[no-untyped-call]
+    split: Tensor = rows.unflatten(1, (members, -1)).transpose(0, 1)
     return split.flatten(1, 2)
 
 

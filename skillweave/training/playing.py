@@ -27,4 +27,5 @@ def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
     gamma = np.array([algorithm.config.gamma])
     request = Request(0, (params,), gamma, seeds / "act", greedy=True)
     with torch_threads(1):  # several wait for each other, for ever on a busy machine
-        return player.play(request, seeds / "start", LONGEST_EPISODE)
+        found: Array = player.play(request, seeds / "start", LONGEST_EPISODE)
+    return found

@@ -27,7 +27,7 @@ from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Stage, Target
 from skillweave.training.stage_log import START, Listener, StageLog, resumed
-from skillweave.types import Policy, SkillweaveError, unprefixed
+from skillweave.types import Policy, SkillweaveError
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,7 @@ class OneAgent:
         )  # fmt: skip
         self._steps_before = int(log.at["steps"])
         if extra:
-            ids = resumed(
-                log, lambda: resume(self.learner, self.collectors, self.episodes, extra)
-            )
+            ids = resumed(log, lambda: resume(self.learner, self.collectors, self.episodes, extra))
             log.tell_begun_anew(len(ids), self.collectors.num_envs)
         self.evaluation.start(log.at["steps"])
 

@@ -11,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from skillweave.training.collector import Collector
+from skillweave.training.on_policy import train_on_policy
 from toys import (
     SHOWS,
     Allowance,
@@ -30,8 +32,6 @@ from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
-from skillweave.training.on_policy import train_on_policy
 from skillweave.types import SkillweaveError
 
 # The table: an algorithm's settings, what it sees, how it acts, how long it learns

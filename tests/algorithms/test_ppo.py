@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from skillweave.training.collector import Collector
+from skillweave.training.on_policy import train_on_policy
 from torch import nn
 from toys import Echo, learn
 
@@ -14,8 +16,6 @@ from skillweave.networks.config import RNN, Network
 from skillweave.ops.moments import normalise
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
-from skillweave.training.on_policy import train_on_policy
 from skillweave.types import SkillweaveError
 
 T, B = 8, 6

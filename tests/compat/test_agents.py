@@ -11,7 +11,7 @@ from skillweave.compat.agilerl.algorithms.dqn import DQN
 from skillweave.compat.agilerl.algorithms.dqn_rainbow import RainbowDQN
 from skillweave.compat.agilerl.algorithms.ppo import PPO
 from skillweave.compat.agilerl.algorithms.td3 import TD3
-from skillweave.training.by_hand import rollout_of
+from skillweave.compat.batches import rollout_of
 from skillweave.types import SkillweaveError
 
 OBS = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
@@ -66,7 +66,7 @@ def test_acting_in_numpy_says_what_torch_says(activation, layer_norm):
         actor = native.learner.acting_params(native.member.state)
         obs = torch.from_numpy(OBS)[None]
         _, head, _ = native.learner.act(actor, obs, None, None)
-        np.testing.assert_allclose(native.quick.output(OBS), head[0].numpy(), atol=1e-5)
+        np.testing.assert_allclose(native.numpy_actor.output(OBS), head[0].numpy(), atol=1e-5)
         action, log_prob, entropy, value = agent.getAction(OBS)
         want, spread = native.learner.head.stats(head[0], None, None, torch.from_numpy(action))
         np.testing.assert_allclose(log_prob, want, atol=1e-5)
@@ -200,7 +200,7 @@ def test_a_checkpoint_is_a_native_policy(tmp_path):
     agent.saveCheckpoint(tmp_path / "agent.pt")
     policy = AgentPolicy.from_file(*read_tensors(tmp_path / "agent.pt"), "agent.pt")
     action, _ = policy.act({}, OBS)
-    np.testing.assert_array_equal(action, agent.native.quick.output(OBS).argmax(-1))
+    np.testing.assert_array_equal(action, agent.native.numpy_actor.output(OBS).argmax(-1))
 
 
 def test_settings_are_those_of_the_native_agent():

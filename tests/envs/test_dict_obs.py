@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-
-from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.foreign import FromVectorEnv
-from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.envs.skill_env import SkillEnv
+
 from skillweave.collecting.calls import SkillSet
+from skillweave.envs.envpool_engine import EnvPoolEngine
+from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from skillweave.envs.skill_env import SkillEnv
 
 from skillweave.envs import envpool_engine
 from skillweave.envs.history import History
 from skillweave.envs.joined import JoinedEnvs
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.envs.skill_env import SkillEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 

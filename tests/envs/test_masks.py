@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from skillweave.envs.foreign import FromVectorEnv
+from skillweave.envs.skill_env import SkillEnv
 
 from skillweave import DQN, PPO, SAC, Hierarchy, Network, Skill, SkillweaveError, evaluate
-from skillweave.envs.foreign import FromVectorEnv
+from skillweave.collecting.calls import SkillSet
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.envs.skill_env import SkillEnv
-from skillweave.collecting.calls import SkillSet
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from skillweave.envs.skill_env import SkillEnv
 from toys import Ledger, actions, cartpole
 
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.envs.skill_env import SkillEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill
 from skillweave.types import SkillweaveError

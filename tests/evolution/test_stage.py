@@ -231,8 +231,9 @@ def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tm
     env_spec = spec(name)
     made = env_spec.make()
     spaces = made.observation_space, made.action_space
-    from skillweave.envs.make import make_engine
     from skillweave.envs.skill_env import SkillEnv
+
+    from skillweave.envs.make import make_engine
 
     def make_env(num_envs: int, gamma: Any) -> Any:
         return SkillEnv(make_engine(env_spec, num_envs))

@@ -11,8 +11,8 @@ from gymnasium.spaces import Box, Dict, Discrete, Text
 from skillweave import DQN, PPO, SAC, EnvSpec, Hierarchy, Reflex, Skill, SkillweaveError, recipes
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Run
+from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.hierarchy.settings import apply_settings, list_settings
 from skillweave.hierarchy.weights import read_weights, write_weights
 from skillweave.networks.config import CNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
@@ -244,7 +244,7 @@ def test_a_setting_is_changed_by_its_dotted_name(setting):
     d = declare()
     before = declare()
     assert not SETTINGS[setting](before)
-    apply_settings(d, [setting])
+    apply_overrides(d, [setting])
     assert SETTINGS[setting](d)
     changed = {f.name for f in dataclasses.fields(d) if f.name != "skills"}
     same = {name for name in changed if getattr(d, name) == getattr(before, name)}
@@ -253,7 +253,7 @@ def test_a_setting_is_changed_by_its_dotted_name(setting):
 
 def test_settings_apply_in_order_and_the_skills_class_is_left_alone():
     d = declare()
-    apply_settings(d, ["selector.gamma=0.5", "selector.gamma=0.6", "skills.lean.steps=9"])
+    apply_overrides(d, ["selector.gamma=0.5", "selector.gamma=0.6", "skills.lean.steps=9"])
     assert (d.selector.gamma, d.skill("lean").steps, Lean.steps) == (0.6, 9, 5_000)
 
 
@@ -299,7 +299,7 @@ def test_a_setting_of_an_agents_name_alone_takes_another_algorithm_then_the_rest
     declaration.algorithm = PPO(num_envs=4, n_steps=8, batch_size=32)
     settings = ["selector.gamma=0.9", "selector=dqn", "selector.network.cnn.kernels=(3,)"]
     settings += ["selector.network.cnn.channels=(4,)", "selector.network.cnn.strides=(1,)"]
-    apply_settings(declaration, [*settings, "skills.center=Rainbow", "algorithm=SAC"])
+    apply_overrides(declaration, [*settings, "skills.center=Rainbow", "algorithm=SAC"])
     cnn = CNN("plain", (4,), (3,), (1,))
     expected = DQN(gamma=0.9, network=Network((256, 256), "relu", cnn=cnn))
     assert declaration.selector == expected
@@ -310,18 +310,18 @@ def test_a_setting_of_an_agents_name_alone_takes_another_algorithm_then_the_rest
 @pytest.mark.parametrize("setting", WRONG_SETTINGS)
 def test_a_wrong_setting_is_named(setting):
     with pytest.raises(SkillweaveError, match=WRONG_SETTINGS[setting]):
-        apply_settings(declare(), [setting])
+        apply_overrides(declare(), [setting])
 
 
 @pytest.mark.parametrize("value", ["(0,)", "(-4, 4)", "('a',)", "(2.5,)"])
 def test_widths_that_no_layer_can_have_are_an_error_for_people(value):
     with pytest.raises(SkillweaveError, match="hidden"):
-        apply_settings(declare(), [f"selector.network.hidden={value}"])
+        apply_overrides(declare(), [f"selector.network.hidden={value}"])
 
 
 def test_a_critic_of_its_own_can_be_set_where_it_has_been_as_the_actors():
     d = declare()
-    apply_settings(d, ["selector.critic.hidden=(128,)"])
+    apply_overrides(d, ["selector.critic.hidden=(128,)"])
     assert d.selector.critic == dataclasses.replace(d.selector.network, hidden=(128,))
 
 
@@ -330,7 +330,7 @@ def test_what_is_listed_can_be_set(make):
     listed = list_settings(make())
     assert len(listed) > 50
     d = make()
-    apply_settings(d, [f"{name}={value}" for name, value in listed.items()])
+    apply_overrides(d, [f"{name}={value}" for name, value in listed.items()])
     assert list_settings(d) == listed
 
 
@@ -341,13 +341,13 @@ def test_changes_show_in_the_list_and_carry_over_to_another_declaration():
         "skills.lean.steps=77", "selector.target_kl=0.02", "selector.learning_rate_schedule=kl",
         "selector.normalize_obs=true", "greedy_skills=false",
     ]  # fmt: skip
-    apply_settings(d, changes)
+    apply_overrides(d, changes)
     listed = list_settings(d)
     assert listed != list_settings(other)
     assert (listed["call_steps"], listed["skills.center.network.hidden"]) == (7, (8, 4))
     first = ("selector.target_kl",)  # the schedule 'kl' asks for it
     names = sorted(listed, key=lambda name: name not in first)
-    apply_settings(other, [f"{name}={listed[name]}" for name in names])
+    apply_overrides(other, [f"{name}={listed[name]}" for name in names])
     assert list_settings(other) == listed
 
 

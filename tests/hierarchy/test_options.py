@@ -22,14 +22,14 @@ from reference_calls import (
     seeds_of,
     shy,
 )
+from skillweave.envs.foreign import FromVectorEnv
+from skillweave.envs.skill_env import SkillEnv
 from toys import cartpole
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.envs.foreign import FromVectorEnv
-from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.envs.skill_env import SkillEnv
 from skillweave.collecting.calls import SkillSet
+from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill

@@ -27,8 +27,8 @@ from reference_calls import (
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Hierarchy, Run
-from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.collecting.calls import SkillSet
+from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds

@@ -13,7 +13,7 @@ import torch
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm, state_from
 from skillweave.cli import main
-from skillweave.runs.agents import load_agent, save_agent
+from skillweave.compat.agent_files import load_agent, save_agent
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 from skillweave.seeding import Seeds
 

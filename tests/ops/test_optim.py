@@ -10,7 +10,7 @@ from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
 
 def adam_state(members: int, size: int, dtype: torch.dtype = torch.float32):
     zeros = torch.zeros(members, size, dtype=dtype)
-    return zeros, zeros.clone(), torch.zeros(members, dtype=dtype)
+    return zeros, zeros.clone(), torch.zeros(members, dtype=torch.int64)
 
 
 def test_adam_equals_torchs_for_each_members_learning_rate():
@@ -31,7 +31,7 @@ def test_adam_equals_torchs_for_each_members_learning_rate():
             optimiser.step()
         adam_(params, grad, mu, nu, count, rates)
         torch.testing.assert_close(params, torch.stack(reference).detach())
-    assert count.tolist() == [20.0] * 3
+    assert count.tolist() == [20] * 3
 
 
 def test_adam_leaves_inactive_members_exactly_as_they_are():

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from skillweave.training.collector import Collector
+from skillweave.training.off_policy import make_buffer, train_off_policy
 from toys import BoxIdentity, Broken, Calls, Countdown, Echo, Identity, learn
 
 from skillweave.algorithms.config import DQN, SAC, TD3
@@ -13,9 +15,7 @@ from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
-from skillweave.training.collector import Collector
 from skillweave.training.episodes import Tick
-from skillweave.training.off_policy import make_buffer, train_off_policy
 from skillweave.types import SkillweaveError, unprefixed
 
 SETTINGS: dict[str, Any] = {

@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from skillweave.runs.trackers import stay_offline
+from skillweave.compat.wandb_runs import stay_offline
 
 
 def _make(name: str, **kwargs: Any) -> gym.Env[Any, Any]:

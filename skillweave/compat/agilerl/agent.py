@@ -1,4 +1,4 @@
-"""What all agents share: a native one under AgileRL's names, and its history."""
+"""The base of all agents: a native agent under AgileRL's names, with its history."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from skillweave.evolution.by_hand import ByHand
+from skillweave.compat.agilerl_files import network_of, observations_of
+from skillweave.compat.batches import returns_of
+from skillweave.compat.single_agent import SingleAgent
 from skillweave.evolution.stacks import Member
-from skillweave.runs.agilerl import network_of, observations_of
-from skillweave.training.by_hand import returns_of
 from skillweave.types import SkillweaveError
 
 MLP: dict[str, Any] = {"arch": "mlp", "hidden_size": [64, 64]}
@@ -20,7 +20,10 @@ _PAST = ("scores", "fitness", "steps", "mut", "index", "beta", "prior_eps")
 
 
 class Setting:
-    """An attribute that is a native setting; ``inverse``: one over it; ``share``: of another."""
+    """An attribute that stands for a field of the native config.
+
+    ``inverse``: its value is 1 / field; ``share``: field times the field of this name.
+    """
 
     def __init__(self, field: str, inverse: bool = False, share: str | None = None) -> None:
         self.field, self.inverse, self.share = field, inverse, share
@@ -37,12 +40,12 @@ class Setting:
         agent.native.set(**self.native(value / whole if whole else value))
 
     def native(self, value: Any) -> dict[str, Any]:
-        """The native setting that such a value stands for."""
+        """The native field, with the value that ``value`` stands for."""
         return {self.field: 1.0 / float(value) if self.inverse else plain(value)}
 
 
 class Agent:
-    """An agent as AgileRL has it; ``native`` is all that acts and learns."""
+    """An agent with AgileRL's interface; ``native`` does all acting and learning."""
 
     algo: ClassVar[str]
     kind: ClassVar[type]
@@ -69,18 +72,18 @@ class Agent:
         own["network"] = network_of(network, "Tanh" if self.algo == "PPO" else "ReLU")
         seen = observations_of(given["state_dim"], given["one_hot"], network)
         self._wrap(
-            ByHand(Member(0, (make or self.kind)(**own), None), (seen, actions), random_seed())
+            SingleAgent(Member(0, (make or self.kind)(**own), None), (seen, actions), random_seed())
         )
         self.index, self.mut, self.device = given["index"], given["mut"], given["device"]
 
-    def _wrap(self, native: ByHand) -> None:
-        self.native, (seen, done) = native, native.spaces
+    def _wrap(self, native: SingleAgent) -> None:
+        self.native, (seen, action_space) = native, native.spaces
         self.scores: list[float] = []
         self.fitness: list[float] = []
         self.index, self.mut, self.steps, self.device = 0, None, [0], "cpu"
-        self.one_hot, self.discrete_actions = not seen.shape, not done.shape
+        self.one_hot, self.discrete_actions = not seen.shape, not action_space.shape
         self.state_dim = seen.shape or (int(seen.n),)
-        self.action_dim = int(done.shape[0] if done.shape else done.n)
+        self.action_dim = int(action_space.shape[0] if action_space.shape else action_space.n)
 
     def test(
         self, env: Any, swap_channels: bool = False, max_steps: int = 500, loop: int = 3
@@ -95,7 +98,7 @@ class Agent:
         return self.fitness[-1]
 
     def clone(self, index: int | None = None, wrap: bool = True) -> Self:
-        """The same agent, but with chance of its own."""
+        """A copy of the agent with its own random streams."""
         found = type(self).__new__(type(self))
         found._wrap(self.native.copy(random_seed()))
         found.__dict__.update(self._past(), device=self.device)
@@ -106,7 +109,7 @@ class Agent:
         return {k: np.array(getattr(self, k)).tolist() for k in _PAST if hasattr(self, k)}
 
     def saveCheckpoint(self, path: str | Path) -> None:
-        """Write a native agent, as safetensors and JSON whatever the path, and its history."""
+        """Write the native agent and its history, as safetensors and JSON whatever the suffix."""
         self.native.save(path, {"algo": self.algo, **self._past()})
 
     def loadCheckpoint(self, path: str | Path) -> None:
@@ -115,7 +118,7 @@ class Agent:
         Raises:
             SkillweaveError: the file is missing, a pickle of AgileRL's, or another algorithm's.
         """
-        native, past = ByHand.load(path, random_seed())
+        native, past = SingleAgent.load(path, random_seed())
         algo = past.pop("algo", self.algo)
         if not isinstance(native.member.config, self.kind) or algo != self.algo:
             kind = type(native.member.config).__name__
@@ -125,7 +128,7 @@ class Agent:
 
     @classmethod
     def load(cls, path: str | Path, device: Any = "cpu", accelerator: Any = None) -> Self:
-        """The agent of a checkpoint; see ``loadCheckpoint``."""
+        """The agent in a checkpoint; see ``loadCheckpoint``."""
         found = cls.__new__(cls)
         found.loadCheckpoint(path)
         found.device = device
@@ -135,15 +138,15 @@ class Agent:
 
 
 def random_seed() -> int:
-    """A seed from torch's generator: ``torch.manual_seed`` decides about all that follows."""
+    """A seed from torch's generator, so that ``torch.manual_seed`` makes agents repeatable."""
     return int(torch.randint(2**62, ()))
 
 
 def plain(value: Any) -> Any:
-    """NumPy's numbers and arrays as Python's."""
+    """NumPy numbers and arrays as Python's."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def swapped(state: Any, swap: bool) -> Any:
-    """Observations with their channels first, where asked for."""
+    """Observations, with the channels moved to the front if ``swap``."""
     return np.moveaxis(state, -1, -3) if swap else state

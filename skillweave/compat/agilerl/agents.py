@@ -1,4 +1,4 @@
-"""The agents: all that is said here is how AgileRL calls what the native API has."""
+"""The agents: only AgileRL's names and signatures for what the native API does."""
 
 from typing import Any
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.buffers.by_hand import Recorder
 from skillweave.compat.agilerl.agent import random_seed
+from skillweave.compat.transition_buffer import TransitionBuffer
 from skillweave.experience import Sample
 from skillweave.types import Array
 
@@ -18,7 +18,7 @@ class MultiStepReplayBuffer:
         n_step: int = 3, gamma: float = 0.99, device: Any = None, **how: Any,
     ) -> None:  # fmt: skip
         self.memory_size, self.counter = memory_size, 0
-        self.native = Recorder(memory_size, random_seed(), gamma, n_step=n_step, **how)
+        self.native = TransitionBuffer(memory_size, random_seed(), gamma, n_step=n_step, **how)
 
     def __len__(self) -> int:
         return len(self.native)
@@ -41,7 +41,7 @@ class MultiStepReplayBuffer:
         return (*_parts(found), found.index[0]) if return_idx else _parts(found)
 
     def sample_from_indices(self, idxs: Array) -> tuple[Any, ...]:
-        """The same of the transitions that another buffer's sample has called so."""
+        """The same, for the indices of a sample from another buffer."""
         return _parts(self.native.at(idxs))
 
 
@@ -65,12 +65,12 @@ class PrioritizedReplayBuffer(MultiStepReplayBuffer):
         super().__init__(action_dim, memory_size, field_names, num_envs, n_step, gamma, **how)
 
     def sample(self, batch_size: int, beta: float = 0.4) -> tuple[Any, ...]:
-        """As of the others, then importance weights (B,) and indices."""
+        """As in the other buffers, then importance weights (B,) and indices."""
         found = self.native.sample(batch_size, beta)
         return (*_parts(found), found.weight[0], found.index[0])  # type: ignore[index]
 
     def update_priorities(self, idxs: Array, priorities: Array) -> None:
-        """New priorities of what was sampled."""
+        """Set the priorities of sampled transitions."""
         self.native.update_priorities(idxs, priorities)
 
 

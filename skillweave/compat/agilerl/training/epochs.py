@@ -1,4 +1,4 @@
-"""What both training functions share: episodes of everyone, and now and then an evaluation."""
+"""The loop of both training functions: episodes of every agent, with an evaluation at times."""
 
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -8,20 +8,20 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave.compat.agilerl.agent import swapped
-from skillweave.runs.trackers import start_wandb
+from skillweave.compat.wandb_runs import start_wandb
 from skillweave.types import SkillweaveError
 
 Result = tuple[list[Any], list[list[float]]]
 
 
 class Epochs(SimpleNamespace):
-    """The arguments of a training function, which says what an agent learns in an episode."""
+    """The arguments of a training function, and the loop that it runs."""
 
     env: Any
     pop: Any
 
     def run(self, episode: Callable[[Any, int], Any]) -> Result:
-        """Train by episodes of ``steps`` and learning; ``episode`` answers the loss."""
+        """Train; ``episode`` plays one episode of an agent, lets it learn and returns the loss."""
         if self.accelerator is not None or not self.pop:
             raise SkillweaveError("pop must have an agent, and accelerator be None")
         if not hasattr(self.env, "num_envs"):
@@ -32,9 +32,8 @@ class Epochs(SimpleNamespace):
         name, found = f"{self.env_name}-EvoHPO-{self.algo}", []
         settings, key = {**(self.INIT_HP or {}), **(self.MUT_P or {})}, self.wandb_api_key
         self.tracked = start_wandb("AgileRL", name, settings, key) if self.wb else None
-        for done in range(self.n_episodes):
-            losses = [self._scored(agent, episode(agent, done)) for agent in self.pop]
-            number = done + 1
+        for number in range(1, self.n_episodes + 1):
+            losses = [self._scored(agent, episode(agent, number - 1)) for agent in self.pop]
             if number % self.evo_epochs == 0:
                 how = self.swap_channels, self.max_steps, self.evo_loop
                 found.append([agent.test(self.env, *how) for agent in self.pop])
@@ -55,7 +54,7 @@ class Epochs(SimpleNamespace):
         return self.pop, found
 
     def steps(self, act: Callable[[Any], Any]) -> Iterator[tuple[Any, ...]]:
-        """An episode's: state, what ``act`` answers, rewards, next state, terminations."""
+        """The steps of an episode: state, result of ``act``, rewards, next state, terminations."""
         self.rewards, self.ended = [], []
         state = swapped(self.env.reset()[0], self.swap_channels)
         for _ in range(self.max_steps):
@@ -70,7 +69,7 @@ class Epochs(SimpleNamespace):
             state = after
 
     def _scored(self, agent: Any, loss: Any) -> Any:
-        """Note the mean return of the first episodes of all environments."""
+        """Record the mean return of the first episodes of all environments."""
         first = np.cumsum(self.ended, axis=0) - np.array(self.ended, int) == 0
         agent.scores.append(float((np.array(self.rewards) * first).sum(0).mean()))
         agent.steps[-1] += self.max_steps

@@ -17,19 +17,19 @@ def train_off_policy(
     elite_path: str | None = None, wb: bool = False, verbose: bool = True, accelerator: Any = None,
     wandb_api_key: str | None = None,
 ) -> Result:  # fmt: skip
-    """Train agents, who share the buffer; returns them and their fitnesses, by evaluation."""
+    """Train agents that share one buffer; returns agents and their fitnesses by evaluation."""
     epochs = Epochs(**locals())
     if mutation is not None:
         epochs.pop = mutation.mutation(pop, pre_training_mut=True)
 
-    def episode(agent: Any, done: int) -> float:
-        losses, how = [], () if noisy else (max(eps_end, eps_start * eps_decay**done),)
+    def episode(agent: Any, past: int) -> float:
+        losses, how = [], () if noisy else (max(eps_end, eps_start * eps_decay**past),)
         for transition in epochs.steps(lambda state: agent.getAction(state, *how)):
             for buffer in (memory, n_step_memory):
                 if buffer is not None:
                     buffer.save2memoryVectEnvs(*transition)
             if per:
-                agent.beta += (1.0 - agent.beta) * (done + 1) / n_episodes
+                agent.beta += (1.0 - agent.beta) * (past + 1) / n_episodes
             if memory.counter % agent.learn_step == 0 and len(memory) >= agent.batch_size:
                 losses.append(_learn(agent, memory, n_step_memory, n_step, per))
         return float(np.mean(losses or [0.0]))
@@ -38,7 +38,7 @@ def train_off_policy(
 
 
 def _learn(agent: Any, memory: Any, n_step_memory: Any, n_step: bool, per: bool) -> float:
-    """One gradient step; its loss, of actor and critics the critics'."""
+    """One gradient step; returns its loss, or that of the critics where there is an actor."""
     if not per and n_step_memory is None:
         found = agent.learn(memory.sample(agent.batch_size))
         losses = [x for x in (found if isinstance(found, tuple) else (found,)) if x is not None]

@@ -13,10 +13,10 @@ def train_on_policy(
     elite_path: str | None = None, wb: bool = False, verbose: bool = True, accelerator: Any = None,
     wandb_api_key: str | None = None,
 ) -> Result:  # fmt: skip
-    """Train agents by ``max_steps`` steps and one ``learn`` an episode; them, their fitnesses."""
+    """Train agents by ``max_steps`` steps and one ``learn`` per episode; agents and fitnesses."""
     epochs = Epochs(**locals())
 
-    def episode(agent: Any, done: int) -> Any:
+    def episode(agent: Any, past: int) -> Any:
         states, acted, rewards, after, ended = zip(*epochs.steps(agent.getAction), strict=True)
         actions, log_probs, _, values = zip(*acted, strict=True)
         return agent.learn((states, actions, log_probs, rewards, ended, values, after[-1]))

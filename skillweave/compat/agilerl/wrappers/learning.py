@@ -6,7 +6,7 @@ import gymnasium as gym
 
 
 class Skill(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment with a reward of one's own."""
+    """An environment with a reward of the user's."""
 
     def step(self, action: Any) -> Any:
         """The environment's step, as ``skill_reward`` changes it."""

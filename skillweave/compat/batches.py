@@ -1,4 +1,4 @@
-"""What a loop of one's own has recorded, as what algorithms learn from."""
+"""Batches for algorithms, made of what a training loop of the user has recorded."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from skillweave.experience import Rollout, Sample
 def returns_of(
     env: Any, act: Callable[[Any], Any], episodes: int, max_steps: int
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Returns (episodes,), each of at most ``max_steps`` steps, by ``act(obs)``.
+    """Returns (episodes,) of ``act(obs)``, each of at most ``max_steps`` steps.
 
-    ``env`` may be a vector environment, of which the first environment counts.
+    In a vector environment only the first environment counts.
     """
     returns = np.zeros(episodes)
     for i in range(episodes):
@@ -44,10 +44,10 @@ def rollout_of(
     terminated: Any,
     next_obs: Any,
 ) -> Rollout:
-    """T steps of N environments as a rollout; each argument has T entries, of N or of none.
+    """T steps of N environments as a rollout; each argument has T entries: (N, ...) or one value.
 
-    What followed a step is the next one's ``obs``; ``next_obs`` is what followed the last. The
-    actions, in policy units, count as drawn with just these log-probabilities.
+    The successor of a step is the next entry of ``obs``; ``next_obs`` is that of the last step.
+    Actions are in policy units, and count as drawn with the log-probabilities given.
     """
     rewards = _tensor(reward, np.float32)
     lead = 1, len(rewards), max(1, rewards[0].numel())
@@ -78,7 +78,7 @@ def sample_of(
     terminated: Any,
     weight: Any = None,
 ) -> Sample:
-    """B transitions as a sample; actions in the environment's units, γ as of all their steps."""
+    """B transitions as a sample; actions in the environment's units, γ for all their steps."""
     rewards = _tensor(reward, np.float32).view(1, -1)
     size, shape = rewards.shape[1], algorithm.action_space.shape or ()
     units = algorithm.codec.from_env(np.asarray(action).reshape(size, *shape))
@@ -96,7 +96,7 @@ def sample_of(
 
 
 def _rows(algorithm: Algorithm, obs: Any) -> Tensor:
-    """Observations, however nested, as (n, *shape) of the space's type."""
+    """Observations, however nested, as (n, *shape) with the dtype of the space."""
     space = algorithm.observation_space
     return _tensor(obs, space.dtype).view(-1, *(space.shape or ()))
 

@@ -1,4 +1,4 @@
-"""Checkpoints of AgileRL 0.1 and 1.0 (PPO, DQN, DDPG, TD3 with MLPs) as files of native agents."""
+"""Converts checkpoints of AgileRL 0.1 and 1.0 (PPO, DQN, DDPG, TD3 with MLPs) to native agents."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from torch import Tensor
 
 from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.compat.agent_files import save_agent
+from skillweave.compat.pickles import read_torch_pickle
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
 from skillweave.reading import Asked, Positive, fit, shown
-from skillweave.runs.agents import save_agent
-from skillweave.runs.pickles import read_torch_pickle
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 
@@ -31,7 +31,7 @@ _LAYER = re.compile(r"(linear_layer|layer_norm)_(\d+|output)\.(weight|bias)$")
 
 
 def convert(path: Path, out: Path) -> str:
-    """Write a checkpoint of AgileRL's as a native agent; the algorithm's name.
+    """Write an AgileRL checkpoint as a native agent; returns the name of the algorithm.
 
     The pickle is read without running code from it (see ``pickles``). The optimiser begins anew.
 
@@ -80,7 +80,7 @@ def _is_size(data: Any) -> bool:
 
 
 class _Init(TypedDict):
-    """How AgileRL says what an MLP is made of."""
+    """The description of an MLP, as AgileRL writes it."""
 
     num_inputs: NotRequired[Annotated[Any, Asked("sizes, a million in all at most", _is_size)]]
     num_outputs: NotRequired[_Units]
@@ -89,7 +89,7 @@ class _Init(TypedDict):
 
 
 class _Checkpoint(TypedDict):
-    """What is read of a checkpoint, besides settings of the same name as ours."""
+    """The fields of a checkpoint that are read, besides hyperparameters named as ours."""
 
     actor_init_dict: _Init
     actor_state_dict: dict[str, Any]
@@ -164,7 +164,7 @@ def _mlp(init: Mapping[str, Any]) -> Network:
 def observations_of(
     size: Any, one_hot: bool | None, net_config: Mapping[str, Any] | None = None
 ) -> gym.Space[Any]:
-    """The space of what AgileRL calls states of this size, seen by such a network."""
+    """The observation space of states of this size, for a network described so."""
     shape, described = [int(n) for n in np.atleast_1d(size)], net_config or {}
     if one_hot:
         return gym.spaces.Discrete(shape[0])
@@ -176,7 +176,7 @@ def observations_of(
 
 
 def network_of(described: Mapping[str, Any], usual: str | None = None) -> Network:
-    """What AgileRL describes by a ``net_config``.
+    """The network that a ``net_config`` of AgileRL describes.
 
     Raises:
         SkillweaveError: a part is missing or unknown.
@@ -197,7 +197,7 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
 def _named(
     shapes: Mapping[str, tuple[int, ...]], prefix: str, weights: Mapping[str, Any]
 ) -> dict[str, Tensor]:
-    """A state dict under the names and in the shapes of one of our networks, all of it.
+    """A state dict with the names and shapes of one of our networks, complete.
 
     Raises:
         SkillweaveError: a weight is missing, unknown, of another shape, or not finite.

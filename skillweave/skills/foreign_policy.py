@@ -1,4 +1,4 @@
-"""Policies made elsewhere: how they meet an environment, and how a run remembers them."""
+"""Policies made elsewhere: how they are fitted to an environment and recorded in a run."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from skillweave.types import Array, Memory, Memoryless, Policy, SkillweaveError
 
 
 class Foreign(Memoryless):
-    """A policy made elsewhere; its spaces may stay open until it meets an environment.
+    """A policy made elsewhere; its spaces may stay open until ``bind`` gives it an environment's.
 
-    A run names its ``source``. What has ``content`` is copied into the run too, and then it is the
-    copy that acts when the run is loaded; what has none must still have the same checksum.
+    A run records its ``source``. If it has ``content``, the run keeps a copy, and the copy acts
+    when the run is loaded. Without content, it must still have the same checksum then.
     """
 
     kind: str
-    """What ``run.json`` calls its sort."""
+    """The name of its kind in ``run.json``."""
     suffix: str = ""
-    """How the file of its ``content`` ends."""
+    """The suffix of the file of its ``content``."""
 
     def __init__(self, name: str, observation_space: Any = None, action_space: Any = None) -> None:
         self.name = self._who = name
@@ -33,7 +33,7 @@ class Foreign(Memoryless):
         self._open = observation_space is None, action_space is None
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy in which these spaces stand where it has none; ``who`` goes before messages."""
+        """A copy that takes these spaces where it has none; messages begin with ``who``."""
         bound = copy.copy(self)
         bound._who = f"{who}: {self.name}"
         if self._open[0]:
@@ -55,7 +55,7 @@ class Foreign(Memoryless):
         raise NotImplementedError
 
     def must_be_bound(self) -> None:
-        """Raise a SkillweaveError where it has not met an environment yet."""
+        """Raise a SkillweaveError if it has no spaces yet."""
         if self.action_space is None:
             raise SkillweaveError(f"{self._who} has no spaces yet: bind() it to an environment's")
 
@@ -66,15 +66,15 @@ class Foreign(Memoryless):
         return {"kind": self.kind, "name": self.name, **sha256}
 
     def content(self) -> bytes | None:
-        """What a run keeps a copy of; None: nothing, it is only named."""
+        """The bytes that a run keeps a copy of; None: the run only names it."""
         return None
 
     def restored(self, content: bytes) -> Self:
-        """This policy with the ``content`` that a run has kept."""
+        """This policy with the ``content`` from a run."""
         raise NotImplementedError
 
     def try_out(self) -> None:
-        """Act once on two made-up observations, so that what does not fit is said before training.
+        """Act once on two made-up observations, so that errors are found before training.
 
         Raises:
             SkillweaveError: it failed; the message names who, and the space.

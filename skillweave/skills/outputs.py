@@ -1,4 +1,4 @@
-"""What a foreign policy returns, checked against the action space, or read as logits."""
+"""Checks what functions and policies of the user return, and reads logits as actions."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from skillweave.types import Array, SkillweaveError
 
 
 def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
-    """What a function of the user's returns.
+    """The result of a function of the user.
 
     Raises:
-        SkillweaveError: it failed; the message names ``who``, the step where it is known, and the
-            line.
+        SkillweaveError: it raised; the message names ``who``, the line, and the step if known.
     """
     try:
         return function(argument)
     except SkillweaveError:
         raise
     except Exception as error:
-        # numpy says no more than that something cannot be written to
+        # the message of numpy says only that something is read-only
         hint = "; what it is given cannot be changed: change a copy"
         hint = hint if "read-only" in told(error) else ""
         about = getattr(argument, "shape", None)
@@ -35,7 +34,7 @@ def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
 
 
 def at_step(elapsed: Any) -> str:
-    """When something happened, for messages; None: nobody knows."""
+    """The step, for messages; an empty string if ``elapsed`` is None."""
     return "" if elapsed is None else f" at step {np.max(elapsed)}"
 
 
@@ -43,7 +42,7 @@ def as_array(value: Any, who: str) -> Array:
     """``value`` as an array.
 
     Raises:
-        SkillweaveError: it cannot be one; the message names ``who``.
+        SkillweaveError: it cannot be converted; the message names ``who``.
     """
     try:
         return np.asarray(value)
@@ -57,7 +56,7 @@ def checked_actions(value: Any, n: int, space: Space[Any], who: str) -> Array:
     """``value`` as actions (n, *shape) of ``space``; those of a Box are clipped to its bounds.
 
     Raises:
-        SkillweaveError: another shape, another kind of number, or a choice that does not exist;
+        SkillweaveError: the shape or the type of number is wrong, or there is no such action;
             the message names ``who`` and the space.
     """
     action, shape = as_array(value, who), (n, *(space.shape or ()))
@@ -93,13 +92,13 @@ def decoded(
 ) -> Array:
     """A network's output as actions.
 
-    Whole numbers are actions, and so is everything for a Box. Other numbers are logits: (n, A) of
-    Discrete(A), concatenated (n, ΣA) of a MultiDiscrete, one for each bit of a MultiBinary; greedy
-    takes the largest, else they are sampled with ``rng``.
+    Integers are actions, and for a Box all numbers are. Other numbers are logits: (n, A) for
+    Discrete(A), concatenated (n, ΣA) for MultiDiscrete, one per bit for MultiBinary. If
+    ``deterministic``, the largest logit wins; else actions are sampled with ``rng``.
     """
     shape = space.shape or ()
     if output.dtype.kind in "iub" or isinstance(space, Box):
-        flat = output.shape == (n, int(np.prod(shape)))  # a last layer knows no other shape
+        flat = output.shape == (n, int(np.prod(shape)))  # the last layer of a network is flat
         return checked_actions(output.reshape(n, *shape) if flat else output, n, space, who)
     width = _width(space)
     if output.shape != (n, width):
@@ -141,7 +140,7 @@ def _width(space: Space[Any]) -> int:
 
 
 def _bounds(space: Space[Any]) -> tuple[Any, Any] | None:
-    """First choice and the one after the last."""
+    """The first action and the one after the last; None for a Box."""
     if isinstance(space, Discrete):
         return space.start, space.start + space.n
     if isinstance(space, MultiDiscrete):

@@ -1,4 +1,4 @@
-"""Checkpoints of ``torch.save``, read without running code from them.
+"""Reads checkpoints of ``torch.save`` without running code from them.
 
 A pickle is a program that calls what it names. Here it may name only what builds tensors, NumPy
 numbers and arrays, devices and plain containers, each by a function of this module's or one that
@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.compat.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
 from skillweave.reading import check_file, shown
-from skillweave.runs.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
 from skillweave.types import SkillweaveError
 
 _STORAGES = {
@@ -31,17 +31,17 @@ _STORAGES = {
 
 
 class Inert:
-    """Stands for an object that carries nothing worth having, such as a loss of torch's."""
+    """Stands for an object that holds nothing that is needed, such as a loss of torch's."""
 
     def __setstate__(self, state: Any) -> None:
-        """Forget it."""
+        """Ignore it."""
 
 
 class _Dict(dict[Any, Any]):
     """An OrderedDict; a dict keeps its order, too."""
 
     def __setstate__(self, state: Any) -> None:
-        """Forget it: torch keeps the versions of its modules there."""
+        """Ignore it: torch keeps the versions of its modules there."""
 
 
 class _Held:
@@ -101,15 +101,15 @@ def read_torch_pickle(path: Path) -> Any:
 
 
 class _Plain:
-    """What was read, with tensors where they were held, and Python's numbers for NumPy's."""
+    """Turns what was read into plain tensors, Python numbers and containers."""
 
     def __init__(self) -> None:
-        self._done: dict[int, tuple[Any, int]] = {}
+        self._results: dict[int, tuple[Any, int]] = {}
 
     def __call__(self, data: Any, depth: int = 0) -> tuple[Any, int]:
-        """The same in plain objects, and how many they are if written out."""
-        if id(data) in self._done:
-            return self._done[id(data)]
+        """The same in plain objects, and their number if nothing were shared."""
+        if id(data) in self._results:
+            return self._results[id(data)]
         if depth > DEEPEST:  # lists and dicts can be put into one another later, even in a circle
             raise SkillweaveError(f"its pickle nests objects more than {DEEPEST} deep")
         inner: list[Any] = []
@@ -121,8 +121,8 @@ class _Plain:
         size = 1 + sum(n for _, n in found)
         if size > MOST_STEPS:
             raise SkillweaveError(f"its pickle holds more than {MOST_STEPS:,} objects")
-        self._done[id(data)] = _rebuilt(data, [value for value, _ in found]), size
-        return self._done[id(data)]
+        self._results[id(data)] = _rebuilt(data, [value for value, _ in found]), size
+        return self._results[id(data)]
 
 
 def _rebuilt(data: Any, inner: list[Any]) -> Any:

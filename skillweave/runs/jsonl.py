@@ -1,4 +1,4 @@
-"""Files of JSON lines that a run appends to, and that a resumed run cuts back."""
+"""Files of JSON lines: a run appends to them, and a resumed run first shortens them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from skillweave.types import SkillweaveError
 
 
 class JsonLines:
-    """One such file; it is made when the first line comes.
+    """One file of JSON lines, created with the first line.
 
-    ``schema`` is what each line must fit when it is read (see ``reading.fit``); None: anything.
+    Each line that is read must fit ``schema`` (see ``reading.fit``); None: any object.
     """
 
     def __init__(self, path: Path, schema: Any = None) -> None:
@@ -26,11 +26,11 @@ class JsonLines:
 
     @property
     def size(self) -> int:
-        """Bytes in the file."""
+        """The size of the file in bytes."""
         return self.path.stat().st_size if self.path.exists() else 0
 
     def append(self, records: Iterable[Mapping[str, Any]]) -> None:
-        """Write a line for each record.
+        """Append one line per record.
 
         Raises:
             SkillweaveError: the disk is full or cannot be written.
@@ -42,14 +42,14 @@ class JsonLines:
             self._file.write(text)
             self._file.flush()
         except OSError as error:
-            self.close()  # what could not be written must not be tried again
+            self.close()  # what could not be written must not be written later
             raise SkillweaveError(
                 f"could not write {self.path}: {error.strerror}. The checkpoint is intact; free "
                 f"space, then: skillweave resume {self.path.parent}"
             ) from error
 
     def rewind(self, size: int | None) -> None:
-        """Drop what was written after ``size`` bytes: training is about to write it again.
+        """Remove all after ``size`` bytes: training will write it again.
 
         Raises:
             SkillweaveError: the disk cannot be written.
@@ -62,10 +62,10 @@ class JsonLines:
             raise SkillweaveError(f"could not write {self.path}: {error.strerror}") from error
 
     def read(self) -> Iterator[dict[str, Any]]:
-        """The records; a half-written last line is left out.
+        """The records, without a last line that is incomplete.
 
         Raises:
-            SkillweaveError: a line is damaged, or this is no plain file.
+            SkillweaveError: a line is damaged, or the path is not a plain file.
         """
         if not self.path.exists():
             return

@@ -1,6 +1,6 @@
 import pytest
 
-from skillweave.runs.lines import JsonLines
+from skillweave.runs.jsonl import JsonLines
 from skillweave.types import SkillweaveError
 
 

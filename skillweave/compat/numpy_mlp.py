@@ -1,4 +1,4 @@
-"""A member's MLP in NumPy: for one observation torch's overhead is most of the time."""
+"""The MLP of one member in NumPy: for one observation, torch's overhead is most of the cost."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 
 
 class NumpyMLP:
-    """Copies of the layers under a prefix in views of P = 1."""
+    """An MLP made of copies of the layers whose names begin with ``prefix``; views of P = 1."""
 
     def __init__(self, views: Views, prefix: str, network: Network) -> None:
         def copy(name: str) -> Array | None:
@@ -35,7 +35,7 @@ class NumpyMLP:
 
     @staticmethod
     def fits(network: Network) -> bool:
-        """Whether the network's nonlinearity is known here."""
+        """Whether its activation is one of those that are written here."""
         return network.activation in _ACTIVATIONS
 
     def __call__(self, x: Array) -> Array:

@@ -1,6 +1,6 @@
-"""Acting on a few observations: for one of them, torch's overhead is most of the time.
+"""Networks that act on few observations at a time, where torch's overhead is most of the cost.
 
-MLPs are copied into NumPy; every other network acts in torch, by the same interface.
+MLPs are copied into NumPy. Every other network acts in torch, by the same interface.
 """
 
 from __future__ import annotations
@@ -11,15 +11,18 @@ import numpy as np
 import torch
 
 from skillweave.algorithms.base import ActingParams, Algorithm
+from skillweave.compat.numpy_mlp import NumpyMLP
 from skillweave.networks.net import Net
-from skillweave.networks.numpy_mlp import NumpyMLP
 from skillweave.types import Array
 
 Sampled = tuple[Array, Array, Array, Array]
 
 
-class Quick:
-    """What the first member of a state says now; made anew after learning. Not for memories."""
+class NumpyActor:
+    """The networks of a state's first member, as they are now: make a new one after learning.
+
+    Not for networks with memory.
+    """
 
     def __init__(self, algorithm: Algorithm, state: Any) -> None:
         self.algorithm, self.state = algorithm, state
@@ -37,11 +40,11 @@ class Quick:
             self._nets = {}
 
     def rows(self, obs: Any) -> Array:
-        """One observation or a batch as (B, *shape) of the space's type."""
+        """One observation or a batch as (B, *shape), with the dtype of the space."""
         return np.asarray(obs, self._space.dtype).reshape(-1, *self._space.shape)
 
     def output(self, rows: Array, field: str = "network") -> Array:
-        """What a network's head says, (B, out); ``field`` is the setting that shapes it."""
+        """The output of a network's head, (B, out); ``field`` is its field of the config."""
         if field in self._nets:
             return self._nets[field](self._vectors(rows) if self._one_hot else rows)
         with torch.inference_mode():
@@ -56,8 +59,8 @@ class Quick:
         return found
 
 
-class QuickPPO(Quick):
-    """PPO's actor and critic."""
+class NumpyPPOActor(NumpyActor):
+    """The actor and the critic of PPO."""
 
     def __init__(self, algorithm: Any, state: Any) -> None:
         super().__init__(algorithm, state)
@@ -83,7 +86,7 @@ class QuickPPO(Quick):
         return action, log_p[np.arange(len(rows)), action], entropy, value
 
     def _drawn(self, head: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-        """The same for all other actions, in torch."""
+        """Actions, log-probabilities and entropies in torch, for all other action spaces."""
         outputs, heads = torch.from_numpy(head), self.algorithm.head
         log_std = None if self._log_std is None else self._log_std[0]
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))

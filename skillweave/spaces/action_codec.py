@@ -1,4 +1,4 @@
-"""Actions: from what a policy head emits to what the environment takes, and back."""
+"""Converts actions from a policy's units to the environment's, and back."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ ACTIONS = "Discrete, MultiDiscrete, MultiBinary, Box (of floats)"
 
 @dataclass(frozen=True)
 class ActionCodec:
-    """Actions of one space.
+    """Converts actions of one space.
 
-    In policy units choices count from 0: (n,) int64, or (n, K) where ``multi``; a Box is (n, A),
-    and each dimension with two bounds spans [−1, 1].
+    In policy units, discrete actions count from 0: (n,) int64, or (n, K) if ``multi``. Those of a
+    Box are (n, A) float32, where each dimension with two bounds spans [−1, 1].
     """
 
     space: gym.Space[Any]
-    parts: tuple[int, ...]  # number of choices of each part; () for a Box
-    low: Array | None = None  # (A,) of a Box; the first choices, where they are not all 0
+    parts: tuple[int, ...]  # number of values of each part; () for a Box
+    low: Array | None = None  # (A,) of a Box; the first values, if they are not all 0
     high: Array | None = None  # (A,) of a Box
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are choices."""
+        """Whether actions are discrete."""
         return bool(self.parts)
 
     @property
     def multi(self) -> bool:
-        """Whether an action is several choices at once."""
+        """Whether an action has several discrete parts."""
         return isinstance(self.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
 
     @cached_property
@@ -51,14 +51,14 @@ class ActionCodec:
             return self._shaped(action) if self.multi else action
         assert self.low is not None
         low, span, bounded = self._span
-        # A network that has diverged stands still until somebody notices.
+        # A diverged network gives NaN; it acts by 0 until training reports it.
         action = np.nan_to_num(action)
         scaled = action.astype(np.result_type(action, low))
         scaled[:, bounded] = low[bounded] + 0.5 * (action[:, bounded] + 1.0) * span[bounded]
         return self._shaped(scaled.astype(self.space.dtype).clip(self.low, self.high))
 
     def from_env(self, action: Array) -> Array:
-        """The inverse of ``to_env``; what a Box does not hold is clipped."""
+        """The inverse of ``to_env``; actions outside a Box are clipped."""
         if self.parts:
             units = np.asarray(action, np.int64)
             units = units.reshape(len(units), -1) if self.multi else units
@@ -66,7 +66,7 @@ class ActionCodec:
         assert self.low is not None
         low, span, bounded = self._span
         units = action.reshape(len(action), -1).clip(self.low, self.high)
-        width = np.where(span[bounded] == 0.0, 1.0, span[bounded])  # one value: any unit is it
+        width = np.where(span[bounded] == 0.0, 1.0, span[bounded])  # low == high: any unit
         units[:, bounded] = (units[:, bounded] - low[bounded]) / width * 2.0 - 1.0
         return units.astype(np.float32)
 
@@ -76,10 +76,10 @@ class ActionCodec:
 
     @cached_property
     def _span(self) -> tuple[Array, Array, Array]:
-        """Of a Box: low, width, and which dimensions have one that is finite; (A,) each."""
+        """Lower bound, width, and whether the width is finite, of a Box; (A,) each."""
         assert self.low is not None
         assert self.high is not None
-        with np.errstate(over="ignore"):  # bounds as wide as their type bound nothing
+        with np.errstate(over="ignore"):  # bounds at the limits of the dtype overflow: unbounded
             span = self.high - self.low
         return self.low, span, np.isfinite(span)
 
@@ -105,7 +105,7 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
 
 
 def _width(space: gym.Space[Any]) -> int:
-    """Numbers that a policy's head has for a space."""
+    """The number of outputs of a policy's head for a space."""
     if isinstance(space, gym.spaces.Discrete):
         return int(space.n)
     if isinstance(space, gym.spaces.MultiDiscrete):
@@ -114,6 +114,6 @@ def _width(space: gym.Space[Any]) -> int:
 
 
 def _first(start: Any) -> Array | None:
-    """The first choices as an offset, None where they are all 0."""
+    """The first values as an offset; None if all are 0."""
     first = np.asarray(start, np.int64)
     return (first.reshape(-1) if first.ndim else first) if first.any() else None

@@ -1,4 +1,4 @@
-"""A replay buffer for loops of one's own: transitions as they come, whatever came before."""
+"""A replay buffer for a training loop that the user writes."""
 
 from __future__ import annotations
 
@@ -8,55 +8,65 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from skillweave.buffers.replay import ReplayBuffer
-from skillweave.experience import Sample
-from skillweave.types import Array, VecStep
+from skillweave.buffers.replay import ReplayStore
+from skillweave.experience import Experience, Sample
+from skillweave.types import Array
 
 
-class Recorder:
-    """A ``ReplayBuffer`` of one member that is made when the first transitions come.
+class TransitionBuffer:
+    """A ``ReplayStore`` of one member, made when the first transitions are added.
 
-    Where observations do not follow from those before, the episodes in between were cut short.
+    Where an observation is not the successor of the one before, the episode counts as cut there.
     """
 
     def __init__(self, capacity: int, seed: int, gamma: float = 1.0, **how: Any) -> None:
         self._capacity, self._gamma, self._how = capacity, torch.tensor([gamma]), how
         self._rngs, self._after = [np.random.default_rng(seed)], np.empty(0)
-        self._buffer: ReplayBuffer | None = None
+        self._buffer: ReplayStore | None = None
 
     def __len__(self) -> int:
         return len(self._buffer) if self._buffer else 0
 
     def add(self, obs: Any, action: Any, reward: Any, next_obs: Any, terminated: Any) -> None:
-        """Append one transition of each of N environments; arguments have N rows."""
-        before, done, reward, after, ended = (
+        """Append one transition of each of N environments; each argument has N rows."""
+        before, action, reward, after, ended = (
             np.asarray(x) for x in (obs, action, reward, next_obs, terminated)
         )
         if self._buffer is None:
-            self._buffer = self._made(before, done)
+            self._buffer = self._made(before, action)
         elif not np.array_equal(before, self._after):
             self._buffer.cut(np.arange(len(before)))
-        nothing, ones = np.zeros(len(before), bool), np.ones(len(before), np.int64)
-        step = VecStep(after, after, reward, ended.astype(bool), nothing, ones, None, {})
-        self._buffer.add(before, None, done, step)
+        never, once = np.zeros((1, len(before)), bool), np.ones((1, len(before)), np.int64)
+        reward = reward.astype(np.float32)
+        self._buffer.add(
+            Experience(
+                before[None],
+                action[None],
+                reward[None],
+                once,
+                ended.astype(bool)[None],
+                never,
+                after[None],
+            )  # fmt: skip
+        )
         self._after = after
 
     def sample(self, batch: int, beta: float = 1.0) -> Sample:
-        """B transitions at random; see ``ReplayBuffer.sample``."""
+        """B transitions at random; see ``ReplayStore.sample``."""
         assert self._buffer, "sample() before add()"
         return self._buffer.sample(batch, self._gamma, self._rngs, min(1.0, beta))
 
     def at(self, index: Array) -> Sample:
-        """The transitions (B,) that the sample of a recorder of the same steps calls ``index``."""
+        """The transitions (B,) at ``index`` of a sample from another buffer of equal steps."""
         assert self._buffer, "at() before add()"
         return self._buffer.at(np.asarray(index)[None], None, self._gamma)
 
     def update_priorities(self, index: Array, priority: Any) -> None:
-        """New priorities (B,) of what was sampled."""
+        """Set the priorities (B,) of sampled transitions."""
         assert self._buffer, "update_priorities() before add()"
         self._buffer.update_priorities(np.asarray(index)[None], torch.as_tensor(priority)[None])
 
-    def _made(self, obs: Array, action: Array) -> ReplayBuffer:
+    def _made(self, obs: Array, action: Array) -> ReplayStore:
         whole = obs.dtype.kind in "iu"
         low, high = (
             (np.iinfo(obs.dtype).min, np.iinfo(obs.dtype).max) if whole else (-np.inf, np.inf)
@@ -64,4 +74,4 @@ class Recorder:
         kind: Any = obs.dtype if whole else np.float32
         space: gym.Space[Any] = gym.spaces.Box(low, high, obs.shape[1:], kind)
         shape, n = action.shape[1:], len(obs)
-        return ReplayBuffer(self._capacity, n, 1, space, shape, action.dtype, **self._how)
+        return ReplayStore(self._capacity, n, 1, space, shape, action.dtype, **self._how)

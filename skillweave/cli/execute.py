@@ -1,4 +1,4 @@
-"""What each command does."""
+"""Carries out each command of the command line."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from skillweave import recipes
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
-from skillweave.hierarchy.settings import apply_settings, list_settings
+from skillweave.cli.overrides import apply_overrides, list_settings
+from skillweave.compat.agilerl_files import convert
 from skillweave.hierarchy.weights import open_weights
 from skillweave.reporting.plots import plot_run
-from skillweave.runs.agilerl import convert
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.types import SkillweaveError
@@ -48,7 +48,7 @@ def _train(command: commands.Train) -> None:
     if command.evaluate < 0:
         raise SkillweaveError(f"evaluate is {command.evaluate}; it must be at least 0")
     hierarchy = recipes.load(command.recipe)
-    apply_settings(hierarchy, command.set)
+    apply_overrides(hierarchy, command.set)
     hierarchy.scale(command.scale)
     evolve = parse_evolve(command.evolve, hierarchy, command.flat)
     name = Path(command.recipe).stem + ("-flat" if command.flat else "")

@@ -12,7 +12,7 @@ from skills.foreign_models import WEIGHT, linear, onnx_file, poisoned, sb3_zip
 
 from skillweave import from_function, from_onnx, from_sb3, from_torch
 from skillweave.skills import Skill, ready_policy
-from skillweave.skills.foreign import Foreign, as_recorded, fitted, source_of
+from skillweave.skills.foreign_policy import Foreign, as_recorded, fitted, source_of
 from skillweave.types import MissingExtra, SkillweaveError
 
 OBS, ACTION = gym.make("CartPole-v1").observation_space, Discrete(2)
@@ -305,7 +305,7 @@ def test_sources_say_where_policies_come_from(zip_file, tmp_path):
     file = onnx_file(tmp_path / "x.onnx")
     found = [source_of(p) for p in (from_function(lean), from_torch(linear()), from_onnx(file))]
     assert [s["kind"] for s in found] == ["function", "torch", "onnx"]
-    assert found[0]["name"].endswith("test_foreign.lean")
+    assert found[0]["name"].endswith("test_foreign_policy.lean")
     assert found[1]["name"] == "torch.nn.modules.linear.Linear"
     assert found[2]["file"] == str(file)
     zipped = source_of(from_sb3(zip_file, "ppo", trust=True))

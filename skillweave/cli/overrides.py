@@ -1,4 +1,4 @@
-"""Settings by dotted name: ``selector.gamma=0.99``, ``skills.center.steps=1e6``."""
+"""``--set``: settings by dotted name, as ``selector.gamma=0.99``, ``skills.center.steps=1e6``."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ PLAIN = tuple(
 CONFIGS = ("algorithm", "selector", "flat")
 
 
-def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
-    """Change a declaration in place by ``name=value`` strings; their order does not matter.
+def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
+    """Change a declaration in place by ``name=value`` strings, in any order.
 
-    The name of an agent alone takes an algorithm: ``selector=DQN``, ``skills.center=SAC``.
+    The name of an agent alone sets its algorithm: ``selector=DQN``, ``skills.center=SAC``.
 
     Raises:
         SkillweaveError: no such setting (with close matches), or a value out of range.
     """
     configs: dict[tuple[str, ...], dict[str, str]] = {}
     kinds: dict[tuple[str, ...], str] = {}
-    for setting in settings:
+    for setting in overrides:
         name, sign, text = (part.strip() for part in setting.partition("="))
         if not sign:
             raise SkillweaveError(f"--set {setting!r}: write name=value, for example call_steps=20")
@@ -67,7 +67,7 @@ def apply_settings(declaration: Declaration, settings: Sequence[str]) -> None:
 
 
 def list_settings(declaration: Declaration) -> dict[str, Any]:
-    """Every setting's dotted name and value."""
+    """The dotted name and the value of every setting."""
     found: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
     for skill in declaration.skills:
         if skill.policy is None:
@@ -78,7 +78,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
 
 
 def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
-    """``config`` with the fields at these paths parsed from (full name, text)."""
+    """``config`` with the fields at these paths set to values parsed from (full name, text)."""
     known, hints = [f.name for f in fields(config)], typing.get_type_hints(type(config))
     values: dict[str, Any] = {}
     deeper: dict[str, dict[tuple[str, ...], tuple[str, str]]] = {}
@@ -93,7 +93,7 @@ def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> An
     for field, inner_changes in deeper.items():
         inner = values.get(field, getattr(config, field))
         if inner is None and field == "critic":
-            inner = values.get("network", getattr(config, "network", None))  # what it stands for
+            inner = values.get("network", getattr(config, "network", None))  # its default
         if inner is None:
             parts: list[Any] = [t for t in typing.get_args(hints[field]) if is_dataclass(t)]
             inner = parts[0]() if parts else None

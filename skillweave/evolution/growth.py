@@ -1,4 +1,4 @@
-"""Networks that grow and shrink: units and layers added to, or taken from, named parameters.
+"""Networks that grow and shrink: units and layers are added to named parameters, or removed.
 
 Growth leaves the function as it was (Net2Net, Chen et al. 2016, in the form of zero outgoing
 weights): new units are read with weight zero, a new layer computes the identity.

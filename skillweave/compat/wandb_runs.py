@@ -1,0 +1,42 @@
+"""Weights & Biases for training loops that do not write a run directory."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+from skillweave.runs.trackers import wandb_mode
+from skillweave.types import MissingExtra
+
+_messages: list[str] = []
+"""What has not been printed yet."""
+
+
+def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None = None) -> Any:
+    """A new Weights & Biases run, for a training loop of the user; offline without login or key.
+
+    Raises:
+        MissingExtra: wandb is not installed.
+    """
+    try:
+        import wandb
+    except ImportError as error:
+        raise MissingExtra("tracking with wandb", "wandb") from error
+    stay_offline()
+    if key is not None:
+        wandb.login(key=key)
+    mode: Any = None if key is None else "online"
+    return wandb.init(project=project, name=name, config=config, mode=mode)
+
+
+def stay_offline() -> None:
+    """Without a login, set wandb to offline, so that it does not ask for one.
+
+    A line on stderr says so, once, when wandb is imported.
+    """
+    if "WANDB_MODE" not in os.environ and wandb_mode() == "offline":
+        os.environ["WANDB_MODE"] = "offline"
+        _messages.append("no login to Weights & Biases, so its runs stay offline")
+    if "wandb" in sys.modules and _messages:
+        print(f"skillweave: {_messages.pop()}", file=sys.stderr)
