@@ -47,7 +47,7 @@ class TransitionBuffer:
                 ended.astype(bool)[None],
                 never,
                 after[None],
-            )  # fmt: skip
+            )
         )
         self._after = after
 
