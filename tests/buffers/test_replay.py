@@ -226,7 +226,7 @@ class World:
         return {
             "obs": first.obs, "obs_mask": first.obs_mask, "action": first.action,
             "reward": reward, "discount": discount, "next_obs": kept.next_obs,
-            "mask": kept.allowed, "between_discount": counts,
+            "next_obs_mask": kept.allowed, "between_discount": counts,
             "between_obs": between["obs"], "between_mask": between["mask"],
         }  # fmt: skip
 
