@@ -131,18 +131,13 @@ def padded() -> float:
     algorithm, state = join(stacked, SPACES)
     for update in range(10):
         seeds = [Seeds(update) / m.number for m in stacked]
-        algorithm.update(state, rollout(MEMBERS, 64), 0.0, seeds)
+        algorithm.update(state, rollout(MEMBERS, 64), [s.torch() for s in seeds])
         for member, seed in zip(alone, seeds, strict=True):
-            data = rollout(MEMBERS, 64)
-            own = {
-                f.name: None if (v := getattr(data.transition, f.name)) is None
-                else v[member.number : member.number + 1]
-                for f in fields(data.transition)
-            }  # fmt: skip
-            part = slice(member.number, member.number + 1)
+            data, part = rollout(MEMBERS, 64), slice(member.number, member.number + 1)
+            values = {f.name: getattr(data, f.name) for f in fields(data)}
+            own = {k: v[part] for k, v in values.items() if isinstance(v, torch.Tensor)}
             single: Any = member.algorithm(SPACES)
-            piece = replace(data, transition=type(data.transition)(**own), head=data.head[part])
-            single.update(member.state, piece, 0.0, [seed])
+            single.update(member.state, replace(data, **own), [seed.torch()])
     split(algorithm, state, stacked, SPACES)
     return max(
         float((a.state.params - b.state.params).abs().max())
