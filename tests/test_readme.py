@@ -32,7 +32,7 @@ def test_the_readme_examples_run_as_they_stand(
     train_alone = Agent.train
 
     def train_alone_briefly(self: Agent, *args: Any, **kwargs: Any) -> Any:
-        self.steps = min(self.steps, 2_000)
+        self.steps = min(self.steps, 5_500)  # a little more than learning_starts
         return train_alone(self, *args, **kwargs | {"quiet": True})
 
     monkeypatch.setattr(Hierarchy, "train", train_briefly)
