@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import skillweave
-from skillweave import Hierarchy
+from skillweave import Agent, Hierarchy
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
@@ -32,7 +32,14 @@ def test_the_readme_examples_run_as_they_stand(
             kwargs["evolve"] = {k: replace(v, **small) for k, v in kwargs["evolve"].items()}
         return train(self, *args, **kwargs | {"quiet": True})
 
+    train_alone = Agent.train
+
+    def train_alone_briefly(self: Agent, *args: Any, **kwargs: Any) -> Any:
+        self.steps = min(self.steps, 5_500)  # a little more than learning_starts
+        return train_alone(self, *args, **kwargs | {"quiet": True})
+
     monkeypatch.setattr(Hierarchy, "train", train_briefly)
+    monkeypatch.setattr(Agent, "train", train_alone_briefly)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "readme"}
     exec(compile(code[0], "README.md", "exec"), names)
