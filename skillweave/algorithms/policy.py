@@ -147,12 +147,21 @@ def checked_tensor(
 
 
 def state_from(
-    tensors: Mapping[str, Tensor], like: S, where: str, groups: Sequence[ParameterGroup] = ()
+    tensors: Mapping[str, Tensor],
+    like: S,
+    where: str,
+    groups: Sequence[ParameterGroup] = (),
+    *,
+    may_diverge: bool = False,
 ) -> S:
     """The state that ``tensors`` hold by field, if it is of the shapes and types of ``like``.
 
+    Args:
+        groups: of the algorithm, where networks may have grown.
+        may_diverge: numbers need not be finite, as of a member that is to be replaced.
+
     Raises:
-        SkillweaveError: it is not; the tensor is named.
+        SkillweaveError: it is not, or holds a number that is not finite; the tensor is named.
     """
     shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
     for family in groups:  # after growth each parameter has an age of its own
@@ -162,6 +171,11 @@ def state_from(
         name: checked_tensor(tensors, name, shapes[name], value.dtype, where)
         for name, value in vars(like).items()
     }
+    for name, value in found.items():
+        if not may_diverge and value.is_floating_point() and not bool(value.isfinite().all()):
+            raise SkillweaveError(
+                f"{where}: tensor {name} holds NaN or infinity: the file was altered"
+            )
     return type(like)(**found)
 
 

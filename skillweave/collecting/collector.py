@@ -137,6 +137,8 @@ class Collector:
         self.open = {k: v.copy() for k, v in unprefixed("open", state).items()}
         if "obs" in self.open:  # files hold it as bytes where it is structured
             self.open["obs"] = self.open["obs"].view(self.obs.dtype).reshape(self.obs.shape)
+        if any(len(v) != self.num_envs for v in self.open.values()):
+            raise ValueError("what is kept of open calls is of another number of environments")
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         return self._begin_anew(np.union1d(early, other))
 

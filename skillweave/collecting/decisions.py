@@ -121,7 +121,8 @@ class DecisionCollector(Collector):
             kept["memory"][rows] = acted.memory
         for name, value in (("obs", here), ("head", acted.head)):
             if value is not None:
-                if name not in self.open:
+                held = self.open.get(name)
+                if held is None or held.shape[1:] != value.shape[1:]:
                     self.open[name] = np.zeros((self.num_envs, *value.shape[1:]), value.dtype)
                 self.open[name][rows] = value
         self.skills.begin(self._calls, rows, choice)

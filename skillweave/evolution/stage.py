@@ -235,7 +235,9 @@ class EvolvingPopulation:
                 unprefixed(str(i), tensors),
             )
             fresh, where = algorithm.init([self.seeds]), f"{self.run.path}: member {i}"
-            member.state = state_from(own, fresh, where, algorithm.parameter_groups())
+            member.state = state_from(
+                own, fresh, where, algorithm.parameter_groups(), may_diverge=True
+            )
             members.append(member)
         self.population = Population(members, self.evolution, self.stage.scene, self.seeds)
         self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]

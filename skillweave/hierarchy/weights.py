@@ -17,6 +17,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.reading import Positive, fit, shown
+from skillweave.messages import short
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
@@ -91,7 +92,7 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             )
         return tensors, header
     if header.get("kind") != "hierarchy":
-        raise SkillweaveError(f"{path} holds a {header.get('kind')}, not a hierarchy")
+        raise SkillweaveError(f"{path} holds a {short(header.get('kind'))}, not a hierarchy")
     fit(HierarchyHeader, header, str(path))
     return tensors, header
 
@@ -105,7 +106,7 @@ def read_agent(
         SkillweaveError: the file is damaged, or belongs to another environment.
     """
     if header["kind"] != "agent":
-        raise SkillweaveError(f"{path} holds a {header['kind']}, not a plain agent")
+        raise SkillweaveError(f"{path} holds a {short(header['kind'])}, not a plain agent")
     if (env := header.get("env", spec.name)) != spec.name:
         raise SkillweaveError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
     return AgentPolicy.from_file(tensors, header, str(path))

@@ -37,6 +37,8 @@ class Episodes:
     def load(self, state: dict[str, Array]) -> None:
         """The inverse of ``state``."""
         for name, window in vars(self).items():
+            if state[name].ndim != 1 or not np.isfinite(state[name]).all():
+                raise ValueError(f"{name} of the latest episodes are no row of numbers")
             window.clear()
             window.extend(state[name].tolist())
 

@@ -113,7 +113,7 @@ def resumed(log: StageLog, restore: Callable[[], T]) -> T:
     """
     try:
         return restore()
-    except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
+    except (KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise SkillweaveError(
             f"{log.run.path}: the checkpoint of stage {log.entry['name']!r} does not hold "
             f"episodes of these environments: {error!r}"

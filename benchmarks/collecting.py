@@ -1,0 +1,184 @@
+"""How fast experience is collected: in one process and in several, and with calls of any length.
+
+    python -m benchmarks.collecting [workers] [calls] [--rounds 3] [--steps 40000]
+
+``workers``: PPO on MiniGrid's DoorKey-8x8 in Python, by two workers, by one, by Stable-Baselines3
+with ``SubprocVecEnv`` (the same network, rollouts and epochs), and the same number of environments
+stepped alone in two processes. ``calls``: a selector on EnvPool's LunarLander whose calls last 1 to
+64 steps at random, against the same selector with all calls of 32. Ratios are of steps per second
+by the clock, within a round; the median round counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from benchmarks.common import machine
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, train_agent
+from skillweave.types import Array, Step
+
+GRID = "MiniGrid-DoorKey-8x8-v0"
+ENVS, ROWS, EPOCHS, BATCH = 16, 256, 4, 512
+NETWORK = Network((64, 64), "tanh")
+
+
+class Flat(gym.ObservationWrapper[Any, Any, Any]):
+    """MiniGrid's picture of 7 × 7 cells as numbers in a row."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.observation_space = gym.spaces.Box(0.0, 10.0, (147,), np.float32)
+
+    def observation(self, observation: Any) -> Any:
+        return observation["image"].reshape(-1).astype(np.float32)
+
+
+def grid(render_mode: str | None = None) -> gym.Env[Any, Any]:
+    import minigrid  # registers the environments
+
+    assert minigrid
+    return Flat(gym.make(GRID, render_mode=render_mode))
+
+
+def ours(workers: int, steps: int) -> float:
+    config = PPO(
+        num_envs=ENVS, n_steps=ROWS, batch_size=BATCH, update_epochs=EPOCHS, network=NETWORK,
+        normalize_obs=False,
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        spec = EnvSpec(grid, engine="sync", workers=workers)
+        run = train_agent(spec, config, steps, Path(folder) / "run", quiet=True)
+        return float(run.info()["stages"][0]["steps_per_second"])
+
+
+def stable_baselines(steps: int) -> float:
+    import torch
+    from stable_baselines3 import PPO as Theirs
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    torch.set_num_threads(1)
+    env = make_vec_env(grid, ENVS, vec_env_cls=SubprocVecEnv)
+    model = Theirs(
+        "MlpPolicy", env, n_steps=ROWS, batch_size=BATCH, n_epochs=EPOCHS, device="cpu",
+        policy_kwargs={"net_arch": [64, 64]},
+    )  # fmt: skip
+    began = time.perf_counter()
+    model.learn(steps)
+    found = model.num_timesteps / (time.perf_counter() - began)
+    env.close()
+    return found
+
+
+def _step_alone(steps: int, ready: Any) -> None:
+    envs = [grid() for _ in range(ENVS // 2)]
+    for i, env in enumerate(envs):
+        env.reset(seed=i)
+    actions = np.random.default_rng(0).integers(7, size=(steps // ENVS, len(envs)))
+    ready.wait()
+    for row in actions:
+        for env, action in zip(envs, row, strict=True):
+            _, _, terminated, truncated, _ = env.step(int(action))
+            if terminated or truncated:
+                env.reset()
+
+
+def alone(steps: int) -> float:
+    """The environments of two workers, stepped by two processes that do nothing else."""
+    context = multiprocessing.get_context("fork")
+    ready = context.Barrier(3)
+    processes = [context.Process(target=_step_alone, args=(steps, ready)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    ready.wait()
+    began = time.perf_counter()
+    for process in processes:
+        process.join()
+    return steps / (time.perf_counter() - began)
+
+
+class Glide(Skill):
+    """Any reward will do; calls end at random, where ``ends`` is set."""
+
+    ends = True
+
+    def reward(self, step: Step) -> Array:
+        return step.reward
+
+    def termination(self, step: Step) -> Array:
+        if not self.ends:
+            return np.zeros(len(step.reward), bool)
+        # As if the length were drawn evenly from 1 to 64 when the call begins: what is left of 64
+        # steps ends now with this chance. A function of the state, so that it can be repeated.
+        chance = 1.0 / np.maximum(1, 65 - step.elapsed)
+        digits = np.abs(step.next_obs[:, :6].astype(np.float64)).sum(1) * 1e4
+        return digits % 1.0 < chance
+
+
+def calls(random_lengths: bool, steps: int) -> float:
+    skills = [type(name, (Glide,), {"ends": random_lengths})() for name in ("One", "Two", "Three")]
+    small = PPO(num_envs=64, n_steps=64, network=Network((64, 64), "tanh"))
+    hierarchy = Hierarchy(
+        "LunarLander-v3", skills, call_steps=64 if random_lengths else 32, algorithm=small,
+        selector=PPO(num_envs=256, n_steps=256, network=NETWORK), skill_steps=5_000,
+        selector_steps=steps,
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        run = hierarchy.train(Path(folder) / "run", quiet=True)
+        return float(run.info()["stages"][-1]["steps_per_second"])
+
+
+def compared(
+    measures: dict[str, Callable[[], float]], ratios: dict[str, tuple[str, str]], rounds: int
+) -> dict[str, Any]:
+    """Every measure once a round, and the median of ratios within rounds."""
+    found: list[dict[str, float]] = []
+    for _ in range(rounds):
+        found.append({name: measure() for name, measure in measures.items()})
+        print({k: round(v) for k, v in found[-1].items()}, flush=True)
+    speeds = {k: statistics.median(f[k] for f in found) for k in measures}
+    return {"steps per second": {k: round(v) for k, v in speeds.items()}} | {
+        name: round(statistics.median(f[a] / f[b] for f in found), 3)
+        for name, (a, b) in ratios.items()
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("which", nargs="*", default=["workers", "calls"])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=40_960)
+    given = parser.parse_args()
+    steps, summary = given.steps, {}
+    if "workers" in given.which:
+        measures = {
+            "two workers": lambda: ours(2, steps),
+            "one": lambda: ours(1, steps),
+            "Stable-Baselines3": lambda: stable_baselines(steps),
+            "environments alone": lambda: alone(steps),
+        }
+        ratios = {f"two workers / {k}": ("two workers", k) for k in list(measures)[1:]}
+        summary |= compared(measures, ratios, given.rounds)
+    if "calls" in given.which:
+        lengths = {
+            "1 to 64": lambda: calls(True, 10 * steps),
+            "32": lambda: calls(False, 10 * steps),
+        }
+        ratio = {"calls of 1 to 64 / calls of 32": ("1 to 64", "32")}
+        summary |= {"calls": compared(lengths, ratio, given.rounds)}
+    print(json.dumps({"machine": machine()} | summary))
+
+
+if __name__ == "__main__":
+    main()
