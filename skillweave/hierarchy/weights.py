@@ -16,8 +16,8 @@ from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.reading import Positive, fit, shown
 from skillweave.messages import short
+from skillweave.reading import Positive, fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
