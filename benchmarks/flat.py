@@ -10,37 +10,31 @@ from __future__ import annotations
 
 import argparse
 
-from skillweave.envs.skill_env import SkillEnv
-from skillweave.training.collector import Collector
-from skillweave.training.on_policy import Tick, train_on_policy
-
+from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table, warm_up
 from skillweave import recipes
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.envs.make import make_engine
+from skillweave.algorithms.policy import AgentPolicy
 from skillweave.seeding import Seeds
+from skillweave.training.episodes import Tick
 from skillweave.training.evaluation import evaluate
+from skillweave.training.learner import Stack
 
 
 def learn(seed: int, steps: int, every: float) -> dict[str, object]:
     hierarchy = recipes.load("lunar-lander")
     config = hierarchy.flat or hierarchy.algorithm
-    env = SkillEnv(make_engine(hierarchy.spec, config.num_envs))
-    algorithm = make_algorithm(config, env.observation_space, env.action_space)
-    seeds = Seeds(seed) / "flat"
-    state = algorithm.init([seeds / "member" / 0])
     copies: list[tuple[float, int, AgentPolicy]] = []
 
-    def on_tick(tick: Tick) -> None:
-        if tick.seconds >= every * (len(copies) + 1):
-            copies.append((tick.seconds, tick.steps, AgentPolicy.of(algorithm, tick.state)))
-
     last: list[Tick] = []
-    cut = hierarchy.cut_every
-    train_on_policy(
-        algorithm, Collector(env), state, seeds, steps, cut_every=cut,
-        on_tick=lambda t: (on_tick(t), last.append(t)),
-    )  # fmt: skip
+
+    def on_tick(tick: Tick, stack: Stack) -> None:
+        last[:] = [tick]
+        if tick.seconds >= every * (len(copies) + 1):
+            policy = AgentPolicy.of(stack.algorithm, stack.state)
+            copies.append((tick.seconds, tick.steps, policy))
+
+    seeds = Seeds(seed) / "flat"
+    stack = train_bare(hierarchy.spec, config, seeds, steps, on_tick, hierarchy.cut_every)
     seconds = last[-1].seconds
     scores = []
     reached = None
@@ -50,7 +44,7 @@ def learn(seed: int, steps: int, every: float) -> dict[str, object]:
         if score.mean >= 200:
             reached = at
             break
-    final = evaluate(AgentPolicy.of(algorithm, state), hierarchy.spec, episodes=100)
+    final = evaluate(AgentPolicy.of(stack.algorithm, stack.state), hierarchy.spec, episodes=100)
     return {
         "seed": seed,
         "seconds_to_200": reached,

@@ -16,14 +16,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from skillweave.envs.skill_env import SkillEnv
-from skillweave.training.collector import Collector
-from skillweave.training.off_policy import train_off_policy
 
+from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table
 from skillweave import DQN, SAC, TD3, EnvSpec, Network
-from skillweave.algorithms.policy import make_algorithm
-from skillweave.envs.make import make_engine
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 
@@ -53,14 +49,9 @@ def ours(name: str, size: str, steps: int, seed: int, *, compile: bool) -> float
         compile=compile, **extra,
     )  # fmt: skip
     # The same engine as theirs.
-    env = SkillEnv(make_engine(EnvSpec(ENVS[name], engine="sync"), ENVIRONMENTS))
-    algorithm: Any = make_algorithm(config, env.observation_space, env.action_space)
-    seeds = Seeds(seed)
     ticks: list[Tick] = []
-    train_off_policy(
-        algorithm, Collector(env), algorithm.init([seeds / "member" / 0]), seeds, steps + 1000,
-        on_tick=ticks.append, cut_every=10**9,
-    )  # fmt: skip
+    spec = EnvSpec(ENVS[name], engine="sync")
+    train_bare(spec, config, Seeds(seed), steps + 1000, lambda tick, stack: ticks.append(tick))
     first, last = ticks[0], ticks[-1]
     return (last.steps - first.steps) / (last.seconds - first.seconds)
 

@@ -24,17 +24,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from skillweave.envs.skill_env import SkillEnv
 
 from benchmarks.common import median, report, run_command, table, warm_up
 from benchmarks.updates import rollout, seconds
 from skillweave import PPO, EnvSpec, Evolution, Network
-from skillweave.envs.make import make_engine
 from skillweave.evolution.architecture import Change, rebuilt
 from skillweave.evolution.population import Population
 from skillweave.evolution.stacks import Member, join, split
 from skillweave.seeding import Seeds
-from skillweave.types import VecEnv
+from skillweave.training.scene import skill_scene
 
 LANDER = EnvSpec("LunarLander-v3")
 SPACES = LANDER.make().observation_space, LANDER.make().action_space
@@ -42,13 +40,9 @@ MEMBERS, ENVS = 8, 16
 AGILERL = Path(__file__).with_name("agilerl_population.py")
 
 
-def make_env(num_envs: int, gamma: Any) -> VecEnv:
-    return SkillEnv(make_engine(LANDER, num_envs))
-
-
 def speed(members: int, config: PPO, steps: int, seed: int) -> float:
     """Steps/s of a population's training, all members' steps counted."""
-    population = Population.fresh(config, Evolution(), make_env, SPACES, Seeds(seed))
+    population = Population.fresh(config, Evolution(), skill_scene(LANDER), Seeds(seed))
     population.members = population.members[:members]
     started = time.perf_counter()
     population.train(steps // members, steps // members, Seeds(seed), lambda steps, tick: None)

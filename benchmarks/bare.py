@@ -1,0 +1,41 @@
+"""One agent trained by the library's loop alone: no run directory, no command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from skillweave import EnvSpec
+from skillweave.algorithms.registry import make_algorithm
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.group import Collectors
+from skillweave.seeding import Seeds
+from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.learner import Stack, learner_of
+from skillweave.training.loop import train
+from skillweave.training.scene import skill_scene
+
+
+def train_bare(
+    spec: EnvSpec,
+    config: Any,
+    seeds: Seeds,
+    steps: int,
+    on_tick: Callable[[Tick, Stack], None],
+    cut_every: int = 10**9,
+) -> Stack:
+    """Train an agent; ``on_tick`` is told of every report."""
+    scene = skill_scene(spec)
+    algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+    stack = Stack(algorithm, algorithm.init([seeds / "member" / 0]))
+    learner = learner_of(stack, config.num_envs, seeds)
+    acting = Acting([(algorithm, 1)], config.num_envs)
+    collectors = Collectors([scene.collector(config.num_envs, acting)])
+    try:
+        train(
+            learner, collectors, Episodes(), seeds, steps, cut_every=cut_every,
+            on_tick=lambda tick: on_tick(tick, stack),
+        )  # fmt: skip
+    finally:
+        collectors.close()
+    return stack
