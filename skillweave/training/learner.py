@@ -103,7 +103,8 @@ class RolloutLearner:
     def take(self, experience: Experience, update: int, progress: float) -> None:
         """Keep a rollout, and the deviations it was collected with."""
         log_std = self._acted_by.views.get("actor.log_std")
-        self._log_std = None if log_std is None else log_std[:, None]
+        if log_std is not None:
+            self._log_std = log_std[:, None].to(self._stack.state.params.device)
         self._store.add(experience)
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
@@ -182,8 +183,10 @@ class ReplayLearner:
         for i, stack in enumerate(self.stacks):
             columns = self._columns(i, experience)
             rows = to_tensor(np.ascontiguousarray(experience.obs[:, columns]))
+            seen = _flat_valid(valid, columns, stack.members)
+            device = stack.state.params.device
             stack.algorithm.update_obs_stats(
-                stack.state, _flat(rows, stack.members), _flat_valid(valid, columns, stack.members)
+                stack.state, _flat(rows, stack.members).to(device), _on(seen, device)
             )
         if any(s.algorithm.scales_rewards for s in self.stacks):
             self._scale_returns(experience)
@@ -201,9 +204,12 @@ class ReplayLearner:
             self._returns = now if valid is None else np.where(valid, now, self._returns)
             for i, stack in enumerate(self.stacks):
                 columns = self._columns(i, experience)
+                device = stack.state.params.device
                 returns = torch.from_numpy(self._returns[columns]).view(stack.members, -1)
                 seen = None if valid is None else _flat_valid(valid[None], columns, stack.members)
-                stack.algorithm.update_return_stats(stack.state, returns, seen)
+                stack.algorithm.update_return_stats(
+                    stack.state, returns.to(device), _on(seen, device)
+                )
             self._returns[ended if valid is None else ended & valid] = 0.0
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
@@ -227,12 +233,11 @@ class ReplayLearner:
         seeds = member_seeds(self._seeds, "learn", stack.members, update, first)
         rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
         # Several draws at once cost little more than one, but priorities change in between.
-        together = 1 if cfg.prioritized else TOGETHER
+        together, gamma = 1 if cfg.prioritized else TOGETHER, stack.state.gamma.cpu()
         for done in range(0, due, together):
             size = cfg.batch_size * min(together, due - done)
-            drawn = self.store.sample(size, stack.state.gamma, rngs, beta, first)
+            drawn = self.store.sample(size, gamma, rngs, beta, first, progress)
             for sample in drawn.split(cfg.batch_size):
-                sample.progress = progress
                 stack.state, report = stack.algorithm.update(stack.state, sample, generators)
                 metrics = report.metrics
                 if cfg.prioritized:
@@ -313,6 +318,10 @@ def _flat(rows: Tensor, members: int) -> Tensor:
     """(T, P·B, …) to (P, T·B, …)."""
     split: Tensor = rows.unflatten(1, (members, -1)).transpose(0, 1)
     return split.flatten(1, 2)
+
+
+def _on(tensor: Tensor | None, device: torch.device) -> Tensor | None:
+    return None if tensor is None else tensor.to(device)
 
 
 def _flat_valid(valid: Array | None, columns: slice, members: int) -> Tensor | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -137,8 +136,10 @@ class OneAgent:
         target, (stack,) = self.stage.target, self.learner.stacks
         made = self.collectors.steps_made
 
+        def policy() -> AgentPolicy:
+            return AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))
+
         def on_tick(tick: Tick) -> None:
-            policy = functools.partial(AgentPolicy.of, self.algorithm, stack.state)
             found = self.evaluation.due(tick.steps, policy)
             log.at["evaluation_steps"] += self.evaluation.spent()
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
@@ -160,7 +161,7 @@ class OneAgent:
             # What was collected since the update was made, too.
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
-        return AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))
+        return policy()
 
     def close(self) -> None:
         """Release the environments."""
