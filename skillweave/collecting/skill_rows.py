@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import Columns
+from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import allowed_rows, info_rows, random_actions
+from skillweave.envs.infos import info_rows
 from skillweave.experience import Experience
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, SkillweaveError, Step
@@ -34,14 +36,15 @@ class SkillCollector(Collector):
     """Environments seen through a skill: its reward, its ends; after each end a real reset.
 
     A skill's ``termination`` terminates the episode (nothing is worth anything after it), its
-    ``max_steps`` truncates it (its value goes on). Where the skill may not start, the environment
-    takes random actions until it may, while the others go on; these rows are not valid.
+    ``max_steps`` truncates it (its value goes on). Where the skill may not start, skills that can
+    act already are called until it may, while other environments go on; these rows are not valid.
 
     Args:
         engine: the environments.
         acting: the learners.
         skill: None for the task itself: the environment's own reward and ends.
         reflexes: in force while the skill acts.
+        starters: skills that can act already; None: random actions lead to where it may start.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class SkillCollector(Collector):
         acting: Acting | None,
         skill: Skill | None = None,
         reflexes: tuple[Reflex, ...] = (),
+        starters: SkillSet | None = None,
     ) -> None:
         super().__init__(engine, acting)
         self.skill, self.reflexes = skill, reflexes
@@ -60,11 +64,14 @@ class SkillCollector(Collector):
         if self._searches:
             self.kept["searching"] = np.zeros(n, bool)  # the skill may not start yet
             self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
-            self._found = False
+            self.kept["found"] = np.zeros(n, bool)  # it ever might
+            self._starters = Starters(starters, n, engine.action_space)
+            self.kept |= self._starters.kept
 
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
         """The same over other environments."""
-        return SkillCollector(engine, acting, self.skill, self.reflexes)
+        starters = self._starters.skills if self._searches else None
+        return SkillCollector(engine, acting, self.skill, self.reflexes, starters)
 
     def _collect(self, request: Request) -> Experience:
         self._prepare(request)
@@ -87,8 +94,10 @@ class SkillCollector(Collector):
         action = self.acting.to_env(acted.action)
         if self.reflexes:
             action = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
+        searching = np.zeros(0, np.int64) if playing is None else np.flatnonzero(~playing)
         if playing is not None:
-            action = self._search(action, ~playing, mask)
+            action = action.copy()
+            action[searching] = self._starters.act(searching, obs, mask, self._rng)
         raw = self.engine.step(action)
         self.kept["age"] += 1
         judged = self._judge(obs, action, raw, playing)
@@ -111,14 +120,18 @@ class SkillCollector(Collector):
             self._tell(told, success, task=self.skill is not None)
             self._begin_anew(ids)
         if playing is not None:
-            self._look(np.flatnonzero(~playing & ~over))
+            going_on = searching[~over[searching]]
+            self._starters.observe(going_on, obs, action, raw)
+            self._look(going_on)
 
     def _forget(self, ids: Array) -> None:
-        searched = self.kept["searched"][ids] if self._searches else None
+        counted = {k: self.kept[k][ids] for k in ("searched", "found") if self._searches}
         super()._forget(ids)
-        if searched is not None:
-            self.kept["searched"][ids] = searched  # it counts on from episode to episode
+        if self._searches:
+            for name, value in counted.items():  # they count on from episode to episode
+                self.kept[name][ids] = value
             self.kept["searching"][ids] = True
+            self._starters.stop(ids)
             self._look(ids)
 
     def _look(self, ids: Array) -> None:
@@ -130,21 +143,21 @@ class SkillCollector(Collector):
         found, waiting = ids[holds], ids[~holds]
         self.kept["searching"][found] = False
         self.kept["searched"][found] = 0
-        self._found |= len(found) > 0
+        self.kept["found"][found] = True
+        self._starters.stop(found)
         self.kept["searched"][waiting] += 1
-        if not self._found and self.kept["searched"].max() > PATIENCE:
+        if self.kept["searched"].max() > PATIENCE and not self.kept["found"].any():
             raise SkillweaveError(
-                f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps of "
-                "random acting, so there is nothing to train on; widen it, or give an environment "
-                "that starts where it holds"
+                f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps "
+                f"{self._sought()}, so there is nothing to train on; widen it, or give an "
+                "environment that starts where it holds"
             )
 
-    def _search(self, action: Array, searching: Array, mask: Array | None) -> Array:
-        """The actions, where environments are ``searching`` (N,) random ones."""
-        ids, action = np.flatnonzero(searching), action.copy()
-        allowed = allowed_rows(mask, ids)
-        action[ids] = random_actions(self.engine.action_space, len(ids), self._rng, allowed)
-        return action
+    def _sought(self) -> str:
+        """By whom a start was searched for."""
+        if self._starters.skills is None:
+            return "of random acting"
+        return f"of calling {', '.join(repr(s.name) for s in self._starters.skills.skills)}"
 
     def _judge(self, obs: Array, action: Array, raw: RawStep, playing: Array | None) -> Judged:
         """What a step was to the skill; anything where it did not play."""

@@ -179,10 +179,12 @@ class Declaration:
             eval_episodes=self.eval_episodes,
         )
 
-    def skill_set(self, policies: Sequence[Policy]) -> SkillSet:
-        """The skills with their policies, ready to be called."""
+    def skill_set(
+        self, policies: Sequence[Policy], skills: Sequence[Skill] | None = None
+    ) -> SkillSet:
+        """The skills (None: all) with their policies, ready to be called."""
         return SkillSet(
-            tuple(self.skills),
+            tuple(self.skills if skills is None else skills),
             tuple(policies),
             tuple(self.reflexes),
             self.call_steps,

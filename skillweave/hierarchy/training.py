@@ -53,8 +53,10 @@ def stages_of(declaration: Declaration) -> list[Stage]:
         config, budget = skill.algorithm or declaration.algorithm, declaration.budget(skill)
         target = check_target(skill)
 
-        def scene(_: Policies) -> Scene:
-            return skill_scene(declaration.spec, skill, reflexes)
+        def scene(policies: Policies) -> Scene:
+            others = [s for s in declaration.skills if s.name in policies]
+            starters = declaration.skill_set([policies[s.name] for s in others], others)
+            return skill_scene(declaration.spec, skill, reflexes, starters if others else None)
 
         return Stage(skill.name, "skill", config, budget, scene, target)
 

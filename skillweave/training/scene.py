@@ -51,16 +51,22 @@ class Scene:
 
 
 def skill_scene(
-    spec: EnvSpec, skill: Skill | None = None, reflexes: Sequence[Reflex] = ()
+    spec: EnvSpec,
+    skill: Skill | None = None,
+    reflexes: Sequence[Reflex] = (),
+    starters: SkillSet | None = None,
 ) -> Scene:
-    """The environments seen through a skill; None: as they are."""
+    """The environments seen through a skill; None: as they are.
+
+    Args:
+        starters: skills that can act already: they lead to where the skill may start.
+    """
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
-        return SkillCollector(
-            make_engine(spec, num_envs, first=first), acting, skill, tuple(reflexes)
-        )
+        engine = make_engine(spec, num_envs, first=first)
+        return SkillCollector(engine, acting, skill, tuple(reflexes), starters)
 
     return Scene(spec.name, *_spaces(spec), collector)
 
