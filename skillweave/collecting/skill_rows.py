@@ -60,7 +60,7 @@ class SkillCollector(Collector):
         if self._searches:
             self.kept["searching"] = np.zeros(n, bool)  # the skill may not start yet
             self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
-            self._found = False
+            self.kept["found"] = np.zeros(n, bool)  # it might, once
 
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
         """The same over other environments."""
@@ -114,25 +114,28 @@ class SkillCollector(Collector):
             self._look(np.flatnonzero(~playing & ~over))
 
     def _forget(self, ids: Array) -> None:
-        searched = self.kept["searched"][ids] if self._searches else None
+        if not self._searches:
+            super()._forget(ids)
+            return
+        goes_on = {k: self.kept[k][ids] for k in ("searched", "found")}
         super()._forget(ids)
-        if searched is not None:
-            self.kept["searched"][ids] = searched  # it counts on from episode to episode
-            self.kept["searching"][ids] = True
-            self._look(ids)
+        for name, rows in goes_on.items():  # a search counts on from episode to episode
+            self.kept[name][ids] = rows
+        self.kept["searching"][ids] = True
+        self._look(ids)
 
     def _look(self, ids: Array) -> None:
         """Whether the skill may start now in environments ``ids`` (k,) that search."""
         if not len(ids):
             return
         assert self.skill is not None
-        holds = asked(self.skill, "initiation", self.obs[ids], len(ids))
+        holds = asked(self.skill, "initiation", self.obs[ids], len(ids), ids=ids)
         found, waiting = ids[holds], ids[~holds]
         self.kept["searching"][found] = False
         self.kept["searched"][found] = 0
-        self._found |= len(found) > 0
+        self.kept["found"][found] = True
         self.kept["searched"][waiting] += 1
-        if not self._found and self.kept["searched"].max() > PATIENCE:
+        if self.kept["searched"].max() > PATIENCE and not self.kept["found"].any():
             raise SkillweaveError(
                 f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps of "
                 "random acting, so there is nothing to train on; widen it, or give an environment "
@@ -154,7 +157,7 @@ class SkillCollector(Collector):
             return Judged(raw.reward, raw.terminated, raw.truncated, None)
         elapsed = self.kept["elapsed"]
         if playing is None:
-            return self._of_skill(skill, obs, action, raw, elapsed)
+            return self._of_skill(skill, obs, action, raw, self._all)
         rows = np.flatnonzero(playing)
         elapsed[~playing] = 0
         found = Judged(
@@ -166,7 +169,7 @@ class SkillCollector(Collector):
                 raw.next_obs[rows], raw.reward[rows], raw.terminated[rows], raw.truncated[rows],
                 info_rows(raw.info, rows, self.num_envs),
             )  # fmt: skip
-            judged = self._of_skill(skill, obs[rows], action[rows], part, elapsed[rows])
+            judged = self._of_skill(skill, obs[rows], action[rows], part, rows)
             found.reward[rows], found.terminated[rows] = judged.reward, judged.terminated
             found.truncated[rows] = judged.truncated
             if found.success is not None:
@@ -174,9 +177,10 @@ class SkillCollector(Collector):
         return found
 
     def _of_skill(
-        self, skill: Skill, obs: Array, action: Array, raw: RawStep, elapsed: Array
+        self, skill: Skill, obs: Array, action: Array, raw: RawStep, ids: Array
     ) -> Judged:
-        n = len(obs)
+        """What a step of environments ``ids`` (n,) was to the skill."""
+        n, elapsed = len(ids), self.kept["elapsed"][ids]
         timed_out = self._never[:n]
         if skill.max_steps is not None:
             timed_out = (elapsed >= skill.max_steps) & ~raw.terminated
@@ -184,12 +188,14 @@ class SkillCollector(Collector):
             obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
             timed_out, elapsed, raw.info,
         )  # fmt: skip
-        reward = asked(skill, "reward", step, n, elapsed)
+        reward = asked(skill, "reward", step, n, elapsed, ids)
         terminated = raw.terminated
         if skill.defines("termination"):
-            terminated = terminated | asked(skill, "termination", step, n, elapsed)
+            terminated = terminated | asked(skill, "termination", step, n, elapsed, ids)
         truncated = (raw.truncated | timed_out) & ~terminated
-        success = asked(skill, "success", step, n, elapsed) if skill.defines("success") else None
+        success = None
+        if skill.defines("success"):
+            success = asked(skill, "success", step, n, elapsed, ids)
         return Judged(reward, terminated, truncated, success)
 
     def _count(self, raw: RawStep, judged: Judged, playing: Array | None) -> None:
