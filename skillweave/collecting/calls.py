@@ -154,7 +154,8 @@ class SkillSet:
             own = self._own(memory, i, rows[mine])
             self._put(memory, i, rows[mine], policy.observe(own, part))
             if skill.defines("termination"):
-                over[mine] |= asked(skill, "termination", part, len(mine), elapsed[mine])
+                stops = asked(skill, "termination", part, len(mine), elapsed[mine], rows[mine])
+                over[mine] |= stops
         return over
 
     def _own(self, memory: Memory, i: int, rows: Array) -> Memory:

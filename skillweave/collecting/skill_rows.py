@@ -139,7 +139,7 @@ class SkillCollector(Collector):
         if not len(ids):
             return
         assert self.skill is not None
-        holds = asked(self.skill, "initiation", self.obs[ids], len(ids))
+        holds = asked(self.skill, "initiation", self.obs[ids], len(ids), ids=ids)
         found, waiting = ids[holds], ids[~holds]
         self.kept["searching"][found] = False
         self.kept["searched"][found] = 0
@@ -167,7 +167,7 @@ class SkillCollector(Collector):
             return Judged(raw.reward, raw.terminated, raw.truncated, None)
         elapsed = self.kept["elapsed"]
         if playing is None:
-            return self._of_skill(skill, obs, action, raw, elapsed)
+            return self._of_skill(skill, obs, action, raw, self._all)
         rows = np.flatnonzero(playing)
         elapsed[~playing] = 0
         found = Judged(
@@ -179,7 +179,7 @@ class SkillCollector(Collector):
                 raw.next_obs[rows], raw.reward[rows], raw.terminated[rows], raw.truncated[rows],
                 info_rows(raw.info, rows, self.num_envs),
             )  # fmt: skip
-            judged = self._of_skill(skill, obs[rows], action[rows], part, elapsed[rows])
+            judged = self._of_skill(skill, obs[rows], action[rows], part, rows)
             found.reward[rows], found.terminated[rows] = judged.reward, judged.terminated
             found.truncated[rows] = judged.truncated
             if found.success is not None:
@@ -187,9 +187,10 @@ class SkillCollector(Collector):
         return found
 
     def _of_skill(
-        self, skill: Skill, obs: Array, action: Array, raw: RawStep, elapsed: Array
+        self, skill: Skill, obs: Array, action: Array, raw: RawStep, ids: Array
     ) -> Judged:
-        n = len(obs)
+        """What a step of environments ``ids`` (n,) was to the skill."""
+        n, elapsed = len(ids), self.kept["elapsed"][ids]
         timed_out = self._never[:n]
         if skill.max_steps is not None:
             timed_out = (elapsed >= skill.max_steps) & ~raw.terminated
@@ -197,12 +198,14 @@ class SkillCollector(Collector):
             obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
             timed_out, elapsed, raw.info,
         )  # fmt: skip
-        reward = asked(skill, "reward", step, n, elapsed)
+        reward = asked(skill, "reward", step, n, elapsed, ids)
         terminated = raw.terminated
         if skill.defines("termination"):
-            terminated = terminated | asked(skill, "termination", step, n, elapsed)
+            terminated = terminated | asked(skill, "termination", step, n, elapsed, ids)
         truncated = (raw.truncated | timed_out) & ~terminated
-        success = asked(skill, "success", step, n, elapsed) if skill.defines("success") else None
+        success = None
+        if skill.defines("success"):
+            success = asked(skill, "success", step, n, elapsed, ids)
         return Judged(reward, terminated, truncated, success)
 
     def _count(self, raw: RawStep, judged: Judged, playing: Array | None) -> None:

@@ -175,7 +175,12 @@ def apply_reflexes(
 
 
 def asked(
-    skill: Skill, method: str, about: Step | Array, n: int, elapsed: Array | int | None = None
+    skill: Skill,
+    method: str,
+    about: Step | Array,
+    n: int,
+    elapsed: Array | int | None = None,
+    ids: Array | None = None,
 ) -> Array:
     """What a method of a skill says about a step or observations: (n,) float32 or bool.
 
@@ -184,7 +189,7 @@ def asked(
     """
     dtype = np.float32 if method == "reward" else bool
     who = f"skill {skill.name!r}"
-    return answer(getattr(skill, method), about, n, dtype, who, method, elapsed)
+    return answer(getattr(skill, method), about, n, dtype, who, method, elapsed, ids)
 
 
 def answer(
@@ -195,6 +200,7 @@ def answer(
     who: str,
     method: str,
     elapsed: Array | int | None = None,
+    ids: Array | None = None,
 ) -> Array:
     """What a function of the user's returns, ``checked``.
 
@@ -204,13 +210,23 @@ def answer(
     if isinstance(about, np.ndarray):
         about = read_only(about)
     value = called(function, about, f"{who}: {method}()", elapsed)
-    return checked(value, n, dtype, who, method, elapsed)
+    return checked(value, n, dtype, who, method, elapsed, ids)
 
 
 def checked(
-    value: Any, n: int, dtype: type, who: str, method: str, elapsed: Array | int | None = None
+    value: Any,
+    n: int,
+    dtype: type,
+    who: str,
+    method: str,
+    elapsed: Array | int | None = None,
+    ids: Array | None = None,
 ) -> Array:
-    """``value`` as an array (n,) of ``dtype``; ``elapsed`` (n,) or () says at which steps.
+    """``value`` as an array (n,) of ``dtype``.
+
+    Args:
+        elapsed: at which steps, (n,) or (), for messages.
+        ids: in which environments, (n,), for messages; None: in all n.
 
     Raises:
         SkillweaveError: it has another shape or kind, or is a NaN or an infinity; the message
@@ -224,7 +240,9 @@ def checked(
         )
     if dtype is bool:
         return (
-            array if array.dtype == bool else _flags(array, f"{who}: {method}()", at_step(elapsed))
+            array
+            if array.dtype == bool
+            else _flags(array, f"{who}: {method}()", at_step(elapsed), ids)
         )
     if array.dtype.kind not in "fiub":
         raise SkillweaveError(
@@ -237,13 +255,18 @@ def checked(
         row = int(np.flatnonzero(~np.isfinite(array))[0])
         when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
         raise SkillweaveError(
-            f"{who}: {method}() returned {array[row]}{when} for environment {row}: "
+            f"{who}: {method}() returned {array[row]}{when} for environment {_number(row, ids)}: "
             "rewards must be finite"
         )
     return array
 
 
-def _flags(array: Array, what: str, when: str) -> Array:
+def _number(row: int, ids: Array | None) -> int:
+    """The environment that a row is of."""
+    return row if ids is None else int(ids[row])
+
+
+def _flags(array: Array, what: str, when: str, ids: Array | None) -> Array:
     """Numbers that are all 0 or 1, as bool."""
     if array.dtype.kind not in "fiu":
         raise SkillweaveError(
@@ -251,9 +274,10 @@ def _flags(array: Array, what: str, when: str) -> Array:
         )
     wrong = np.flatnonzero((array != 0) & (array != 1))
     if len(wrong):
+        row = int(wrong[0])
         raise SkillweaveError(
-            f"{what} returned {array[wrong[0]]}{when} for environment {wrong[0]}, but yes or no "
-            "(bool) is asked: compare with something"
+            f"{what} returned {array[row]}{when} for environment {_number(row, ids)}, but yes or "
+            "no (bool) is asked: compare with something"
         )
     return array.astype(bool)
 

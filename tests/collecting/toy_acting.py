@@ -12,6 +12,8 @@ import numpy as np
 from reference_calls import EPISODE, Walk
 
 from skillweave.collecting.acting import Acted, Request
+from skillweave.collecting.collector import Collected
+from skillweave.experience import Experience
 from skillweave.seeding import Seeds
 from skillweave.types import Array
 
@@ -46,6 +48,45 @@ class Choices:
             chosen.append(rng.choice(np.flatnonzero(allowed)))
         action = np.array(chosen, np.int64)
         return Acted(action, action[:, None].astype(np.float32), None)
+
+
+class Given(Choices):
+    """Does what it was told last."""
+
+    then: Array  # (N, …), as the environments take it
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, 0)
+        self.asked = 0
+
+    def some(self, rows: Array, obs: Array, mask: Array | None, memory: Any) -> Acted:
+        return Acted(np.asarray(self.then)[rows], None, None)
+
+
+class Counts(Choices):
+    """Remembers how often it acted since it began; ``head`` says what it remembered before."""
+
+    memory_size = 1
+
+    def some(self, rows: Array, obs: Array, mask: Array | None, memory: Any) -> Acted:
+        before = memory[rows].copy()
+        return Acted(super().some(rows, obs, mask, None).action, before, before + 1)
+
+
+def step(collector: Any, action: Any) -> Collected:
+    """One row, in which ``Given`` does ``action`` (N, …)."""
+    acting: Given = collector.acting
+    acting.then, acting.asked = np.asarray(action), acting.asked + 1
+    request = Request(1, (), np.array([0.97]), Seeds(0) / acting.asked)
+    found: Collected = collector.collect(request)
+    return found
+
+
+def valid_rows(experience: Experience, column: int) -> Array:
+    """Which rows of a column count, in order."""
+    if experience.valid is None:
+        return np.arange(len(experience.reward))
+    return np.flatnonzero(experience.valid[:, column])
 
 
 def requests(rows: int, gamma: float = 0.97) -> Any:
