@@ -13,7 +13,7 @@ from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import Columns
 from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import info_rows
+from skillweave.envs.infos import info_rows, told_success
 from skillweave.experience import Experience
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, SkillweaveError, Step
@@ -29,7 +29,7 @@ class Judged:
     reward: Array  # (n,) float32
     terminated: Array  # (n,) bool
     truncated: Array  # (n,) bool, never where terminated
-    success: Array | None  # (n,) bool
+    success: Array | None  # (n,) bool, or of the task float64, NaN where it is not told
 
 
 class SkillCollector(Collector):
@@ -164,7 +164,8 @@ class SkillCollector(Collector):
         skill = self.skill
         self.kept["elapsed"] += 1
         if skill is None:
-            return Judged(raw.reward, raw.terminated, raw.truncated, None)
+            success = told_success(raw.info, self.num_envs)
+            return Judged(raw.reward, raw.terminated, raw.truncated, success)
         elapsed = self.kept["elapsed"]
         if playing is None:
             return self._of_skill(skill, obs, action, raw, self._all)

@@ -1,0 +1,123 @@
+"""Skills that can act already lead to where the one that is trained may start."""
+
+import itertools
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from toy_acting import Choices, requests
+
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.seeding import Seeds
+from skillweave.skills import Skill
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.types import SkillweaveError
+
+N = 3
+X, T = range(2)
+
+
+class Corridor(gym.Env):
+    """A line of 1,000 places: to the right by action 1, back to the start by any other."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gym.spaces.Discrete(5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.t = 0
+        return self._obs(), {}
+
+    def _obs(self):
+        return np.array([self.x, self.t], np.float32)
+
+    def step(self, action):
+        self.x = self.x + 1 if action == 1 else 0
+        self.t += 1
+        return self._obs(), float(self.x), self.t >= 60, False, {}
+
+
+def always(action):
+    spaces = Corridor.observation_space, Corridor.action_space
+    return ScriptedPolicy(lambda obs: np.full(len(obs), action), *spaces)
+
+
+class Forward(Skill):
+    max_steps = 30
+    policy = always(1)
+
+
+class OnlyFar(Skill):
+    """May start only where it is not needed."""
+
+    policy = always(1)
+
+    def initiation(self, obs):
+        return obs[:, X] > 900
+
+
+class Far(Skill):
+    max_steps = 5
+
+    def initiation(self, obs):
+        return obs[:, X] >= 20
+
+
+def collector_of(*kinds, skill=Far):
+    skills = tuple(kind() for kind in kinds)
+    starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
+    engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
+    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters)
+    found.start(Seeds(0))
+    return found
+
+
+def test_it_is_led_to_where_it_may_start_and_only_its_own_rows_are_valid():
+    experience = collector_of(Forward).collect(next(requests(120))).experience
+    valid = experience.valid
+    assert valid.any(0).all(), "chance alone would need 5^20 tries"
+    started = valid[1:] & ~valid[:-1]
+    assert (experience.obs[1:][started][:, X] >= 20).all()
+    led = ~valid & (experience.obs[:, :, X] < 20)
+    assert (experience.next_obs[led][:, X] == experience.obs[led][:, X] + 1).all()
+    assert experience.spent == 120 * N
+
+
+def test_each_of_its_ends_begins_anew_and_it_is_led_again():
+    experience = collector_of(Forward).collect(next(requests(200))).experience
+    ends = experience.valid & (experience.terminated | experience.truncated)
+    assert ends.sum() >= 2 * N
+    after = np.argwhere(ends[:-1])
+    assert all(experience.obs[t + 1, n, T] == 0 for t, n in after)
+
+
+def test_where_no_starter_may_start_chance_acts():
+    collector, asked = collector_of(OnlyFar), requests(600)
+    first = collector.collect(next(asked)).experience
+    assert len(np.unique(first.action[~first.valid])) == 5
+    with pytest.raises(SkillweaveError, match="steps of calling 'only_far'"):
+        for request in itertools.islice(asked, 10):
+            collector.collect(request)
+
+
+def test_without_starters_it_says_that_chance_found_nothing():
+    collector = collector_of()
+    with pytest.raises(SkillweaveError, match="steps of random acting"):
+        for request in itertools.islice(requests(600), 10):
+            collector.collect(request)
+
+
+@pytest.mark.parametrize("rows", [7, 50])
+def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(rows):
+    first, asked = collector_of(Forward), requests(rows)
+    for request in itertools.islice(asked, 3):
+        first.collect(request)
+    first.cut(Seeds(1))
+    again = collector_of(Forward)
+    assert not len(again.restore(first.state()))
+    for request in itertools.islice(asked, 4):
+        one, two = first.collect(request).experience, again.collect(request).experience
+        for name in ("obs", "action", "reward", "next_obs", "valid", "terminated", "truncated"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
