@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 
@@ -14,7 +16,8 @@ from skillweave.types import Array, Memory, Step, prefixed
 class Starters:
     """Skills that can act already, called at random wherever they may start.
 
-    Where none of them may, actions are drawn at random from those allowed.
+    They sample, as a greedy skill may go round in circles for ever. Where none of them may start,
+    actions are drawn at random from those allowed.
 
     Args:
         skills: None where nobody can act yet.
@@ -23,7 +26,8 @@ class Starters:
     """
 
     def __init__(self, skills: SkillSet | None, num_envs: int, action_space: gym.Space) -> None:  # type: ignore[type-arg]
-        self.skills, self._space, self._num_envs = skills, action_space, num_envs
+        self.skills = None if skills is None else replace(skills, greedy=False)
+        self._space, self._num_envs = action_space, num_envs
         self._calls: Memory = {} if skills is None else skills.start(num_envs)
         self.kept: dict[str, Array] = prefixed("starters", self._calls)
         """What is kept of each environment, (N, …) each; changed in place."""
