@@ -74,12 +74,13 @@ class RolloutStore:
         named["discount"] = factor * ~named.pop("terminated")
         if named["valid"].all():
             del named["valid"]
+        if log_std is not None:
+            named["log_std"] = log_std
         named = {name: x.to(self._device) for name, x in named.items()}
         memory = named.pop("memory", None)
         return Rollout(
-            **named, memory=None if memory is None else memory[:, 0], log_std=log_std,
-            progress=progress,
-        )  # fmt: skip
+            **named, memory=None if memory is None else memory[:, 0], progress=progress
+        )
 
     def state(self) -> dict[str, Tensor]:
         """Copies of what is held, to go on exactly; see ``load``."""

@@ -14,6 +14,7 @@ from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import as_wide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.infos import told_success
 from skillweave.experience import Experience
 from skillweave.types import Array, Memory, SkillweaveError, Step, prefixed
 
@@ -103,7 +104,8 @@ class DecisionCollector(Collector):
             self.kept["first"][ids] = False
             if ended.any():
                 ids = np.flatnonzero(ended)
-                self._tell(ids)
+                success = told_success(raw.info, self.num_envs)
+                self._tell(ids, None if success is None else success[ids])
                 self._begin_anew(ids)
 
     def _decide(self, rows: Array) -> None:
@@ -118,6 +120,8 @@ class DecisionCollector(Collector):
         kept["choice"][rows] = choice
         kept["reward"][rows], kept["discount"][rows], kept["tau"][rows] = 0.0, 1.0, 0
         kept["before"][rows], kept["over"][rows] = kept["memory"][rows], False
+        if "rewards" in self.open:
+            self.open["rewards"][rows] = 0.0
         if acted.memory is not None:
             kept["memory"][rows] = acted.memory
         for name, value in (("obs", here), ("head", acted.head)):
@@ -190,7 +194,6 @@ class Decisions:
             values["next_obs_mask"] = self._next_mask(collector, values)
         if "rewards" in opened:
             values["rewards"] = opened["rewards"][ids]
-            opened["rewards"][ids] = 0.0
         self._found.append((self._count[ids], ids, values))
         self._count[ids] += 1
 

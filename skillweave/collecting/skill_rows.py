@@ -11,7 +11,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import Columns
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import allowed_rows, info_rows, random_actions
+from skillweave.envs.infos import allowed_rows, info_rows, random_actions, told_success
 from skillweave.experience import Experience
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, SkillweaveError, Step
@@ -27,7 +27,7 @@ class Judged:
     reward: Array  # (n,) float32
     terminated: Array  # (n,) bool
     truncated: Array  # (n,) bool, never where terminated
-    success: Array | None  # (n,) bool
+    success: Array | None  # (n,) bool, or of the task float64, NaN where it is not told
 
 
 class SkillCollector(Collector):
@@ -154,7 +154,8 @@ class SkillCollector(Collector):
         skill = self.skill
         self.kept["elapsed"] += 1
         if skill is None:
-            return Judged(raw.reward, raw.terminated, raw.truncated, None)
+            success = told_success(raw.info, self.num_envs)
+            return Judged(raw.reward, raw.terminated, raw.truncated, success)
         elapsed = self.kept["elapsed"]
         if playing is None:
             return self._of_skill(skill, obs, action, raw, self._all)

@@ -88,6 +88,19 @@ class ActionMasks:
         return allowed
 
 
+def told_success(info: Mapping[str, Any], n: int) -> Array | None:
+    """Whether the episodes of n environments have succeeded, by ``info["success"]``.
+
+    Returns:
+        (n,) float64, NaN where an environment says nothing; None: none of them does.
+    """
+    told = np.asarray(info.get("success"))
+    if told.shape != (n,) or told.dtype.kind not in "biuf":
+        return None
+    here = np.asarray(info.get("_success", np.ones(n, bool)))
+    return np.where(here, told != 0, np.nan)
+
+
 def allowed_rows(mask: Array | None, rows: Array) -> Array | None:
     """Rows of an action mask, where there is one."""
     return None if mask is None else mask[rows]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.infos import info_rows
 from skillweave.types import Array
 
 
@@ -46,10 +47,9 @@ class JoinedEngines:
         steps = [self.parts[i].step(action[rows], own) for i, rows, own in split]
         found = _joined(steps, [len(rows) for _, rows, _ in split])
         order = np.argsort(np.concatenate([rows for _, rows, _ in split]))
-        info = {k: v[order] for k, v in found.info.items()}
         return RawStep(
             found.next_obs[order], found.reward[order], found.terminated[order],
-            found.truncated[order], info,
+            found.truncated[order], info_rows(found.info, order, len(order)),
         )  # fmt: skip
 
     def mask(self) -> Array | None:
@@ -90,13 +90,17 @@ def _joined(steps: Sequence[RawStep], counts: Sequence[int]) -> RawStep:
 
 
 def _infos(infos: Sequence[dict[str, Any]], counts: Sequence[int]) -> dict[str, Any]:
-    """What all parts tell, array by array."""
-
-    def batched(value: Any, count: int) -> bool:
-        return isinstance(value, np.ndarray) and value.shape[:1] == (count,)
-
-    return {
-        k: np.concatenate([info[k] for info in infos])
-        for k in infos[0]
-        if all(batched(info.get(k), count) for info, count in zip(infos, counts, strict=True))
-    }
+    """What parts of so many environments tell, array by array; zeros where one tells nothing."""
+    found: dict[str, Any] = {}
+    for name in dict.fromkeys(name for info in infos for name in info):
+        values = [info.get(name) for info in infos]
+        example = next(value for value in values if value is not None)
+        if isinstance(example, dict):
+            found[name] = _infos([value or {} for value in values], counts)
+        elif isinstance(example, np.ndarray) and example.ndim:
+            rest, kind = example.shape[1:], example.dtype
+            found[name] = np.concatenate([
+                np.zeros((count, *rest), kind) if value is None else value
+                for value, count in zip(values, counts, strict=True)
+            ])
+    return found

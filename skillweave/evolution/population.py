@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.buffers.replay import ReplayStore
@@ -25,6 +25,7 @@ from skillweave.evolution.config import Evolution
 from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.selection import select
 from skillweave.evolution.stacks import Member, Origin, copy, grouped, join, split
+from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick
@@ -124,20 +125,20 @@ class Population:
         """
         first = spent = 0
         for i, group in enumerate(groups):
-            stack = Stack(*join(group, self.spaces, self._made))
+            stack = self._stack(group)
             start, count = sum(m.steps for m in group), len(group)
-            clock = _Clock(spent, start, on_tick)
             places = self.places[first : first + count]
             joined = self._together(places, [stack])
-            train(
+            end = train(
                 RolloutLearner(stack, seeds / i), Collectors([joined], count), self.episodes,
                 seeds / i, until * count, resume_from=Progress(steps=start), cut_every=NEVER,
-                schedule_steps=schedule_steps * count, skip_diverged=True, on_tick=clock,
+                schedule_steps=schedule_steps * count, skip_diverged=True,
+                on_tick=_telling(on_tick, spent - start),
             )  # fmt: skip
             apart(joined, places)
-            split(stack.algorithm, stack.state, group, self.spaces)
-            spent, first = spent + clock.taken, first + count
-            _count(group, clock.taken)
+            self._unstack(stack, group)
+            spent, first = spent + end.steps - start, first + count
+            _count(group, end.steps - start)
 
     def _train_side_by_side(
         self,
@@ -148,9 +149,8 @@ class Population:
         on_tick: OnTick,
     ) -> None:
         """All stacks act at once and learn from one store."""
-        stacks = [Stack(*join(group, self.spaces, self._made)) for group in groups]
+        stacks = [self._stack(group) for group in groups]
         start, count = self.steps, len(self.members)
-        clock = _Clock(0, start, on_tick)
         self.store = self.store or self._make_store()
         learner = ReplayLearner(
             stacks, self.store, seeds, row_steps=self.row_steps, goes_on_at=start
@@ -158,17 +158,26 @@ class Population:
         if self._kept:
             learner.load(self._kept)
         joined = self._together(self.places, stacks)
-        train(
+        end = train(
             learner, Collectors([joined], count), self.episodes, seeds, until * count,
             resume_from=Progress(self.rounds, start), schedule_steps=schedule_steps * count,
-            skip_diverged=True, cut_every=NEVER, on_tick=clock,
+            skip_diverged=True, cut_every=NEVER, on_tick=_telling(on_tick, -start),
         )  # fmt: skip
         apart(joined, self.places)
         for stack, group in zip(stacks, groups, strict=True):
-            split(stack.algorithm, stack.state, group, self.spaces)
-        self._kept = {k: v for k, v in learner.kept().items() if not k.startswith("store.")}
-        self.rounds = clock.update
-        _count(self.members, clock.taken)
+            self._unstack(stack, group)
+        self._kept = learner.counts()
+        self.rounds = end.update
+        _count(self.members, end.steps - start)
+
+    def _stack(self, group: list[Member]) -> Stack:
+        """Members as one stack, on the device that they learn on."""
+        algorithm, state = join(group, self.spaces, self._made)
+        return Stack(algorithm, state_to(state, resolve_device(algorithm.config.device)))
+
+    def _unstack(self, stack: Stack, group: list[Member]) -> None:
+        """Give each member its part of what a stack has learnt."""
+        split(stack.algorithm, state_to(stack.state, "cpu"), group, self.spaces)
 
     def _together(self, places: Sequence[Collector], stacks: Sequence[Stack]) -> Collector:
         """The places as one collector, in which the stacks act."""
@@ -206,6 +215,8 @@ class Population:
         columns = np.concatenate([own + i * self.places[0].num_envs for i, own in enumerate(ids)])
         if self.store is not None:
             self.store.cut(columns)
+        if "returns" in self._kept:
+            self._kept["returns"][columns] = 0.0
         return columns
 
     def close(self) -> None:
@@ -251,16 +262,9 @@ def spaces_of(scene: Scene) -> tuple[Any, Any]:
     return scene.observation_space, scene.action_space
 
 
-class _Clock:
-    """Tells the ticks of one loop in terms of the generation, and remembers where it ended."""
-
-    def __init__(self, before: int, start: int, on_tick: OnTick) -> None:
-        self._before, self._start, self._on_tick = before, start, on_tick
-        self.taken = self.update = 0
-
-    def __call__(self, tick: Tick) -> None:
-        self.taken, self.update = tick.steps - self._start, tick.update
-        self._on_tick(self._before + self.taken, tick)
+def _telling(on_tick: OnTick, before: int) -> Callable[[Tick], None]:
+    """Tells the ticks of one loop in terms of the generation, ``before`` steps later."""
+    return lambda tick: on_tick(before + tick.steps, tick)
 
 
 def _count(members: list[Member], steps: int) -> None:

@@ -59,8 +59,8 @@ class Learner(Protocol):
         """What collectors are to do next."""
         ...
 
-    def take(self, experience: Experience, update: int, progress: float) -> None:
-        """Keep it, and what must be known of it at once."""
+    def take(self, experience: Experience) -> None:
+        """Keep what was collected by the latest request."""
         ...
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
@@ -91,25 +91,27 @@ class RolloutLearner:
         self.overlap, self.threads = bool(config.overlap), int(config.threads)
         self._store = RolloutStore(stack.members, device=stack.state.params.device)
         self._log_std: Tensor | None = None
+        self._progress = 0.0  # where the rollout began, so that the first has the whole rate
 
     def request(self, update: int, steps: int, progress: float) -> Request:
         """A rollout of ``n_steps`` environment steps of each environment."""
         algorithm, state = self._stack.algorithm, self._stack.state
         params = algorithm.acting_params(state, progress)
         seeds = self._seeds / "collect" / update
-        self._acted_by = params
+        self._asked = params, progress
         return Request(algorithm.config.n_steps, (params,), state.gamma.cpu().numpy(), seeds)
 
-    def take(self, experience: Experience, update: int, progress: float) -> None:
-        """Keep a rollout, and the deviations it was collected with."""
-        log_std = self._acted_by.views.get("actor.log_std")
+    def take(self, experience: Experience) -> None:
+        """Keep a rollout, and what it was collected with."""
+        params, self._progress = self._asked
+        log_std = params.views.get("actor.log_std")
         self._log_std = None if log_std is None else log_std[:, None]
         self._store.add(experience)
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """An update, where there was something to learn from."""
         stack = self._stack
-        rollout = self._store.rollout(stack.state.gamma, self._log_std, progress)
+        rollout = self._store.rollout(stack.state.gamma, self._log_std, self._progress)
         if rollout is None:
             return {}
         seeds = member_seeds(self._seeds, "learn", stack.members, update)
@@ -168,12 +170,12 @@ class ReplayLearner:
     def request(self, update: int, steps: int, progress: float) -> Request:
         """``train_freq`` rows of every environment."""
         params = tuple(s.algorithm.acting_params(s.state, progress) for s in self.stacks)
-        gamma = np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks])
         rows = int(self.config.train_freq) * self._row_steps
         at_random = steps < self._random_until
-        return Request(rows, params, gamma, self._seeds / "collect" / update, at_random)
+        seeds = self._seeds / "collect" / update
+        return Request(rows, params, self._gamma(), seeds, at_random)
 
-    def take(self, experience: Experience, update: int, progress: float) -> None:
+    def take(self, experience: Experience) -> None:
         """Put rows into the store, and keep the running scales of observations and returns."""
         self.store.add(experience)
         valid = experience.valid
@@ -181,9 +183,10 @@ class ReplayLearner:
         self._transitions[1] += count / self.members
         for i, stack in enumerate(self.stacks):
             columns = self._columns(i, experience)
-            rows = to_tensor(np.ascontiguousarray(experience.obs[:, columns]))
             stack.algorithm.update_obs_stats(
-                stack.state, _flat(rows, stack.members), _flat_valid(valid, columns, stack.members)
+                stack.state,
+                _rows(experience.obs, columns, stack),
+                None if valid is None else _rows(valid, columns, stack),
             )
         if any(s.algorithm.scales_rewards for s in self.stacks):
             self._scale_returns(experience)
@@ -194,16 +197,19 @@ class ReplayLearner:
         each = n // self.members
         if self._returns is None:
             self._returns = np.zeros(n, np.float32)
-        gamma = np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks]).repeat(each)
+        gamma = self._gamma().repeat(each)
         for at, ended in enumerate(experience.ended):
             valid = None if experience.valid is None else experience.valid[at]
-            now = self._returns * gamma ** experience.steps[at] + experience.reward[at]
+            power = gamma ** experience.steps[at].astype(np.float32)
+            now = self._returns * power + experience.reward[at]
             self._returns = now if valid is None else np.where(valid, now, self._returns)
             for i, stack in enumerate(self.stacks):
                 columns = self._columns(i, experience)
-                returns = torch.from_numpy(self._returns[columns]).view(stack.members, -1)
-                seen = None if valid is None else _flat_valid(valid[None], columns, stack.members)
-                stack.algorithm.update_return_stats(stack.state, returns, seen)
+                stack.algorithm.update_return_stats(
+                    stack.state,
+                    _rows(self._returns[None], columns, stack),
+                    None if valid is None else _rows(valid[None], columns, stack),
+                )
             self._returns[ended if valid is None else ended & valid] = 0.0
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
@@ -246,11 +252,16 @@ class ReplayLearner:
             self._returns[columns] = 0.0
 
     def kept(self) -> dict[str, Tensor]:
-        """The store, if it is to be saved, and what is counted."""
+        """What is counted, and the store, if it is to be saved."""
+        store = prefixed("store", self.store.state()) if self.config.save_buffer else {}
+        return self.counts() | store
+
+    def counts(self) -> dict[str, Tensor]:
+        """What is kept beside the store."""
         found = {"transitions": torch.from_numpy(self._transitions.copy())}
         if self._returns is not None:
             found["returns"] = torch.from_numpy(self._returns.copy())
-        return found | (prefixed("store", self.store.state()) if self.config.save_buffer else {})
+        return found
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint kept."""
@@ -260,6 +271,10 @@ class ReplayLearner:
         if saved := unprefixed("store", kept):
             self.store.load(saved)
             self._learns_from = self._random_until
+
+    def _gamma(self) -> Array:
+        """(P,) float32, of all members."""
+        return np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks])
 
     def _columns(self, stack: int, experience: Experience) -> slice:
         """The columns of a stack's members."""
@@ -309,13 +324,8 @@ def crossed(every: int, before: int, after: int) -> bool:
     return after // every > before // every
 
 
-def _flat(rows: Tensor, members: int) -> Tensor:
-    """(T, P·B, …) to (P, T·B, …)."""
-    split: Tensor = rows.unflatten(1, (members, -1)).transpose(0, 1)
-    return split.flatten(1, 2)
-
-
-def _flat_valid(valid: Array | None, columns: slice, members: int) -> Tensor | None:
-    if valid is None:
-        return None
-    return _flat(torch.from_numpy(np.ascontiguousarray(valid[:, columns])), members)
+def _rows(x: Array, columns: slice, stack: Stack) -> Tensor:
+    """The columns of a stack, of (T, N, …), as (P, T·B, …) on the stack's device."""
+    rows = to_tensor(np.ascontiguousarray(x[:, columns])).unflatten(1, (stack.members, -1))
+    found: Tensor = rows.transpose(0, 1).flatten(1, 2)
+    return found.to(stack.state.params.device)

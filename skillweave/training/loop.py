@@ -116,12 +116,10 @@ class _Loop:
         over = at.steps >= budget
         cut = crossed(cut_every, before, at.steps) or over
         self.episodes.extend(collected.episodes)
-        # On-policy schedules count from where a rollout began, so the first is the whole rate.
-        progress = self._progress(before if learner.overlap else at.steps)
-        learner.take(collected.experience, update, progress)
+        learner.take(collected.experience)
         if learner.overlap and not cut:
             self.ask()  # before the parameters change
-        self._begin(update, progress)
+        self._begin(update)
         if cut or not learner.overlap:
             kept = self._cut() if cut and not over else None
             self.wait(cut, kept, before)
@@ -132,9 +130,9 @@ class _Loop:
         at = self.at
         self._request = self.learner.request(at.update, at.steps, self._progress(at.steps))
 
-    def _begin(self, update: int, progress: float) -> None:
+    def _begin(self, update: int) -> None:
         """Learn, on the thread if it may overlap."""
-        about = update, self.at.steps, progress
+        about = update, self.at.steps, self._progress(self.at.steps)
         self._told = update + 1, self.at.steps
         if self.learner.overlap:
             self._summary = self.episodes.summary()
@@ -154,15 +152,15 @@ class _Loop:
         update, steps = self._told
         every = self.learner.report_every
         due = not every or before is None or cut or crossed(every, before, steps)
-        if self._on_tick is None or not due:
+        if not due:
             return
         self.at.seconds = time.perf_counter() - self._started
         metrics = to_numbers(self._metrics, update, skip_diverged=self.skip_diverged)
+        self._metrics = {}
+        if self._on_tick is None:
+            return
         # Those of the episodes are from when the update began, where it was not waited for.
         metrics |= self._summary if self.learner.overlap else self.episodes.summary()
-        self._metrics = {}
-        # A cut may have taken steps, where an environment had to begin anew.
-        steps = self.at.steps if cut else steps
         state = [stack.state for stack in self.learner.stacks]
         self._on_tick(Tick(update, steps, self.at.seconds, metrics, state, cut, kept))
 
@@ -177,9 +175,7 @@ class _Loop:
         """Make a clean cut; what going on from it needs beside the states of the stacks."""
         if self._pending is not None:
             self._pending.result()
-        before = self.collectors.steps_made
         self.learner.cut(self.collectors.cut(self.seeds / "cut" / self.at.update))
-        self.at.steps += self.collectors.steps_made - before
         found = self.collectors.state() | prefixed("episodes", self.episodes.state())
         tensors = {k: to_tensor(np.array(v)) for k, v in found.items()}
         return prefixed("collector", tensors) | prefixed("learner", self.learner.kept())
