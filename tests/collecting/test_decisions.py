@@ -277,6 +277,44 @@ def test_restored_it_goes_on_as_if_it_had_not_been_stopped(rows):
         np.testing.assert_array_equal(one.episodes, two.episodes)
 
 
+class Told(Again):
+    """Tells whether an episode was a success, in odd episodes."""
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        if (terminated or truncated) and self.episode % 2:
+            info["success"] = self.position > 0
+        return obs, reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize("of_selector", [True, False])
+def test_the_success_that_an_environment_tells_is_that_of_its_episode(of_selector):
+    made = {}
+
+    def make():
+        made[len(made)] = Told()
+        return made[len(made) - 1]
+
+    if of_selector:
+        collector = collector_of(skill_set(*ALL), env=make)
+    else:
+        engine = make_engine(EnvSpec(make, engine="sync"), N)
+        collector = SkillCollector(engine, Choices(N, 3))
+        collector.start(Seeds(7))
+    kinds = set()
+    for request in itertools.islice(requests(1), 90):
+        before = {i: e.episode for i, e in made.items()}
+        collected = collector.collect(request)
+        ends = [i for i, e in made.items() if e.episode > before[i] and i >= len(made) - N]
+        for told, i in zip(collected.episodes, ends, strict=True):
+            logged = [a for e, _, a in made[i].log if e == before[i]]
+            position = sum(logged) - len(logged)
+            wanted = float(position > 0) if before[i] % 2 else np.nan
+            np.testing.assert_array_equal(told[3], wanted)
+            kinds.add(str(told[3]))
+    assert kinds == {"0.0", "1.0", "nan"}
+
+
 # Memory ----------------------------------------------------------------------------------------
 
 

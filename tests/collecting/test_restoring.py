@@ -196,7 +196,7 @@ def test_what_begins_anew_at_a_cut_begins_so_after_a_resume_too(kind, monkeypatc
 def test_where_an_episode_begins_anew_at_a_cut_its_open_call_is_forgotten(monkeypatch):
     monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", 2)
     skills = SkillSet((Zigzag(),), (Zigzag.policy,), call_steps=9)
-    env = DecisionCollector(engine_of(Again), Choices(3, 1), skills)
+    env = DecisionCollector(engine_of(Again), Choices(3, 1), skills, keep_rewards=True)
     env.start(Seeds(0))
     env.collect(next(requests(3)))
     cut = env.cut(Seeds(1))
@@ -207,6 +207,10 @@ def test_where_an_episode_begins_anew_at_a_cut_its_open_call_is_forgotten(monkey
         assert experience.obs[0, column, 2] == 0
         lasted = experience.next_obs[0, column, 2] - experience.obs[0, column, 2]
         assert experience.steps[0, column] == lasted
+        each = experience.rewards[0, column]
+        assert not each[int(lasted) :].any()
+        total = (each * 0.97 ** np.arange(len(each))).sum()
+        assert total == pytest.approx(experience.reward[0, column], abs=1e-5)
 
 
 def test_a_state_of_another_kind_of_collector_is_refused():
