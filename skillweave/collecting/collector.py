@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.columns import as_wide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, checksums
 from skillweave.experience import Experience
@@ -202,7 +203,7 @@ def together(collectors: Sequence[Collector], engine: Engine, acting: Acting) ->
             rows[:] = np.concatenate([c.kept[name] for c in collectors])
     for name, example in collectors[0].open.items():
         parts = [c.open.get(name, np.zeros_like(example)) for c in collectors]
-        found.open[name] = np.concatenate(parts)
+        found.open[name] = np.concatenate(as_wide(parts) if name == "rewards" else parts)
     found.obs, found.begun = np.concatenate([c.obs for c in collectors]), True
     return found
 
@@ -260,8 +261,7 @@ def _beside(values: list[Any], members: int, name: str) -> Any:
             np.ones((*known.shape[:2], *known.shape[2:]), bool) if v is None else v for v in values
         ]
     if name == "rewards":
-        longest = max(v.shape[2] for v in values)
-        values = [np.pad(v, ((0, 0), (0, 0), (0, longest - v.shape[2]))) for v in values]
+        values = as_wide(values)
     axis = 0 if name == "memory" else 1
     split = [v.reshape(*v.shape[:axis], members, -1, *v.shape[axis + 1 :]) for v in values]
     joined = np.concatenate(split, axis + 1)

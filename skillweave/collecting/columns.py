@@ -92,3 +92,13 @@ def stacked(masks: list[Any]) -> Array | None:
         return None
     free = np.ones_like(known)
     return np.stack([free if mask is None else mask for mask in masks])
+
+
+def as_wide(parts: list[Array]) -> list[Array]:
+    """Arrays of which the last axis is as long as that of the longest; zeros are added."""
+    longest = max(part.shape[-1] for part in parts)
+    before = [(0, 0)] * (parts[0].ndim - 1)
+    return [
+        p if p.shape[-1] == longest else np.pad(p, [*before, (0, longest - p.shape[-1])])
+        for p in parts
+    ]

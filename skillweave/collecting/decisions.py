@@ -11,6 +11,7 @@ import numpy as np
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
+from skillweave.collecting.columns import as_wide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import told_success
@@ -220,8 +221,7 @@ class Decisions:
         """One field of all decisions, (D, N, …); rewards of calls as long as the longest."""
         values = [value[name] for _, _, value in self._found]
         if name == "rewards":
-            longest = max(v.shape[1] for v in values)
-            values = [np.pad(v, ((0, 0), (0, longest - v.shape[1]))) for v in values]
+            values = as_wide(values)
         whole = np.zeros((height, n, *values[0].shape[1:]), values[0].dtype)
         for (rows, ids, _), value in zip(self._found, values, strict=True):
             whole[rows, ids] = value
@@ -249,4 +249,5 @@ class Decisions:
             head=None if head is None else np.zeros_like(head)[None],
             memory=np.zeros((collector.num_envs, size), np.float32) if size else None,
             starts=no if size else None,
+            rewards=np.zeros((*lead, 1), np.float32) if collector.keep_rewards else None,
         )  # fmt: skip

@@ -89,10 +89,10 @@ def valid_rows(experience: Experience, column: int) -> Array:
     return np.flatnonzero(experience.valid[:, column])
 
 
-def requests(rows: int, gamma: float = 0.97) -> Any:
-    """Requests for ``rows`` rows each, one after another."""
+def requests(rows: int, gamma: float | Array = 0.97) -> Any:
+    """Requests for ``rows`` rows each, one after another; γ of each member."""
     for i in itertools.count():
-        yield Request(rows, (), np.array([gamma]), Seeds(0) / i)
+        yield Request(rows, (), np.atleast_1d(gamma), Seeds(0) / i)
 
 
 class Again(Walk):

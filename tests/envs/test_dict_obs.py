@@ -4,20 +4,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from skillweave.envs.foreign import FromVectorEnv
-from skillweave.envs.skill_env import SkillEnv
 
+from skillweave.algorithms.config import PPO
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.options import OptionsEnv
+from skillweave.networks.config import CNN, Network
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.spaces import action_codec, obs_dtype, pack, unpack
+from skillweave.spaces import obs_dtype, pack, unpack
 
-GYMNASIUM = ["sync", "async"]
 ACTIONS = [
     Discrete(3, start=-1),
     MultiDiscrete([2, 3], start=[1, 0]),
@@ -84,10 +86,9 @@ def engine():
         e.close()
 
 
-@pytest.mark.parametrize("name", GYMNASIUM)
 @pytest.mark.parametrize("actions", ACTIONS, ids=str)
-def test_an_engine_is_single_environments_side_by_side(engine, name, actions):
-    e = engine(name, lambda: Places(actions))
+def test_an_engine_is_single_environments_side_by_side(engine, actions):
+    e = engine("sync", lambda: Places(actions))
     actions.seed(0)
     e.reset(0)
     seeds, singles = [5, 6, 7], [Places(actions) for _ in range(3)]
@@ -136,17 +137,26 @@ def test_a_skill_starts_after_random_actions_of_any_kind_and_reads_parts(engine,
         def reward(self, step):
             return step.next_obs["position"][:, 1] - step.obs["position"][:, 1]
 
-    env = SkillEnv(engine(env=lambda: Places(actions)), Onwards())
-    obs = env.reset(Seeds(0))
-    codec = action_codec(actions)
-    units = np.zeros((3, codec.size), np.float32)
-    if codec.discrete:
-        units = np.zeros((3, len(codec.parts)) if codec.multi else 3, np.int64)
-    for _ in range(6):
-        assert (obs["inside"]["0"] >= 1).all()
-        step = env.step(codec.to_env(units))
-        np.testing.assert_allclose(step.reward, 0.5, atol=1e-5)
-        obs = step.obs
+    made = engine(env=lambda: Places(actions))
+    acting, params = learner(made.action_space)
+    collector = SkillCollector(made, acting, Onwards())
+    collector.start(Seeds(0))
+    experience = collector.collect(Request(20, (params,), np.array([0.9]), Seeds(1))).experience
+    assert experience.obs.dtype == experience.next_obs.dtype == obs_dtype(PLACES)
+    valid = experience.valid
+    assert (valid == (experience.obs["inside"]["0"] >= 1)).all()
+    forwards = experience.next_obs["position"][..., 1] - experience.obs["position"][..., 1]
+    np.testing.assert_allclose(experience.reward[valid], forwards[valid], atol=1e-5)
+    np.testing.assert_allclose(experience.reward[valid], 0.5, atol=1e-5)
+    assert 10 < valid.sum() < 60
+
+
+def learner(actions):
+    """One that acts in Places, and its parameters."""
+    network = Network((4,), cnn=CNN("plain", (2,), (2,), (2,)))
+    config = PPO(num_envs=3, n_steps=20, batch_size=20, network=network)
+    algorithm = make_algorithm(config, PLACES, actions)
+    return Acting([(algorithm, 1)], 3), algorithm.acting_params(algorithm.init([Seeds(0)]), 0.0)
 
 
 class Ahead(Skill):
@@ -217,36 +227,23 @@ def test_the_next_mask_is_that_of_the_true_successor(options):
     assert seen == {True, False}
 
 
-def test_a_loop_that_trains_on_options_sees_packed_arrays_and_both_masks(options):
-    env = FromVectorEnv(options)
-    obs = env.reset(Seeds(0))
-    assert obs.dtype == obs_dtype(PLACES)
-    for _ in range(10):
-        step = env.step(env.mask().argmax(axis=1))
-        assert step.obs.dtype == step.next_obs.dtype == obs_dtype(PLACES)
-        assert step.mask.tolist() == step.info["action_mask"].tolist()
-        assert step.next_mask is step.info["next_action_mask"]
-
-
-@pytest.mark.parametrize(
-    "space", [PLACES, Tuple((Discrete(20), PLACES["position"]))], ids=["dict", "tuple"]
-)
-def test_a_foreign_vector_of_parts_tells_true_successors(space):
-    makers = [lambda: Places(space=space)] * 2
-    env = FromVectorEnv(SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP))
-    obs, time = env.reset(Seeds(0)), "0"
-    assert obs.dtype == obs_dtype(space)
-    ends = 0
-    for _ in range(8):
-        step = env.step(np.zeros(2, np.int64))
-        before, after, now = (
-            x[time] if space is not PLACES else x["inside"][time]
-            for x in (obs, step.next_obs, step.obs)
-        )
-        assert np.array_equal(after, before + 1)
-        assert np.array_equal(now, np.where(step.ended, 0, after))
-        assert step.next_mask is None
-        ends += step.ended.sum()
-        obs = step.obs.copy()
-    assert ends
-    env.close()
+def test_decisions_are_packed_arrays_with_both_masks(options):
+    acting, params = learner(Discrete(2))
+    collector = DecisionCollector(options.engine, acting, options.skills)
+    collector.start(Seeds(0))
+    stuck = 0
+    for i in range(3):
+        asked = Request(15, (params,), np.array([0.9]), Seeds(i))
+        experience = collector.collect(asked).experience
+        assert experience.obs.dtype == experience.next_obs.dtype == obs_dtype(PLACES)
+        assert experience.valid is None, "all calls are of one step"
+        time, after = experience.obs["inside"]["0"], experience.next_obs["inside"]["0"]
+        assert np.array_equal(after, time + 1)
+        assert np.array_equal(experience.obs_mask, np.stack([time < 4, time <= 1], -1))
+        found = np.stack([after < 4, after <= 1], -1)
+        found[experience.terminated | ~found.any(-1)] = True
+        assert np.array_equal(experience.next_obs_mask, found)
+        stuck += (experience.truncated & (after == 4)).sum()
+        goes_on = ~experience.ended[:-1]
+        assert np.array_equal(experience.next_obs[:-1][goes_on], experience.obs[1:][goes_on])
+    assert stuck

@@ -5,14 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from skillweave.envs.skill_env import SkillEnv
 
 from skillweave.envs import envpool_engine
 from skillweave.envs.history import History
-from skillweave.envs.joined import JoinedEnvs
+from skillweave.envs.joined import JoinedEngines
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.seeding import Seeds
-from skillweave.skills import Skill
 
 N = 5
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
@@ -67,12 +64,10 @@ def run(engine, steps: int, seed: int, renew: int = 0) -> list:
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1", "LunarLander-v3"])
-@pytest.mark.parametrize("engine", ["envpool", "sync", "async"])
+@pytest.mark.parametrize("engine", ["envpool", "sync"])
 def test_an_engine_that_is_restored_goes_on_as_if_nothing_had_happened(engine, env, monkeypatch):
     if engine == "envpool":
         pytest.importorskip("envpool")
-    if engine == "async" and env != "CartPole-v1":
-        pytest.skip("one environment in processes is enough")
     monkeypatch.setattr(envpool_engine, "RENEW_AFTER", 150)
     spec = EnvSpec(env, engine=engine)
     first, second = make_engine(spec, N, threads=1), make_engine(spec, N, threads=1)
@@ -109,139 +104,85 @@ def test_old_pools_are_left_one_episode_at_a_time_and_histories_stay_short(monke
     assert longest < 400, "a hundred steps, and the episodes that were open"
 
 
-class Hasty(gym.Env):
-    """Ends after two steps in every second process that plays it; it shows nothing of that."""
+@pytest.mark.parametrize("engine", ["envpool", "sync"])
+def test_joined_engines_are_their_parts_side_by_side(engine):
+    if engine == "envpool":
+        pytest.importorskip("envpool")
+    spec = EnvSpec("CartPole-v1", engine=engine)
+    parts, alone = ([make_engine(spec, 2, threads=1) for _ in range(3)] for _ in range(2))
+    joined = JoinedEngines(parts)
+    obs = np.concatenate([e.reset(i) for i, e in enumerate(parts)])
+    for i, e in enumerate(alone):
+        np.testing.assert_array_equal(e.reset(i), obs[2 * i : 2 * i + 2])
+    rng, ends = np.random.default_rng(0), 0
+    for t in range(60):
+        ids = rng.permutation(6)[: rng.integers(1, 7)] if t % 2 else np.arange(6)
+        action = rng.integers(2, size=len(ids))
+        raw = joined.step(action, ids if t % 2 else None)
+        for part in np.unique(ids // 2):
+            mine = np.flatnonzero(ids // 2 == part)
+            own = alone[part].step(action[mine], ids[mine] % 2)
+            for name in ("next_obs", "reward", "terminated", "truncated"):
+                np.testing.assert_array_equal(getattr(raw, name)[mine], getattr(own, name))
+        ended = ids[raw.terminated | raw.truncated]
+        ends += len(ended)
+        if len(ended):
+            fresh = joined.reset_some(ended)
+            for part in np.unique(ended // 2):
+                mine = np.flatnonzero(ended // 2 == part)
+                own = alone[part].reset_some(ended[mine] % 2)
+                np.testing.assert_array_equal(fresh[mine], own)
+    assert ends > 5
+    assert joined.steps_made == sum(e.steps_made for e in alone)
+    for e in (*parts, *alone):
+        e.close()
 
-    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-    hurry = False
+
+class Talker(gym.Env):
+    """Tells its time, in two depths, and now and then a word; nothing of it is drawn."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Discrete(3)
 
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
         self.t = 0
         return np.zeros(1), {}
 
     def step(self, action):
         self.t += 1
-        return np.zeros(1), 1.0, bool(Hasty.hurry and action and self.t == 2), False, {}
+        info = {"t": self.t, "deep": {"t": self.t, "even": {}}}
+        if action == 1:
+            info |= {"word": f"at {self.t}", "goal": True}
+        if action == 2:
+            info["deep"]["even"] = {"t": 2.0 * self.t, "place": np.arange(2) + self.t}
+        return np.zeros(1), 0.0, False, False, info
 
 
-def test_an_episode_that_ends_early_when_it_is_played_again_begins_anew(monkeypatch):
-    spec = EnvSpec(Hasty, engine="sync")
-    first, second = (SkillEnv(make_engine(spec, 3)) for _ in range(2))
-    first.reset(Seeds(0))
-    for _ in range(5):
-        first.step(np.array([0, 1, 0]))
-    first.renew(Seeds(1))
-    monkeypatch.setattr(Hasty, "hurry", True)
-    assert second.restore(first.state()).tolist() == [1]
-    monkeypatch.setattr(Hasty, "hurry", False)
-    assert second.step(np.zeros(3, np.int64)).terminated.tolist() == [False] * 3
-    assert second.renew(Seeds(2)).tolist() == []
-    assert second.state()["elapsed"].tolist() == [6, 1, 6]
+def same(one, two):
+    """Whether two infos are equal, however deep."""
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        if isinstance(value, dict):
+            same(value, two[name])
+        else:
+            assert value.dtype == two[name].dtype, name
+            np.testing.assert_array_equal(value, two[name])
 
 
-class Moody(gym.Env):
-    """Does not repeat itself: its observation is drawn from a stream that no seed begins anew."""
-
-    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-    stream = np.random.default_rng(0)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1), {}
-
-    def step(self, action):
-        moody = bool(action)
-        return np.array([self.stream.random() if moody else 0.5]), 1.0, False, False, {}
-
-
-def test_environments_that_do_not_repeat_themselves_begin_anew_and_are_named():
-    spec = EnvSpec(Moody, engine="sync")
-    first, second = (SkillEnv(make_engine(spec, 3)) for _ in range(2))
-    first.reset(Seeds(0))
-    first.step(np.array([0, 1, 0]))
-    assert first.renew(Seeds(1)).tolist() == []
-    assert second.restore(first.state()).tolist() == [1]
-    assert second.obs[:, 0].tolist() == [0.5, 0.0, 0.5]
-
-
-def test_an_episode_that_never_ends_is_ended_where_it_is_too_long_to_be_kept(monkeypatch):
-    monkeypatch.setattr("skillweave.envs.skill_env.LONGEST_EPISODE", 10)
-    env = SkillEnv(make_engine(EnvSpec(Moody, engine="sync"), 2))
-    env.reset(Seeds(0))
-    for _ in range(10):
-        env.step(np.zeros(2, np.int64))
-    assert env.renew(Seeds(1)).tolist() == []
-    env.step(np.zeros(2, np.int64))
-    assert env.renew(Seeds(2)).tolist() == [0, 1]
-    assert env.obs.tolist() == [[0.0], [0.0]]
-    assert env.state()["engine.length"].tolist() == [0, 0]
-
-
-class Second(Skill):
-    """May start where the pole leans to the right."""
-
-    max_steps = 7
-
-    def initiation(self, obs):
-        return obs[:, 2] > 0.02
-
-
-def test_a_search_for_a_start_is_counted_and_repeats_itself():
-    def fresh() -> SkillEnv:
-        return SkillEnv(make_engine(EnvSpec("CartPole-v1", engine="sync"), 3), Second())
-
-    env, again = fresh(), fresh()
-    env.reset(Seeds(5))
-    searched = env.steps_made
-    assert searched > 0
-    for t in range(30):
-        env.step(np.full(3, t % 2))
-    assert env.steps_made > searched + 90, "every start is looked for"
-    env.renew(Seeds(6))
-    assert again.restore(env.state()).tolist() == []
-    for t in range(60):
-        one, other = env.step(np.full(3, t % 2)), again.step(np.full(3, t % 2))
-        np.testing.assert_array_equal(one.obs, other.obs)
-
-
-def test_joined_environments_are_those_of_their_parts():
-    def fresh() -> JoinedEnvs:
-        spec = EnvSpec("CartPole-v1", engine="sync")
-        return JoinedEnvs([SkillEnv(make_engine(spec, 2)) for _ in range(3)])
-
-    joined, parts = fresh(), fresh().parts
-    obs = joined.reset(Seeds(1))
-    assert obs.shape == (6, 4)
-    for i, part in enumerate(parts):
-        np.testing.assert_array_equal(part.reset(Seeds(1) / i), obs[2 * i : 2 * i + 2])
-    action = np.array([0, 1, 1, 0, 1, 1])
-    for _ in range(30):
-        step = joined.step(action)
-        for i, part in enumerate(parts):
-            rows = slice(2 * i, 2 * i + 2)
-            own = part.step(action[rows])
-            np.testing.assert_array_equal(step.obs[rows], own.obs)
-            np.testing.assert_array_equal(step.terminated[rows], own.terminated)
-    assert joined.steps_made == 180
-    joined.renew(Seeds(2))
-    again = fresh()
-    assert again.restore(joined.state()).tolist() == []
-    np.testing.assert_array_equal(again.obs, joined.obs)
-    np.testing.assert_array_equal(again.step(action).obs, joined.step(action).obs)
-
-
-def test_what_begins_anew_at_a_cut_begins_so_after_a_resume_too(monkeypatch):
-    monkeypatch.setattr("skillweave.envs.skill_env.LONGEST_EPISODE", 3)
-    spec = EnvSpec("CartPole-v1", engine="sync")
-    env, again = (SkillEnv(make_engine(spec, 3), Second()) for _ in range(2))
-    env.reset(Seeds(5))
-    for _ in range(5):
-        env.step(np.zeros(3, np.int64))
-    assert len(env.renew(Seeds(6)))
-    assert again.restore(env.state()).tolist() == []
-    for t in range(60):
-        one, other = env.step(np.full(3, t % 2)), again.step(np.full(3, t % 2))
-        np.testing.assert_array_equal(one.obs, other.obs)
+def test_infos_of_joined_engines_are_those_of_one_engine():
+    spec = EnvSpec(Talker, engine="sync")
+    parts, whole = [make_engine(spec, 2) for _ in range(3)], make_engine(spec, 6)
+    for engine in (*parts, whole):
+        engine.reset(0)
+    joined = JoinedEngines(parts)
+    for action in ([0] * 6, [1, 0, 0, 0, 0, 0], [0, 0, 0, 2, 0, 1], [2, 1, 2, 1, 0, 0]):
+        one, two = (e.step(np.array(action)) for e in (joined, whole))
+        same(one.info, two.info)
+    for ids, action in (([5, 0, 3], [1, 0, 2]), ([2, 1], [0, 1]), ([4], [2]), ([3, 2], [1, 2])):
+        one, two = (e.step(np.array(action), np.array(ids)) for e in (joined, whole))
+        told = {k: v for k, v in one.info.items() if np.size(v)}
+        assert told["t"].tolist() == two.info["t"].tolist()
+        if 1 in action:
+            assert told["word"].tolist() == two.info["word"].tolist()
+        if 2 in action:
+            same(told["deep"]["even"], two.info["deep"]["even"])

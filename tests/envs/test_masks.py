@@ -7,12 +7,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from skillweave.envs.foreign import FromVectorEnv
-from skillweave.envs.skill_env import SkillEnv
 
 from skillweave import DQN, PPO, SAC, Hierarchy, Network, Skill, SkillweaveError, evaluate
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.options import OptionsEnv
@@ -76,9 +77,8 @@ def first_allowed(mask: Array) -> Array:
 # Engines -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["sync", "async"])
-def test_an_engine_knows_what_is_allowed_in_the_latest_observation_of_each_environment(name):
-    engine = make_engine(EnvSpec(Gate, engine=name), 3)
+def test_an_engine_knows_what_is_allowed_in_the_latest_observation_of_each_environment():
+    engine = make_engine(EnvSpec(Gate, engine="sync"), 3)
     try:
         obs = engine.reset(0).copy()
         for ids in ([0, 1, 2], [2, 0], [2], None, [1, 2], [2, 1], None, None):
@@ -195,45 +195,36 @@ class Late(Skill):
         return step.next_obs[:, 1] == 4
 
 
-@pytest.mark.parametrize("skill", [None, Skill(), Late()])
-def test_a_loop_is_told_the_masks_of_what_to_act_on_and_of_true_successors(skill):
-    env = SkillEnv(make_engine(EnvSpec(Gate), 4), skill)
-    obs, ended = env.reset(Seeds(0)), 0
-    for _ in range(40):
-        mask = env.mask()
-        assert mask.tolist() == wanted(obs).tolist()
-        step = env.step(first_allowed(mask))
-        assert step.mask.tolist() == wanted(step.obs).tolist()
-        after = step.mask if step.next_mask is None else step.next_mask
-        alive = ~step.terminated
-        assert after[alive].tolist() == wanted(step.next_obs)[alive].tolist()
-        obs, ended = step.obs, ended + int(step.ended.sum())
-    assert ended > 10
-
-
-def test_a_foreign_vectors_masks_are_read_as_well():
-    vector = SyncVectorEnv([Gate] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
-    env = FromVectorEnv(vector)
-    obs = env.reset(Seeds(0))
-    truncated = 0
-    for _ in range(40):
-        mask = env.mask()
-        assert (mask.dtype, mask.tolist()) == (np.bool_, wanted(obs).tolist())
-        step = env.step(first_allowed(mask))
-        after = step.mask if step.next_mask is None else step.next_mask
-        alive = ~step.terminated
-        assert after[alive].tolist() == wanted(step.next_obs)[alive].tolist()
-        truncated += int(step.truncated.sum())
-        obs = step.obs
-    assert truncated > 3
-
-
 SMALL = Network((8,))
 LEARNERS = [
     PPO(num_envs=4, n_steps=16, batch_size=32, network=SMALL),
     DQN(num_envs=4, learning_starts=100, update_ratio=0.1, batch_size=8, network=SMALL),
     SAC(num_envs=4, learning_starts=100, update_ratio=0.1, batch_size=8, network=SMALL),
 ]
+
+
+@pytest.mark.parametrize("at_random", [True, False])
+@pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda a: type(a).__name__)
+@pytest.mark.parametrize("skill", [None, Skill(), Late()])
+def test_rows_have_the_masks_of_what_was_acted_on_and_of_true_successors(
+    skill, algorithm, at_random
+):
+    # Gate raises an error where the learner, or the search for a start, takes what is forbidden.
+    learner = make_algorithm(algorithm, Gate.observation_space, Gate.action_space)
+    params = learner.acting_params(learner.init([Seeds(0)]), 0.0)
+    collector = SkillCollector(make_engine(EnvSpec(Gate), 4), Acting([(learner, 1)], 4), skill)
+    collector.start(Seeds(0))
+    how = {"at_random": at_random and learner.store == "replay"}
+    for i in range(3):
+        asked = Request(30, (params,), np.array([0.9]), Seeds(i), **how)
+        experience = collector.collect(asked).experience
+        valid = np.ones((30, 4), bool) if experience.valid is None else experience.valid
+        assert valid.all() == (not isinstance(skill, Late))
+        assert experience.obs_mask[valid].tolist() == wanted(experience.obs[valid]).tolist()
+        goes_on = valid & ~experience.terminated
+        after = experience.next_obs_mask[goes_on]
+        assert after.tolist() == wanted(experience.next_obs[goes_on]).tolist()
+        assert experience.ended[valid].sum() > 10
 
 
 @pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda a: type(a).__name__)
@@ -313,6 +304,12 @@ def test_each_skill_is_told_the_masks_of_its_own_environments(nested):
     for t in range(30):
         _, info = env.step((np.arange(4) + t) % 2)[-2:]
         assert "action_mask" not in info, "the selector's masks are of skills"
+    learner = make_algorithm(LEARNERS[0], Gate.observation_space, gym.spaces.Discrete(2))
+    params = learner.acting_params(learner.init([Seeds(0)]), 0.0)
+    decides = DecisionCollector(make_engine(EnvSpec(Gate), 4), Acting([(learner, 1)], 4), skills)
+    decides.start(Seeds(0))
+    told = decides.collect(Request(60, (params,), np.array([0.9]), Seeds(1))).experience
+    assert told.obs_mask is None, "the selector's masks are of skills"
     policy = HierarchyPolicy(constant(1, 2), skills)
     evaluate(policy, EnvSpec(Gate), episodes=7, num_envs=3)
     for part in masked:

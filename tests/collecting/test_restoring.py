@@ -1,0 +1,221 @@
+"""Collectors that are brought back stand where they stood, or begin anew and say where."""
+
+import itertools
+from dataclasses import fields
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from reference_calls import POSITION, Counter, Left, Right, Zigzag, shy
+from toy_acting import Again, Choices, Counts, Given, requests, step
+
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.seeding import Seeds
+from skillweave.skills import Skill
+from skillweave.types import SkillweaveError
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
+
+
+def equal(one, two):
+    """Whether two collectors have found the same, and that is all there is."""
+    for field in fields(one.experience):
+        first, second = (getattr(c.experience, field.name) for c in (one, two))
+        assert (first is None) == (second is None), field.name
+        if field.name == "spent":
+            assert first == second
+        elif first is not None:
+            np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(one.episodes, two.episodes)
+
+
+class Aside(Skill):
+    """May start to the left only, so it must be searched for."""
+
+    max_steps = 6
+
+    def initiation(self, obs):
+        return obs[:, POSITION] <= -1
+
+
+class Falling(Skill):
+    """CartPole: may start where the pole leans to the right."""
+
+    max_steps = 7
+
+    def initiation(self, obs):
+        return obs[:, 2] > 0.02
+
+
+def engine_of(env, num_envs=3, engine="sync"):
+    return make_engine(EnvSpec(env, engine=engine), num_envs, threads=1)
+
+
+def of_skill(env=Again, skill=None, engine="sync", actions=3, reflexes=(), acting=Counts):
+    def make():
+        made = engine_of(env, engine=engine)
+        return SkillCollector(made, acting(made.num_envs, actions), skill, reflexes)
+
+    return make
+
+
+def of_selector(greedy=True):
+    def make():
+        skills = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
+        calls = SkillSet(skills, tuple(s.policy for s in skills), call_steps=5, greedy=greedy)
+        return DecisionCollector(engine_of(Again), Counts(3, 4), calls, keep_rewards=True)
+
+    return make
+
+
+KINDS = {
+    "task": of_skill(),
+    "skill": of_skill(skill=Left()),
+    "skill with a search": of_skill(skill=Aside()),
+    "skill with reflexes": of_skill(skill=Aside(), reflexes=(shy(),)),
+    "CartPole": of_skill("CartPole-v1", Falling(), actions=2),
+    "EnvPool": of_skill("CartPole-v1", Falling(), "envpool", 2),
+    "selector": of_selector(),
+    "selector of skills that sample": of_selector(greedy=False),
+}
+
+
+@pytest.mark.parametrize("rows", [1, 13])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_collector_that_is_restored_goes_on_bit_for_bit(kind, rows):
+    if kind == "EnvPool":
+        pytest.importorskip("envpool")
+    first, again, asked = KINDS[kind](), KINDS[kind](), requests(rows)
+    try:
+        first.start(Seeds(3))
+        for request in itertools.islice(asked, -(-40 // rows)):
+            first.collect(request)
+        assert not len(first.cut(Seeds(4)))
+        state = {k: v.copy() for k, v in first.state().items()}
+        assert not len(again.restore(state))
+        again.start(Seeds(9))  # it is under way: nothing happens
+        for request in itertools.islice(asked, -(-40 // rows)):
+            equal(first.collect(request), again.collect(request))
+        for name, kept in again.state().items():
+            np.testing.assert_array_equal(kept, first.state()[name])
+    finally:
+        first.close()
+        again.close()
+
+
+class Moody(gym.Env):
+    """Does not repeat itself: its observation is drawn from a stream that no seed begins anew."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    stream = np.random.default_rng(0)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1), {}
+
+    def step(self, action):
+        moody = bool(action)
+        return np.array([self.stream.random() if moody else 0.5]), 1.0, False, False, {}
+
+
+def given(env, num_envs=3, skill=None):
+    collector = SkillCollector(engine_of(env, num_envs), Given(num_envs), skill)
+    collector.start(Seeds(0))
+    return collector
+
+
+def test_environments_that_do_not_repeat_themselves_begin_anew_and_are_named():
+    first, second = given(Moody), given(Moody)
+    step(first, [0, 1, 0])
+    assert first.cut(Seeds(1)).tolist() == []
+    assert second.restore(first.state()).tolist() == [1]
+    assert second.obs[:, 0].tolist() == [0.5, 0.0, 0.5]
+    assert second.kept["age"].tolist() == [1, 0, 1]
+    assert second.kept["sums"][:, 0].tolist() == [1.0, 0.0, 1.0]
+
+
+class Hasty(gym.Env):
+    """Ends after two steps in every second process that plays it; it shows nothing of that."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    hurry = False
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(1), 1.0, bool(Hasty.hurry and action and self.t == 2), False, {}
+
+
+def test_an_episode_that_ends_early_when_it_is_played_again_begins_anew(monkeypatch):
+    first, second = given(Hasty), given(Hasty)
+    for _ in range(5):
+        step(first, [0, 1, 0])
+    first.cut(Seeds(1))
+    monkeypatch.setattr(Hasty, "hurry", True)
+    assert second.restore(first.state()).tolist() == [1]
+    monkeypatch.setattr(Hasty, "hurry", False)
+    assert step(second, [0, 0, 0]).experience.terminated.tolist() == [[False] * 3]
+    assert second.cut(Seeds(2)).tolist() == []
+    assert second.state()["kept.elapsed"].tolist() == [6, 1, 6]
+
+
+def test_an_episode_that_never_ends_is_ended_where_it_is_too_long_to_be_kept(monkeypatch):
+    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", 10)
+    env = given(Moody, 2)
+    for _ in range(10):
+        step(env, [0, 0])
+    assert env.cut(Seeds(1)).tolist() == []
+    step(env, [0, 0])
+    assert env.cut(Seeds(2)).tolist() == [0, 1]
+    assert env.obs.tolist() == [[0.0], [0.0]]
+    assert env.state()["engine.length"].tolist() == [0, 0]
+    assert env.state()["kept.age"].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("kind", ["skill with a search", "CartPole", "selector"])
+def test_what_begins_anew_at_a_cut_begins_so_after_a_resume_too(kind, monkeypatch):
+    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", 3)
+    first, again, asked = KINDS[kind](), KINDS[kind](), requests(5)
+    first.start(Seeds(5))
+    first.collect(next(asked))
+    assert len(first.cut(Seeds(6)))
+    assert again.restore(first.state()).tolist() == []
+    for request in itertools.islice(asked, 12):
+        equal(first.collect(request), again.collect(request))
+
+
+def test_where_an_episode_begins_anew_at_a_cut_its_open_call_is_forgotten(monkeypatch):
+    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", 2)
+    skills = SkillSet((Zigzag(),), (Zigzag.policy,), call_steps=9)
+    env = DecisionCollector(engine_of(Again), Choices(3, 1), skills, keep_rewards=True)
+    env.start(Seeds(0))
+    env.collect(next(requests(3)))
+    cut = env.cut(Seeds(1))
+    assert len(cut)
+    assert env.kept["over"][cut].all()
+    experience = env.collect(next(requests(9))).experience
+    for column in cut:  # the first decision is the new episode's first
+        assert experience.obs[0, column, 2] == 0
+        lasted = experience.next_obs[0, column, 2] - experience.obs[0, column, 2]
+        assert experience.steps[0, column] == lasted
+        each = experience.rewards[0, column]
+        assert not each[int(lasted) :].any()
+        total = (each * 0.97 ** np.arange(len(each))).sum()
+        assert total == pytest.approx(experience.reward[0, column], abs=1e-5)
+
+
+def test_a_state_of_another_kind_of_collector_is_refused():
+    first, other = KINDS["task"](), of_skill(acting=Choices)()
+    first.start(Seeds(0))
+    first.cut(Seeds(1))
+    with pytest.raises(SkillweaveError, match=r"'memory' of open episodes is float32 \(3, 1\)"):
+        other.restore(first.state())
