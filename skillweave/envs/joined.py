@@ -102,7 +102,7 @@ def _infos(infos: Sequence[dict[str, Any]], counts: Sequence[int]) -> dict[str, 
             found[name] = _infos([value or {} for value in values], counts)
         elif isinstance(example, np.ndarray) and example.ndim:
             rest, kind = example.shape[1:], example.dtype
-            nothing = None if kind == object else np.zeros((), kind)
+            nothing = None if kind.kind == "O" else np.zeros((), kind)
             found[name] = np.concatenate(
                 [
                     np.full((count, *rest), nothing, kind) if value is None else value

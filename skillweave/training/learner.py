@@ -81,15 +81,19 @@ class Learner(Protocol):
 
 
 class RolloutLearner:
-    """One stack that learns from its latest rollout, then forgets it."""
+    """One stack that learns from its latest rollout, then forgets it.
+
+    Args:
+        quota: valid rows that each member collects before it learns; 0: what there is.
+    """
 
     report_every = 0
 
-    def __init__(self, stack: Stack, seeds: Seeds) -> None:
+    def __init__(self, stack: Stack, seeds: Seeds, quota: int = 0) -> None:
         self.stacks, self._stack, self._seeds = (stack,), stack, seeds
         config = stack.algorithm.config
         self.overlap, self.threads = bool(config.overlap), int(config.threads)
-        self._store = RolloutStore(stack.members, device=stack.state.params.device)
+        self._store = RolloutStore(stack.members, quota, stack.state.params.device)
         self._log_std: Tensor | None = None
         self._progress = 0.0  # where the rollout began, so that the first has the whole rate
 
@@ -122,14 +126,15 @@ class RolloutLearner:
         return metrics
 
     def cut(self, columns: Array) -> None:
-        """Nothing is kept from one update to the next."""
+        """Nothing to do: trajectories end with each experience."""
 
     def kept(self) -> dict[str, Tensor]:
-        """Nothing."""
-        return {}
+        """Rows of which there are not enough yet."""
+        return self._store.state()
 
     def load(self, kept: dict[str, Tensor]) -> None:
-        """Nothing to do."""
+        """Go on from what a checkpoint kept."""
+        self._store.load(kept)
 
 
 class ReplayLearner:
@@ -309,7 +314,9 @@ def learner_of(
         row_steps, goes_on_at: as of ``ReplayLearner``.
     """
     if stack.algorithm.store == "rollout":
-        return RolloutLearner(stack, seeds)
+        # A skill that is seldom where it may start learns from batches that are worth it.
+        full = int(stack.algorithm.config.n_steps) * num_envs // stack.members
+        return RolloutLearner(stack, seeds, full // 2 if row_steps == 1 else 0)
     store = store_of(stack.algorithm, num_envs, stack.members)
     return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
 
