@@ -302,7 +302,7 @@ def environment_cases(draw: Any) -> Case:
     place, after = draw(st.sampled_from(PLACES)), draw(st.integers(0, 9))
     make = draw(_makers())
     scalar = place in ("reward", "terminated", "truncated") and draw(st.booleans())
-    asynchronous = draw(st.integers(0, 49)) == 0
+    workers = 2 if draw(st.integers(0, 49)) == 0 else 1
 
     class Bad(Ramp):
         steps = 0
@@ -328,8 +328,9 @@ def environment_cases(draw: Any) -> Case:
             return tuple(found.values())
 
     Bad.__name__ = "Bad"
-    spec = EnvSpec(Bad, engine="async" if asynchronous else "auto")
+    spec = EnvSpec(Bad, workers=workers)
     label = f"{place} {make.__name__}{' scalar' if scalar else ''} after {after} steps"
+    label += f" in {workers} processes" if workers > 1 else ""
     names = ("Bad", "step")
     return Case("environment", label, names, lambda folder: train(folder, spec))
 
@@ -359,7 +360,7 @@ def maker_cases(draw: Any) -> Case:
         st.one_of(_anything(), _makers().map(lambda m: lambda: m(2)), st.just(lambda: shared))
     )
     if draw(st.booleans()):
-        field = draw(st.sampled_from(("kwargs", "wrappers", "engine", "env")))
+        field = draw(st.sampled_from(("kwargs", "wrappers", "engine", "env", "workers")))
         value = {field: draw(_anything())}
         made: Any = lambda: EnvSpec(**{"env": "CartPole-v1", **value})  # noqa: E731
         return Case("maker", f"EnvSpec {field}", (), lambda folder: train(folder, made()))

@@ -157,7 +157,7 @@ KINDS: dict[str, Kind] = {
         lambda: alone(CART, PPO(**LEARNS, network=NET, normalize_obs=True, target_kl=0.02), 4000)
     ),
     "workers": Kind(
-        lambda: alone(EnvSpec(CART, engine="async"), PPO(**LEARNS, network=NET), 2000)
+        lambda: alone(EnvSpec(CART, engine="sync", workers=2), PPO(**LEARNS, network=NET), 2000)
     ),
     "population": Kind(
         lambda: alone(EnvSpec(CART, engine="sync"), PPO(**LEARNS, network=NET), 800),

@@ -12,20 +12,19 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.shared_memory import SharedMemory
 from time import monotonic
 from typing import Any
 
-import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected, Collector
 from skillweave.collecting.group import Collectors, _joined_states, split_states
-from skillweave.experience import Experience
+from skillweave.collecting.shared_columns import ColumnWriter, SharedColumns
 from skillweave.messages import told
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError
@@ -205,8 +204,8 @@ class ProcessCollectors(Collectors):
         error, answer = worker.pipe.recv()
         if error is not None:
             raise SkillweaveError(f"{error} (in worker {worker.number})")
-        if isinstance(answer, _Columns):
-            return answer.read(worker)
+        if isinstance(answer, SharedColumns):
+            worker.memory, answer = answer.read(worker.memory)
         return answer
 
     def _died(self, worker: _Worker) -> SkillweaveError:
@@ -221,64 +220,6 @@ class ProcessCollectors(Collectors):
             f"{self._name}: the process of worker {worker.number} (environments {first} to "
             f"{first + self._each - 1}) died {how}, and again when it was made anew"
         )
-
-
-@dataclass
-class _Columns:
-    """An experience whose arrays lie in shared memory: where, of which kind, and which shape."""
-
-    name: str  # of the memory; "" where it is known
-    places: dict[str, tuple[int, Any, tuple[int, ...]]]
-    spent: int
-    episodes: Array
-
-    def read(self, worker: _Worker) -> Collected:
-        """The experience; its arrays are views of the memory, good until the next request."""
-        if self.name:
-            if worker.memory is not None:
-                worker.memory.close()
-            worker.memory = SharedMemory(self.name)
-            worker.memory.unlink()  # it goes when both have closed it, however they end
-        assert worker.memory is not None
-        found = {
-            k: np.ndarray(shape, dtype, worker.memory.buf, at)
-            for k, (at, dtype, shape) in self.places.items()
-        }
-        return Collected(Experience(**found, spent=self.spent), self.episodes)
-
-
-class _Writer:
-    """Puts experience into shared memory, which grows where it must."""
-
-    def __init__(self) -> None:
-        self.memory: SharedMemory | None = None
-
-    def write(self, collected: Collected) -> _Columns:
-        """Copy all arrays; what the parent needs to read them."""
-        experience = collected.experience
-        arrays = {
-            f.name: value
-            for f in fields(experience)
-            if isinstance(value := getattr(experience, f.name), np.ndarray)
-        }
-        size = sum(_room(a) for a in arrays.values())
-        name = ""
-        if self.memory is None or self.memory.size < size:
-            if self.memory is not None:
-                self.memory.close()
-            self.memory = SharedMemory(create=True, size=size + size // 4)
-            name = self.memory.name
-        places, at = {}, 0
-        for k, a in arrays.items():
-            np.ndarray(a.shape, a.dtype, self.memory.buf, at)[...] = a
-            places[k] = (at, a.dtype, a.shape)
-            at += _room(a)
-        return _Columns(name, places, experience.spent, collected.episodes)
-
-
-def _room(array: Array) -> int:
-    """Bytes of an array, rounded up so that the next one begins where a number may."""
-    return -(-array.nbytes // 64) * 64
 
 
 def _release(worker: _Worker) -> None:
@@ -316,7 +257,7 @@ def _work(
     try:
         collector = make.fn(each, number * each)
         pipe.send((None, None))
-        writer = _Writer()
+        writer = ColumnWriter()
         for what, task in _tasks(pipe, parent):
             answer: Any
             answer = collector.state() if what == "state" else getattr(collector, what)(task)

@@ -22,8 +22,6 @@ from reference_calls import (
     seeds_of,
     shy,
 )
-from skillweave.envs.foreign import FromVectorEnv
-from skillweave.envs.skill_env import SkillEnv
 from toys import cartpole
 
 from skillweave.algorithms.config import PPO
@@ -154,11 +152,6 @@ def test_a_power_of_two_as_gamma_agrees_to_the_last_bit(options):
         assert info["call_return"].tolist() == [w.plain for w in want]
 
 
-def test_environments_in_processes_of_their_own_agree_too(options):
-    env = options(skill_set(*ALL), num_envs=2, engine="async")
-    agree(env, [Scalar(Walk(), env.skills.skills, 4, 0.97) for _ in range(2)], 20, seed=0)
-
-
 class Push(Skill):
     """CartPole: to the left."""
 
@@ -281,12 +274,6 @@ def test_without_call_steps_a_skill_goes_on_until_it_stops(options):
     assert seen["steps"].max() > 3
 
 
-def test_every_environment_may_have_its_own_gamma(options):
-    gamma = np.linspace(0.5, 1.0, N)
-    env = options(skill_set(*ALL, call_steps=6), gamma=gamma)
-    agree(env, [Scalar(Walk(), env.skills.skills, 6, float(g)) for g in gamma], 40, seed=2)
-
-
 def test_a_time_limit_keeps_the_discount_and_a_termination_makes_it_zero(options):
     env = options(skill_set(Zigzag, call_steps=40), gamma=0.5)
     env.reset(seed=0)
@@ -391,8 +378,7 @@ class Nested(gym.Env):
         return obs, 0.0, False, False, {"id": self.number, "deep": deep}
 
 
-@pytest.mark.parametrize("engine", ["sync", "async"])
-def test_a_skill_sees_its_own_rows_of_info_however_deep(options, engine):
+def test_a_skill_sees_its_own_rows_of_info_however_deep(options):
     seen = []
 
     class Watching(Skill):
@@ -405,7 +391,7 @@ def test_a_skill_sees_its_own_rows_of_info_however_deep(options, engine):
     class Short(Skill):
         policy, max_steps = Watching.policy, 2
 
-    env = options(skill_set(Short, Watching, call_steps=4), Nested, num_envs=4, engine=engine)
+    env = options(skill_set(Short, Watching, call_steps=4), Nested, num_envs=4)
     env.reset(seed=0)
     env.step(np.array([0, 1, 0, 1]))
     assert len(seen) == 4
@@ -415,26 +401,6 @@ def test_a_skill_sees_its_own_rows_of_info_however_deep(options, engine):
         for found in (info["id"], deep["id"], deep["deeper"]["id"]):
             assert found.tolist() == rows
         assert list(deep["word"]) == [f"env {r}" for r in rows]
-
-
-def test_a_skill_sees_the_same_steps_under_a_selector_as_in_training(options):
-    in_training, in_calls = {}, {}
-    trained, called = recorder(in_training, max_steps=3), recorder(in_calls, max_steps=3)
-    engine = make_engine(EnvSpec(Walk, engine="sync"), 200)
-    alone = SkillEnv(engine, trained())
-    alone.reset(Seeds(0))
-    env = options(skill_set(called, call_steps=None), num_envs=200)
-    env.reset(seed=(Seeds(0) / "env").integer())
-    for _ in range(3):
-        alone.step(np.full(200, 2))
-    env.step(np.zeros(200, int))
-    ends = [v for v in in_calls.values() if v[5] == 3]
-    assert any(v[2] for v in ends), "no episode terminated on the skill's last step"
-    assert any(not v[2] for v in ends)
-    # in training a skill's episode is over at its end, and its next begins: compare what both saw
-    shared = in_calls.keys() & in_training.keys()
-    assert len(shared) >= len(in_calls) > 400
-    assert [in_calls[k] for k in sorted(shared)] == [in_training[k] for k in sorted(shared)]
 
 
 # Initiation sets -----------------------------------------------------------------------------
@@ -458,7 +424,6 @@ def test_without_initiation_sets_there_is_no_mask(options):
     env = options(skill_set(Left, Zigzag))
     assert "action_mask" not in env.reset(seed=0)[1]
     assert "action_mask" not in env.step(np.zeros(N, int))[-1]
-    assert FromVectorEnv(env).mask() is None
 
 
 def test_choosing_a_skill_that_may_not_start_names_it_and_the_environment(options):
@@ -689,24 +654,6 @@ def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):
     assert counted > 10
 
 
-def test_the_loops_view_of_it_has_steps_masks_and_true_successors(options):
-    env = FromVectorEnv(options(skill_set(Left, Right, Zigzag, call_steps=6)))
-    obs = env.reset(Seeds(0))
-    ended = 0
-    for _ in range(20):
-        mask = env.mask()
-        assert mask[:, 1].tolist() == (obs[:, POSITION] < 2).tolist()
-        step = env.step(np.where(mask[:, 1], 1, 2))
-        same = step.next_obs[:, EPISODE] == obs[:, EPISODE]
-        assert same.all()
-        moved = step.next_obs[:, T] - obs[:, T]
-        assert step.steps.tolist() == moved.tolist()
-        assert not (step.terminated & step.truncated).any()
-        ended += int(step.ended.sum())
-        obs = step.obs
-    assert ended
-
-
 # EnvPool -------------------------------------------------------------------------------------
 
 
@@ -769,23 +716,6 @@ def test_envpool_steps_only_those_whose_calls_go_on(options):
         ends += int(terminated.sum())
     assert different > 10
     assert ends > 3
-
-
-def test_where_gammas_differ_the_reward_of_every_step_of_a_call_is_told(options):
-    gamma = np.linspace(0.5, 1.0, N)
-    env = options(skill_set(*ALL, call_steps=6), gamma=gamma)
-    env.reset(seed=0)
-    for i in range(20):
-        _, reward, _, _, info = env.step(np.full(N, i % len(ALL)))
-        each, steps = info["rewards"], info["steps"]
-        assert each.shape == (N, steps.max())
-        assert not each[np.arange(each.shape[1]) >= steps[:, None]].any()
-        np.testing.assert_allclose(each.sum(1), info["call_return"], rtol=1e-5, atol=1e-6)
-        own = (each * gamma[:, None] ** np.arange(each.shape[1])).sum(1)
-        np.testing.assert_allclose(own, reward, rtol=1e-5, atol=1e-6)
-    alone = options(skill_set(*ALL, call_steps=6), gamma=0.9)
-    alone.reset(seed=0)
-    assert "rewards" not in alone.step(np.zeros(N, int))[-1]
 
 
 def test_a_memory_that_no_checkpoint_could_hold_is_refused_by_the_skills_name():

@@ -1,4 +1,4 @@
-"""Environments in processes of their own: every fault is a sentence, and nothing hangs."""
+"""Collectors in processes of their own: every fault is a sentence, and nothing hangs."""
 
 import multiprocessing as mp
 import os
@@ -10,9 +10,15 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from toy_acting import Given, requests
 
+from skillweave.collecting.processes import ProcessCollectors
+from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
+
+PID = 8  # the reward is the process
 
 
 class Unpicklable(Exception):
@@ -24,11 +30,10 @@ class Unpicklable(Exception):
 
 
 class Faulty(gym.Env):
-    """At the step that the action names, something happens."""
+    """Something happens that the action names."""
 
     observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     action_space = gym.spaces.Discrete(9)
-    PID = 8  # the reward is the process
 
     def reset(self, *, seed=None, options=None):
         return np.zeros(1, np.float32), {}
@@ -49,7 +54,7 @@ class Faulty(gym.Env):
                 return np.zeros(1, np.float32), 0.0, False, False, {"f": lambda: 0}
             case 7:
                 time.sleep(1_000)
-        return np.zeros(1, np.float32), float(os.getpid()), False, False, {}
+        return np.zeros(1, np.float32), float(os.getpid() % 2**20), False, False, {}
 
 
 class Stubborn(Faulty):
@@ -62,18 +67,44 @@ class Stubborn(Faulty):
         time.sleep(1_000)
 
 
+class Plan(Given):
+    """In row ``late`` the second worker's second environment does ``action``, else all do 8."""
+
+    def __init__(self, first, action, late=1):
+        super().__init__(2)
+        self.first, self.action, self.late, self.at = first, action, late, 0
+
+    def some(self, rows, obs, mask, memory):
+        self.then = np.full(2, PID)
+        if self.first == 2 and self.at == self.late:
+            self.then[1] = self.action
+        self.at += 1
+        return super().some(rows, obs, mask, memory)
+
+
+def collectors_of(env=Faulty, action=PID, late=1):
+    """Two workers with two environments each."""
+
+    def make(num_envs, first):
+        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
+        return SkillCollector(engine, Plan(first, action, late))
+
+    found = ProcessCollectors(make, 2, 2, 1, "Faulty")
+    found.start(Seeds(0))
+    return found
+
+
 @pytest.fixture
-def engine():
+def collectors():
     made = []
 
-    def make(env=Faulty, num_envs=3):
-        made.append(make_engine(EnvSpec(env, engine="async"), num_envs))
-        made[-1].reset(0)
+    def of(**how):
+        made.append(collectors_of(**how))
         return made[-1]
 
-    yield make
-    for e in made:
-        e.close()
+    yield of
+    for each in made:
+        each.close()
 
 
 def alive(pid: int) -> bool:
@@ -85,74 +116,70 @@ def alive(pid: int) -> bool:
         return False
 
 
-def pids(e) -> list[int]:
-    return [int(p) for p in e.step(np.full(e.num_envs, Faulty.PID)).reward]
+def pids(collectors) -> list[int]:
+    """The workers' processes."""
+    return [worker.process.pid for worker in collectors._workers]
 
 
 @pytest.mark.parametrize(
     ("action", "says"),
     [
-        (1, r"raised ValueError: the wing fell off \(test_workers\.py, line \d+\)"),
-        (2, "raised Unpicklable: code 7"),
-        (3, "died with exit code 5"),
-        (4, "died by signal 9"),
-        (5, "SystemExit: enough"),
-        (6, "environment 1: .*(pickle|Pickl)"),
+        (1, r"environment 3, step 2.*raised ValueError: the wing fell off \(test_workers\.py, lin"),
+        (2, "environment 3, step 2.*raised Unpicklable: code 7"),
+        (3, r"worker 1 \(environments 2 to 3\) died with exit code 5"),
+        (4, r"worker 1 \(environments 2 to 3\) died by signal 9"),
+        (5, "SystemExit: enough.*in worker 1"),
     ],
 )
-def test_what_goes_wrong_in_a_process_is_told_with_the_environment_and_the_step(
-    engine, action, says
-):
-    e = engine()
-    e.step(np.zeros(3, np.int64))
-    with pytest.raises(SkillweaveError, match=f"(?s){says}") as raised:
-        e.step(np.array([0, action, 0]))
-    assert "environment 1" in str(raised.value)
-    if action in (1, 2, 3, 4):
-        assert "step 2" in str(raised.value)
+def test_what_goes_wrong_in_a_process_is_told_with_who_it_was(collectors, action, says):
+    with pytest.raises(SkillweaveError, match=f"(?s){says}"):
+        collectors(action=action).collect(next(requests(3)))
+
+
+def test_an_info_that_cannot_leave_its_process_does_no_harm(collectors):
+    experience = collectors(action=6).collect(next(requests(3))).experience
+    assert (experience.reward[:, :3] > 0).all()
+    assert experience.reward[1, 3] == 0.0
 
 
 @pytest.mark.parametrize("env", [Faulty, Stubborn])
-def test_closing_ends_every_process_whatever_it_does(engine, env):
-    e = engine(env)
-    processes = pids(e)
-    assert len(set(processes)) == 3
-    assert os.getpid() not in processes
-    e.close()
+def test_closing_ends_every_process_whatever_it_does(collectors, env):
+    made = collectors(env=env)
+    processes = pids(made)
+    rewards = made.collect(next(requests(2))).experience.reward
+    assert rewards[0].tolist() == [p % 2**20 for p in processes for _ in range(2)]
+    assert len({*processes, os.getpid()}) == 3
+    made.close()
     assert not any(alive(pid) for pid in processes)
 
 
 def test_a_constructor_that_fails_in_a_process_is_told():
-    def make():
-        if os.getpid() != parent:
+    class Ruined(Faulty):
+        def __init__(self):
             raise ValueError("no device")
-        return Faulty()
 
-    parent = os.getpid()
-    with pytest.raises(SkillweaveError, match=r"make \(environment \d\).*ValueError: no device"):
-        make_engine(EnvSpec(make, engine="async"), 2)
+    with pytest.raises(SkillweaveError, match=r"Ruined \(environment \d\).*ValueError: no device"):
+        collectors_of(env=Ruined)
 
 
 def stuck(tell) -> None:
-    """A run whose second environment never answers; tells the processes, then how it ended."""
+    """A run whose last environment never answers; tells the processes, then how it ended."""
     os.setsid()  # a group of its own, to which the terminal would send Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    e = make_engine(EnvSpec(Faulty, engine="async"), 2)
+    made = collectors_of(action=7)
     try:
-        e.reset(0)
-        tell.send(pids(e))
-        e.step(np.array([0, 7]))
+        tell.send(pids(made))
+        made.collect(next(requests(3)))
     except KeyboardInterrupt:
         tell.send("stopped")
     finally:
-        e.close()
+        made.close()
 
 
 def waiting(tell) -> None:
     """A run whose environments have nothing to do."""
-    e = make_engine(EnvSpec(Faulty, engine="async"), 2)
-    e.reset(0)
-    tell.send(pids(e))
+    made = collectors_of()
+    tell.send(pids(made))
     time.sleep(1_000)
 
 
@@ -204,8 +231,7 @@ def test_environments_with_other_spaces_are_refused():
             self.observation_space = gym.spaces.Box(-1.0, 1.0, (size,), np.float32)
 
     def growing():
-        return Grows(os.getpid() % 1_000 + next(numbers))
+        return Grows(1 + next(numbers))
 
-    for engine in ("sync", "async"):
-        with pytest.raises(SkillweaveError, match=r"growing.*(differ|other spaces)"):
-            make_engine(EnvSpec(growing, engine=engine), 2)
+    with pytest.raises(SkillweaveError, match=r"growing.*(differ|other spaces)"):
+        make_engine(EnvSpec(growing, engine="sync"), 2)
