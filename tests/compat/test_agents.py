@@ -98,9 +98,7 @@ def test_learn_takes_the_log_probabilities_as_they_are_given(kind):
     rollout = rollout_of(
         native.learner, native.member.state, states, actions, given, rewards, ends, after
     )
-    found, _ = native.learner.head.stats(
-        rollout.head, rollout.log_std, None, rollout.transition.action
-    )
+    found, _ = native.learner.head.stats(rollout.head, rollout.log_std, None, rollout.action)
     np.testing.assert_allclose(found.flatten(), np.concatenate(given), atol=1e-4)
 
 
@@ -111,7 +109,7 @@ def test_a_record_becomes_a_rollout_that_ends_where_it_ended():
     native = agent.native
     tr = rollout_of(
         native.learner, native.member.state, states, actions, log_probs, rewards, ends, after
-    ).transition
+    )
     np.testing.assert_allclose(tr.discount[0, :, 0], [0.9, 0.0, 0.9, 0.9])
     assert tr.last[0].tolist() == [[False, False], [True, False], [False, False], [True, True]]
     np.testing.assert_array_equal(tr.next_obs[0, 0], states[1])
