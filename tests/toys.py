@@ -11,16 +11,25 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from skillweave.training.collector import Collector
-from skillweave.training.off_policy import train_off_policy
-from skillweave.training.on_policy import train_on_policy
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.group import Collectors
+from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.envs.engine import RawStep
 from skillweave.seeding import Seeds
+from skillweave.skills import Skill
+from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import pack
-from skillweave.types import Array, VecStep
+from skillweave.training.episodes import Episodes
+from skillweave.training.learner import Learner, ReplayLearner, Stack, learner_of, store_of
+from skillweave.training.loop import Progress, resume, train
+from skillweave.types import Array
 
 
 def cartpole(obs: Array, action: int) -> Array:
@@ -88,59 +97,64 @@ class Rememberer(gym.Env):
 
 
 class Toy:
-    """A VecEnv whose N environments are written as one; subclasses say ``first`` and ``play``."""
+    """An engine whose N environments are written as one; subclasses say ``first`` and ``play``."""
 
     observation_space: gym.Space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     action_space: gym.Space = gym.spaces.Discrete(2)
+    row_steps = 1
 
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs
         self.obs: Array = np.empty(0)
         self.steps_made = 0
 
-    def renew(self, seeds: Seeds) -> Array:
-        return np.arange(0)
+    def first(self, rows: Array) -> Array:
+        """First observations of the environments ``rows``."""
+        return np.zeros((len(rows), 1), np.float32)
 
-    def set_gamma(self, gamma: Array) -> None:
+    def play(self, action: Array) -> tuple[Array, Array, Array, Array]:
+        """next_obs, reward, terminated, truncated."""
+        raise NotImplementedError
+
+    def collector(self, acting: Acting | None, shared: bool = False) -> Collector:
+        """A collector of its environments."""
+        return SkillCollector(self, acting)
+
+    def mask(self) -> Array | None:
+        return None
+
+    def reset(self, seed: int) -> Array:
+        self.rng = Seeds(seed).numpy()
+        self.t = np.zeros(self.num_envs, np.int64)
+        self.obs = self.first(np.arange(self.num_envs))
+        return self.obs
+
+    def reset_some(self, ids: Array, seeds: Any = None) -> Array:
+        self.obs = self.obs.copy()
+        self.obs[ids] = self.first(ids)
+        self.t[ids] = 0
+        return self.obs[ids]
+
+    def step(self, action: Array, ids: Array | None = None) -> RawStep:
+        assert ids is None
+        self.t += 1
+        next_obs, reward, terminated, truncated = self.play(action)
+        self.steps_made += self.num_envs
+        self.obs = next_obs
+        return RawStep(next_obs, reward.astype(np.float32), terminated, truncated, {})
+
+    def renew(self, seed: int) -> None:
         pass
 
     def state(self) -> dict[str, Array]:
         """Everything it has: a toy is copied, not played again."""
         return {"pickle": np.frombuffer(pickle.dumps(self.__dict__), np.uint8).copy()}
 
-    def restore(self, state: dict[str, Array]) -> Array:
+    def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
         made = self.steps_made
         self.__dict__ = pickle.loads(state["pickle"].tobytes())
         self.steps_made = made  # steps are counted where they are made
-        return np.arange(0)
-
-    def first(self, rows: Array) -> Array:
-        """First observations of the environments ``rows``."""
-        return np.zeros((len(rows), 1), np.float32)
-
-    def play(self, action: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """next_obs, reward, terminated, truncated, steps."""
-        raise NotImplementedError
-
-    def mask(self) -> Array | None:
-        return None
-
-    def reset(self, seeds: Seeds) -> Array:
-        self.rng = seeds.numpy()
-        self.t = np.zeros(self.num_envs, np.int64)
-        self.obs = self.first(np.arange(self.num_envs))
-        return self.obs
-
-    def step(self, action: Array) -> VecStep:
-        self.t += 1
-        next_obs, reward, terminated, truncated, steps = self.play(action)
-        self.steps_made += int(steps.sum())
-        self.obs = next_obs.copy()
-        if (rows := np.flatnonzero(terminated | truncated)).size:
-            self.obs[rows] = self.first(rows)
-            self.t[rows] = 0
-        reward = reward.astype(np.float32)
-        return VecStep(next_obs, self.obs, reward, terminated, truncated, steps, self.mask(), {})
+        return self.obs, np.arange(0)
 
     def close(self) -> None:
         pass
@@ -165,7 +179,7 @@ class Identity(Toy):
 
     def play(self, action: Array) -> Any:
         reward = action == self.obs
-        return self.first(self.ones), reward, self.t == 4, self.never, self.ones
+        return self.first(self.ones), reward, self.t == 4, self.never
 
 
 class BoxIdentity(Toy):
@@ -178,7 +192,7 @@ class BoxIdentity(Toy):
 
     def play(self, action: Array) -> Any:
         reward = -np.square(action - self.obs)[:, 0]
-        return self.first(self.ones), reward, self.t == 4, self.never, self.ones
+        return self.first(self.ones), reward, self.t == 4, self.never
 
 
 class Masked(Toy):
@@ -200,7 +214,7 @@ class Masked(Toy):
 
     def play(self, action: Array) -> Any:
         self.taken_though_forbidden += int((action == self.obs).sum())
-        return self.first(self.ones), action, self.t == 1, self.never, self.ones
+        return self.first(self.ones), action, self.t == 1, self.never
 
 
 class Allowance(Toy):
@@ -212,7 +226,6 @@ class Allowance(Toy):
             self.ones,
             self.never,
             self.t == 5,
-            self.ones,
         )
 
 
@@ -225,22 +238,38 @@ class Countdown(Toy):
         return np.zeros(len(rows), np.int64)
 
     def play(self, action: Array) -> Any:
-        return self.t.copy(), self.ones, self.t == 5, self.never, self.ones
+        return self.t.copy(), self.ones, self.t == 5, self.never
+
+
+class Call(Skill):
+    """Takes one action for so many steps; perhaps it may never start."""
+
+    def __init__(self, action: int, steps: int, allowed: bool) -> None:
+        self.max_steps, self.allowed = steps, allowed
+        self.policy = ScriptedPolicy(lambda obs: np.full(len(obs), action))
+
+    def initiation(self, obs: Array) -> Array:
+        return np.full(len(obs), self.allowed)
 
 
 class Calls(Toy):
-    """A semi-MDP: action 0 lasts 1 step and pays 1, action 1 lasts 10 steps and pays 3."""
+    """A selector's world: skill 0 lasts 1 step and pays 1, skill 1 lasts 10 and pays 3 at once."""
 
     def __init__(self, num_envs: int, allowed: tuple[bool, bool] = (True, True)) -> None:
         super().__init__(num_envs)
         self.allowed = allowed
+        self.under_way = np.zeros(num_envs, np.int64)  # steps of the open long call
 
-    def mask(self) -> Array:
-        return np.tile(self.allowed, (self.num_envs, 1))
+    def collector(self, acting: Acting | None, shared: bool = False) -> Collector:
+        calls = tuple(Call(i, (1, 10)[i], self.allowed[i]) for i in range(2))
+        return DecisionCollector(
+            self, acting, SkillSet(calls, tuple(c.policy for c in calls)), shared
+        )
 
     def play(self, action: Array) -> Any:
-        still = np.zeros((self.num_envs, 1), np.float32)
-        return still, 1 + 2 * action, self.never, self.never, 1 + 9 * action
+        reward = np.where(action == 1, 3 * (self.under_way == 0), 1)
+        self.under_way = (self.under_way + action) % 10
+        return np.zeros((self.num_envs, 1), np.float32), reward, self.never, self.never
 
 
 class Clockwork(Toy):
@@ -259,7 +288,7 @@ class Clockwork(Toy):
     def play(self, action: Array) -> Any:
         next_obs = (2 * self.obs + action + self.columns) % 5
         reward, truncated = (action == self.obs % 3) * 1.0, self.t == 3 + self.columns % 4
-        return next_obs, reward, (next_obs == 4) & ~truncated, truncated, self.ones
+        return next_obs, reward, (next_obs == 4) & ~truncated, truncated
 
 
 class Broken(Identity):
@@ -345,9 +374,9 @@ class Echo(Toy):
         half = (self.action_space.high - self.action_space.low) / 2
         return np.square((action - self.wanted[state]) / half).mean(1)
 
-    def reset(self, seeds: Seeds) -> Array:
-        self.rngs = [(seeds / c).numpy() for c in self.columns]
-        return super().reset(seeds)
+    def reset(self, seed: int) -> Array:
+        self.rngs = [(Seeds(seed) / c).numpy() for c in self.columns]
+        return super().reset(seed)
 
     def first(self, rows: Array) -> Array:
         self.shown[rows] = [self.rngs[i].integers(4) for i in rows]
@@ -358,7 +387,7 @@ class Echo(Toy):
         reward = -self.error(self.shown, action)
         truncated = (self.t == 3) & (np.array(self.columns) % 2 == 0)
         everywhere = np.arange(self.num_envs)
-        return self.first(everywhere), reward, self.t == 4, truncated, self.ones
+        return self.first(everywhere), reward, self.t == 4, truncated
 
 
 class Recall(Toy):
@@ -375,7 +404,7 @@ class Recall(Toy):
     def play(self, action: Array) -> Any:
         last = self.t == 4
         after = np.stack([0.0 * self.t, self.t == 3], 1).astype(np.float32)
-        return after, last & (action == self.sign), last, self.never, self.ones
+        return after, last & (action == self.sign), last, self.never
 
 
 @dataclass(frozen=True)
@@ -385,9 +414,16 @@ class SeedsOfMember:
     seeds: Seeds
     member: int
 
-    def __truediv__(self, name: str) -> Any:
+    def __truediv__(self, name: str | int) -> Any:
         node = self.seeds / name
-        return _Renumbered(node, self.member) if name in ("act", "learn") else node
+        kind = _Renumbered if name in ("act", "learn") else SeedsOfMember
+        return kind(node, self.member)
+
+    def integer(self) -> int:
+        return self.seeds.integer()
+
+    def numpy(self) -> Any:
+        return self.seeds.numpy()
 
 
 @dataclass(frozen=True)
@@ -412,18 +448,71 @@ def own_algorithm() -> Any:
     return sys.modules["own_algorithm"]
 
 
+@dataclass
+class Training:
+    """A learner in an environment, to be trained."""
+
+    learner: Learner
+    collectors: Collectors
+    seeds: Any
+    episodes: Episodes
+
+    @property
+    def state(self) -> Any:
+        """Of its only stack."""
+        return self.learner.stacks[0].state
+
+    def run(self, budget: int, **how: Any) -> Progress:
+        """Train it, as ``train`` does."""
+        return train(self.learner, self.collectors, self.episodes, self.seeds, budget, **how)
+
+    def resume(self, extra: dict[str, Any]) -> Array:
+        """Stand where a clean cut was."""
+        return resume(self.learner, self.collectors, self.episodes, extra)
+
+
+def training(
+    algorithm: Algorithm,
+    env: Toy,
+    seeds: Any = 0,
+    members: Any = (0,),
+    *,
+    state: Any = None,
+    shared: bool = False,
+    goes_on_at: int = 0,
+) -> Training:
+    """An algorithm's members, each with its seed, in an environment.
+
+    Args:
+        shared: members learn from what all did.
+        goes_on_at: environment steps that were made before.
+    """
+    seeds = Seeds(seeds) if isinstance(seeds, int) else seeds
+    stack = Stack(algorithm, state or algorithm.init([Seeds(m) for m in members]))
+    p, n, row_steps = stack.members, env.num_envs, env.row_steps
+    learner: Any
+    if shared:
+        store = store_of(algorithm, n, p, shared=True)
+        learner = ReplayLearner([stack], store, seeds, row_steps=row_steps)
+    else:
+        learner = learner_of(stack, n, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
+    collector = env.collector(Acting([(algorithm, p)], n), shared)
+    return Training(learner, Collectors([collector], p), seeds, Episodes())
+
+
 def learn(
     config: AlgorithmConfig,
     env: Toy,
     budget: int,
     seeds: Any = 0,
     members: Any = (0,),
-    **where: Any,
+    *,
+    state: Any = None,
+    shared: bool = False,
+    **how: Any,
 ) -> tuple[Any, Any]:
     """Any algorithm, trained in an environment: it and its state, whose members have seeds."""
-    algorithm: Algorithm = make_algorithm(config, env.observation_space, env.action_space)
-    seeds = Seeds(seeds) if isinstance(seeds, int) else seeds
-    state = where.pop("state", None) or algorithm.init([Seeds(m) for m in members])
-    train: Any = train_on_policy if algorithm.store == "rollout" else train_off_policy
-    collector = where.pop("collector", None) or Collector(env)
-    return algorithm, train(algorithm, collector, state, seeds, budget, **where)
+    algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    made = training(algorithm, env, seeds, members, state=state, shared=shared)
+    made.run(budget, **how)
+    return algorithm, made.state

@@ -222,7 +222,7 @@ class Pays(Toy):
 
     def play(self, action: Any) -> Any:
         still = np.zeros((self.num_envs, 1), np.float32)
-        return still, 4000.0 + 2000.0 * action, self.never, self.never, self.ones
+        return still, 4000.0 + 2000.0 * action, self.never, self.never
 
 
 def test_atoms_without_bounds_of_their_own_fit_the_returns_seen():

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from skillweave.training.collector import Collector
-from skillweave.training.on_policy import train_on_policy
 from torch import nn
-from toys import Echo, learn
+from toys import Echo, learn, training
 
 from skillweave.algorithms.config import PPO, config_from_json, config_to_json
 from skillweave.algorithms.ppo import PPOAlgorithm, State
@@ -353,7 +351,7 @@ def test_weights_are_one_unless_what_acted_is_old(asks, rnn, overlap):
     env, config = Echo(B, "vector", asks), replace(CONFIG, network=Network((16,), rnn=rnn))
     config = replace(config, overlap=overlap, learning_rate=1e-2, batch_size=T * B)
     algorithm = Weighed(config, env.observation_space, env.action_space)
-    train_on_policy(algorithm, Collector(env), algorithm.init([Seeds(0)]), Seeds(0), 4 * T * B)
+    training(algorithm, env).run(4 * T * B)
     off = [(w - 1.0).abs().max().item() for w in algorithm.found[:: config.update_epochs]]
     assert len(off) == 4
     assert [x > 1e-3 for x in off] == [False, overlap, overlap, overlap]

@@ -54,10 +54,10 @@ def own(**settings: Any) -> Any:
 # Learning
 
 
-@pytest.mark.parametrize(("asks", "updates"), [("Discrete", 120), ("Box", 300)])
+@pytest.mark.parametrize(("asks", "updates"), [("Discrete", 120), ("Box", 400)])
 def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, updates, tmp_path):
     env = Echo(8, "vector", asks)
-    algorithm, state = learn(own(), env, 64 * updates)
+    algorithm, state = learn(own(learning_rate=1e-2), env, 64 * updates)
     policy, shown = AgentPolicy.of(algorithm, state), np.arange(4)
     action, _ = policy.act({}, env.show(shown))
     assert env.error(shown, action).mean() < 0.1

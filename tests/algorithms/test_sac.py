@@ -258,7 +258,7 @@ class Nothing(Toy):
 
     def play(self, action: Any) -> Any:
         still = np.zeros((self.num_envs, 1), np.float32)
-        return still, 0.0 * self.ones, self.never, self.never, self.ones
+        return still, 0.0 * self.ones, self.never, self.never
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
@@ -303,7 +303,7 @@ class TwoOfEight(Toy):
 
     def play(self, action: Any) -> Any:
         still = np.zeros((self.num_envs, 1), np.float32)
-        return still, (action == 1) * 1.0, self.t == 1, self.never, self.ones
+        return still, (action == 1) * 1.0, self.t == 1, self.never
 
 
 def test_under_a_mask_the_temperature_does_not_grow_without_bound():

@@ -74,7 +74,7 @@ def outputs(made: Member, spaces: Any) -> dict[str, torch.Tensor]:
                 views = family.layout.views(rows[row : row + 1])
                 for name, net in family.nets:
                     key = f"{field}.{row}.{name}"
-                    if getattr(net, "memory", 0):
+                    if getattr(net, "memory_size", 0):
                         zero = torch.zeros(1, 50, net.memory_size)
                         found[key] = net.step(views, inputs, zero)[0]
                     elif field.startswith("critic") and made.config.__class__ is not PPO:
