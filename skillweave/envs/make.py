@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
+import numpy as np
 
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
+from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.messages import short, shortened, told, whole_number
 from skillweave.types import MissingExtra, SkillweaveError
 
@@ -186,15 +188,24 @@ def _in_envpool(spec: EnvSpec, reference: gym.Env[Any, Any]) -> bool:
 
 def _step_seconds(env: gym.Env[Any, Any]) -> float:
     """Seconds of a step with random actions: the least of several means, so load does not count."""
-    env.action_space.seed(0)
+    masks, rng = ActionMasks(env.action_space, 1), np.random.default_rng(0)
+    discrete = isinstance(env.action_space, gym.spaces.Discrete)
     means = []
-    env.reset(seed=0)
+
+    def seen(info: dict[str, Any], ended: bool = False) -> None:
+        told = {k: np.asarray(v)[None] for k, v in info.items() if k == "action_mask"}
+        masks.see(told, ended=np.array([ended]))
+
+    seen(env.reset(seed=0)[1])
     for _ in range(PIECES):
-        actions = [env.action_space.sample() for _ in range(STEPS)]
-        began = time.perf_counter()
-        for action in actions:
-            _, _, terminated, truncated, _ = env.step(action)
+        spent = 0.0
+        for _ in range(STEPS):
+            action = random_actions(env.action_space, 1, rng, masks.now)[0]
+            began = time.perf_counter()
+            _, _, terminated, truncated, info = env.step(int(action) if discrete else action)
+            spent += time.perf_counter() - began
+            seen(info, terminated or truncated)
             if terminated or truncated:
-                env.reset()
-        means.append((time.perf_counter() - began) / STEPS)
+                seen(env.reset()[1])
+        means.append(spent / STEPS)
     return min(means)

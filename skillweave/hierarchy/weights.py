@@ -92,7 +92,9 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             )
         return tensors, header
     if header.get("kind") != "hierarchy":
-        raise SkillweaveError(f"{path} holds a {short(header.get('kind'))}, not a hierarchy")
+        raise SkillweaveError(
+            f"{path} holds something of kind {short(header.get('kind'))}, not a hierarchy"
+        )
     fit(HierarchyHeader, header, str(path))
     return tensors, header
 
@@ -106,7 +108,9 @@ def read_agent(
         SkillweaveError: the file is damaged, or belongs to another environment.
     """
     if header["kind"] != "agent":
-        raise SkillweaveError(f"{path} holds a {short(header['kind'])}, not a plain agent")
+        raise SkillweaveError(
+            f"{path} holds something of kind {short(header['kind'])}, not a plain agent"
+        )
     if (env := header.get("env", spec.name)) != spec.name:
         raise SkillweaveError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
     return AgentPolicy.from_file(tensors, header, str(path))

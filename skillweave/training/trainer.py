@@ -126,7 +126,12 @@ class OneAgent:
             goes_on_at=log.at["steps"],
         )  # fmt: skip
         self._steps_before = int(log.at["steps"])
-        if extra:
+        if extra and "collector.collectors" not in extra:
+            log.tell(
+                "the checkpoint is of an older version: learning goes on where it stood, but all "
+                "episodes, and what was kept to learn from, begin anew"
+            )
+        elif extra:
             ids = resumed(log, lambda: resume(self.learner, self.collectors, self.episodes, extra))
             log.tell_begun_anew(len(ids), self.collectors.num_envs)
         self.evaluation.start(log.at["steps"])

@@ -124,7 +124,7 @@ def test_a_network_with_memory_computes_steps_as_a_sequence():
     views, steps = layout.views(flat), 5
     g = torch.Generator().manual_seed(3)
     x = {"vector": torch.randn(P, steps, B, 5, generator=g)}
-    memory = torch.randn(P, B, net.memory, generator=g)
+    memory = torch.randn(P, B, net.memory_size, generator=g)
     start = torch.rand(P, steps, B, generator=g) < 0.3
     out, after = net.sequence(views, x, memory, start)
     assert (out.shape, after.shape) == ((P, steps, B, 2), (P, steps, B, 12))
