@@ -291,6 +291,16 @@ class Clockwork(Toy):
         return next_obs, reward, (next_obs == 4) & ~truncated, truncated
 
 
+class Steady(Calls):
+    """Every step of a call of ten pays 1."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, (False, True))
+
+    def play(self, action: Array) -> Any:
+        return np.zeros((self.num_envs, 1), np.float32), self.ones, self.never, self.never
+
+
 class Broken(Identity):
     """Pays NaN."""
 
@@ -473,7 +483,7 @@ class Training:
 
 def training(
     algorithm: Algorithm,
-    env: Toy,
+    env: Any,
     seeds: Any = 0,
     members: Any = (0,),
     *,
@@ -484,25 +494,33 @@ def training(
     """An algorithm's members, each with its seed, in an environment.
 
     Args:
+        env: a toy, or an engine.
         shared: members learn from what all did.
         goes_on_at: environment steps that were made before.
     """
     seeds = Seeds(seeds) if isinstance(seeds, int) else seeds
     stack = Stack(algorithm, state or algorithm.init([Seeds(m) for m in members]))
-    p, n, row_steps = stack.members, env.num_envs, env.row_steps
+    p, n, row_steps = stack.members, env.num_envs, getattr(env, "row_steps", 1)
     learner: Any
     if shared:
         store = store_of(algorithm, n, p, shared=True)
         learner = ReplayLearner([stack], store, seeds, row_steps=row_steps)
     else:
         learner = learner_of(stack, n, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
-    collector = env.collector(Acting([(algorithm, p)], n), shared)
+    acting = Acting([(algorithm, p)], n)
+    own = isinstance(env, Toy)
+    collector = env.collector(acting, shared) if own else SkillCollector(env, acting)
     return Training(learner, Collectors([collector], p), seeds, Episodes())
+
+
+def copied(state: Any) -> Any:
+    """A state with tensors of its own."""
+    return type(state)(**{name: value.clone() for name, value in vars(state).items()})
 
 
 def learn(
     config: AlgorithmConfig,
-    env: Toy,
+    env: Any,
     budget: int,
     seeds: Any = 0,
     members: Any = (0,),

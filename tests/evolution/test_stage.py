@@ -35,6 +35,7 @@ from skillweave.evolution import stage as evolving
 from skillweave.evolution.population import Population, has_diverged
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
+from skillweave.training.scene import skill_scene
 
 SMALL = Network((8, 6), "relu")
 REPLAY: dict[str, Any] = {
@@ -181,16 +182,16 @@ def test_fitness_is_measured_on_the_same_starts_for_all(tmp_path, monkeypatch):
     played = evolving.Population.fitness
 
     def watch(self: Population, env: Any, seeds: Seeds) -> Any:
-        reset = env.reset
+        reset = env.engine.reset
 
-        def seen(given: Seeds) -> Any:
-            obs = reset(given)
+        def seen(seed: int) -> Any:
+            obs = reset(seed)
             starts.setdefault(seeds.path[-2], set()).add(obs.tobytes())
             return obs
 
-        monkeypatch.setattr(env, "reset", seen)
+        monkeypatch.setattr(env.engine, "reset", seen)
         found = played(self, env, seeds)
-        monkeypatch.setattr(env, "reset", reset)
+        monkeypatch.setattr(env.engine, "reset", reset)
         return found
 
     monkeypatch.setattr(Population, "fitness", watch)
@@ -228,23 +229,13 @@ def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeyp
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tmp_path):
     config = replace(CONFIGS[name], max_grad_norm=1e30)
-    env_spec = spec(name)
-    made = env_spec.make()
-    spaces = made.observation_space, made.action_space
-    from skillweave.envs.skill_env import SkillEnv
-
-    from skillweave.envs.make import make_engine
-
-    def make_env(num_envs: int, gamma: Any) -> Any:
-        return SkillEnv(make_engine(env_spec, num_envs))
-
-    population = Population.fresh(config, Evolution(3, 1, 2), make_env, spaces, Seeds(0))
+    scene = skill_scene(spec(name))
+    population = Population.fresh(config, Evolution(3, 1, 2), scene, Seeds(0))
     sick = population.members[1]
     sick.state.params.fill_(float("nan"))
     population.train(256, 256, Seeds(1), lambda steps, tick: None)
     assert [has_diverged(m) for m in population.members] == [False, True, False]
-    env = make_env(2, 0.9)
-    fitness = population.fitness(env, Seeds(2))
+    fitness = population.fitness(scene.collector(2, None), Seeds(2))
     assert np.isfinite(fitness).tolist() == [True, False, True]
 
 

@@ -76,9 +76,9 @@ def test_the_search_for_a_start_is_reported_and_counts_against_the_budget(settin
     run = hierarchy(**settings).train(tmp_path / "run", quiet=True)
     assert reported(run) == made[0]
     late, always, selector = run.info()["stages"]
-    assert late["steps"] <= 600 + 4 * 16 * 14, "a rollout, each step of it perhaps a search"
-    assert always["steps"] <= 600 + 4 * 16
-    assert selector["steps"] <= 600 + 4 * 16 + 4 * 3
+    rollout = 4 * 16 if "algorithm" not in settings else 4 * 3  # of a selector, call_steps
+    for stage in (late, always, selector):
+        assert 600 <= stage["steps"] < 600 + rollout, stage["name"]
     assert (always["evaluation_steps"] > 0) == ("eval_every" in settings)
 
 
@@ -129,7 +129,7 @@ def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
     run = declared.train(tmp_path / "run", quiet=True)
     updates = sum(1 for _ in RunDirectory.open(run.path).metrics())
     assert updates >= 150 / 20
-    assert run.info()["stages"][0]["steps"] <= declared.selector_steps + 64 * 64 + 64 * 40
+    assert run.info()["stages"][0]["steps"] < declared.selector_steps + 64 * 64
 
 
 @pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])

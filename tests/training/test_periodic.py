@@ -2,85 +2,100 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from toys import Calls, Clockwork, Countdown, Echo, Toy
+
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
-from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.training.periodic import PeriodicEvaluation, first_episodes
-from tests.toys import Calls, Clockwork, Countdown, Identity
+from skillweave.training import playing
+from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.playing import returns_of
 
 
-def played_by_hand(env: Any, seeds: Seeds) -> list[float]:
-    """The return of each environment's first episode under action 0, one environment at a time."""
-    obs, n = env.reset(seeds / "start"), env.num_envs
-    found, over = [0.0] * n, [False] * n
-    while not all(over):
-        step = env.step(np.zeros(n, np.int64))
-        for i in range(n):
-            if not over[i]:
-                found[i] += float(step.reward[i])
-                over[i] = bool(step.terminated[i] or step.truncated[i])
-    assert obs is not None
+SMALL = Network((8,), "relu")
+
+
+def fresh(env: Toy) -> AgentPolicy:
+    """A policy that has learnt nothing."""
+    algorithm = make_algorithm(PPO(network=SMALL), env.observation_space, env.action_space)
+    return AgentPolicy.of(algorithm, algorithm.init([Seeds(0)]))
+
+
+def played(env: Toy, seed: int = 0) -> list[float]:
+    return returns_of(fresh(env), env.collector(None), Seeds(seed)).tolist()
+
+
+def played_by_hand(env: Any, policy: AgentPolicy) -> list[float]:
+    """The return of each environment's first episode, one environment at a time."""
+    found = []
+    for i in range(env.num_envs):
+        obs, over, total = env.reset(0), False, 0.0
+        while not over:
+            step = env.step(policy.act({}, obs)[0])
+            total += float(step.reward[i])
+            over, obs = bool(step.terminated[i] or step.truncated[i]), step.next_obs
+            ended = np.flatnonzero(step.terminated | step.truncated)
+            if len(ended):
+                env.reset_some(ended)
+                obs = env.obs
+        found.append(total)
     return found
 
 
 def test_only_first_episodes_count_though_they_differ_in_length():
-    env = Clockwork(range(6))
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    got, _ = first_episodes(policy, env, Seeds(0))
-    assert got.tolist() == played_by_hand(Clockwork(range(6)), Seeds(0))
-    assert len(set(got.tolist())) > 1
+    got = played(Clockwork(range(6)))
+    assert got == played_by_hand(Clockwork(range(6)), fresh(Clockwork(range(6))))
+    assert len(set(got)) > 1
 
 
-def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit():
+def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit(monkeypatch):
     class Forever(Countdown):
         """Pays 1 a step; only the first environment ends, after 5 steps."""
 
         def play(self, action: Any) -> Any:
-            obs, reward, terminated, truncated, steps = super().play(action)
-            return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated, steps
+            obs, reward, terminated, truncated = super().play(action)
+            return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated
 
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    assert first_episodes(policy, Forever(2), Seeds(0), max_steps=8)[0].tolist() == [5.0, 8.0]
+    monkeypatch.setattr(playing, "LONGEST_EPISODE", 8)
+    assert played(Forever(2)) == [5.0, 8.0]
 
 
-def test_the_limit_counts_environment_steps_not_decisions():
-    class Choice(ScriptedPolicy):
-        """Takes the call of 10 steps, which pays 3."""
-
-    policy = Choice(lambda obs: np.ones(len(obs), np.int64))
-    assert first_episodes(policy, Calls(1), Seeds(0), max_steps=25)[0].tolist() == [9.0]
+def test_the_limit_counts_environment_steps_not_decisions(monkeypatch):
+    monkeypatch.setattr(playing, "LONGEST_EPISODE", 25)
+    assert played(Calls(1, (False, True))) == [9.0]  # calls of 10 steps, of which each pays 3
 
 
 def test_equal_seeds_give_equal_starts_and_others_other_ones():
-    env, wrong = Identity(50), ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    first, again, other = (first_episodes(wrong, env, Seeds(s))[0] for s in (1, 1, 2))
-    assert first.tolist() == again.tolist() != other.tolist()
+    env = Echo(50, "vector", "Box")
+    first, again, other = (played(env, seed) for seed in (1, 1, 2))
+    assert first == again != other
 
 
 def test_an_evaluation_is_made_once_in_every_so_many_steps_also_after_a_resume():
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64))
-    evaluation = PeriodicEvaluation(lambda n, gamma: Countdown(n), 0.9, Seeds(0), 100, 3)
+    scene: Any = SimpleNamespace(collector=lambda n, acting: Countdown(n).collector(acting))
+    policy = fresh(Countdown(1))
+    evaluation = PeriodicEvaluation(scene, Seeds(0), 100, 3)
     evaluation.start(250)
     ticks = (260, 299, 300, 350, 520, 599, 601)
     assert [t for t in ticks if evaluation.due(t, lambda: policy)] == [300, 520, 601]
+    assert evaluation.spent() == 3 * 3 * 5
     assert evaluation.due(700, lambda: policy) == {"eval_return": 5.0, "eval_return_min": 5.0}
-    never = PeriodicEvaluation(lambda n, gamma: Countdown(n), 0.9, Seeds(0), None, 3)
+    assert (evaluation.spent(), evaluation.spent()) == (15, 0)
+    never = PeriodicEvaluation(scene, Seeds(0), None, 3)
     assert never.due(10**6, lambda: policy) == {}
 
 
 class Balance(Skill):
     """Stay up."""
-
-
-SMALL = Network((8,), "relu")
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from skillweave import (
     train_agent,
 )
 from skillweave.envs import engine as engines
+from skillweave.evolution.plan import plan
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
@@ -240,9 +241,16 @@ def test_a_skill_without_success_has_no_target_success() -> None:
 # The stage itself
 
 
-def test_an_algorithm_without_a_loop_is_an_error() -> None:
-    with pytest.raises(SkillweaveError, match="no training loop is known for"):
-        trainer.run_loop(object(), None, None, None, 10, {})  # type: ignore[arg-type]
+def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> None:
+    h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL)
+    content = training.manifest(h, seed=0, flat=True)
+    plan(content["stages"], Evolution(2, 2, 1))
+    run = RunDirectory.create(tmp_path / "run", content | {"recipe": None})
+    try:
+        with pytest.raises(SkillweaveError, match="'agent' evolves: it needs a population"):
+            training.train(h, run)
+    finally:
+        run.close()
 
 
 def test_a_stage_says_who_learns_and_who_decides(tmp_path: Path) -> None:

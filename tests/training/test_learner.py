@@ -1,3 +1,5 @@
+"""Learners from replay: when they learn, from what, and what they keep of it."""
+
 from __future__ import annotations
 
 from dataclasses import fields, replace
@@ -6,16 +8,29 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from skillweave.training.collector import Collector
-from skillweave.training.off_policy import make_buffer, train_off_policy
-from toys import BoxIdentity, Broken, Calls, Countdown, Echo, Identity, learn
+from toys import (
+    BoxIdentity,
+    Broken,
+    Calls,
+    Countdown,
+    Echo,
+    Identity,
+    Steady,
+    copied,
+    learn,
+    training,
+)
 
 from skillweave.algorithms.config import DQN, SAC, TD3
 from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.group import Collectors
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
-from skillweave.training.episodes import Tick
+from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.learner import ReplayLearner, Stack, crossed, store_of
+from skillweave.training.loop import Progress, train
 from skillweave.types import SkillweaveError, unprefixed
 
 SETTINGS: dict[str, Any] = {
@@ -53,12 +68,16 @@ class Spy(DQNAlgorithm):
         return super().update(state, batch, rng)
 
 
-def spied(config: DQN, budget: int, env: Any = None, members: int = 1, **where: Any) -> Spy:
+def spied(
+    config: DQN, budget: int, env: Any = None, members: int = 1, shared: bool = False, **how: Any
+) -> Spy:
     env = env or Identity(4 * members)
     spy = Spy(config, env.observation_space, env.action_space)
-    state = spy.init([Seeds(m) for m in range(members)])
-    train_off_policy(spy, Collector(env), state, Seeds(0), budget, **where)
+    training(spy, env, members=range(members), shared=shared).run(budget, **how)
     return spy
+
+
+# When
 
 
 @pytest.mark.parametrize(
@@ -88,14 +107,55 @@ def test_gradient_steps_follow_the_round_that_they_are_due_after():
     assert log == ["random"] * 10 + (["act"] * 5 + ["learn"] * 20) * 2
 
 
-def test_a_selector_learns_by_its_decisions_and_its_budget_counts_steps():
+@pytest.mark.parametrize("row_steps", [1, 10])
+def test_a_selector_learns_by_its_decisions_and_its_budget_counts_steps(row_steps):
     ticks: list[Tick] = []
-    spy = spied(CONFIG, 1000, Calls(4, (False, True)), on_tick=ticks.append)
+    env = Calls(4, (False, True))
+    env.row_steps = row_steps
+    spy = spied(CONFIG, 1000, env, on_tick=ticks.append)
     assert ticks[-1].steps == 1000
+    assert ticks[-1].update == 250 // row_steps
     assert spy.log.count("random") + spy.log.count("act") == 25
     assert spy.log.count("random") == 1  # learning_starts counts steps, too
     assert spy.log.count("learn") == 96
     assert spy.spent == pytest.approx(np.repeat(np.arange(80, 1001, 40), 4) / 1000)
+
+
+@pytest.mark.parametrize(("members", "ratio"), [(1, 0.3), (3, 0.3), (3, 1.0)])
+def test_no_gradient_step_is_lost_or_made_twice_however_many_members_there_are(members, ratio):
+    config = replace(CONFIG, update_ratio=ratio, learning_starts=0, train_freq=3)
+    spy = spied(config, 120 * members, Calls(4 * members), members=members)
+    # A call lasts 1 or 10 steps: what counts is how many decisions a member made, on average.
+    made = spied(replace(config, update_ratio=1.0), 120 * members, Calls(4 * members), members)
+    assert abs(spy.log.count("learn") - ratio * made.log.count("learn")) <= 1
+    assert spy.log.count("learn") > 5
+
+
+def test_reports_come_every_thousand_steps_and_at_cuts_and_the_store_at_cuts_but_the_last():
+    ticks: list[Tick] = []
+    config = replace(CONFIG, update_ratio=0.05)
+    learn(config, Countdown(4), 3000, cut_every=1500, on_tick=ticks.append)
+    assert [t.steps for t in ticks] == [1000, 1500, 2000, 3000]
+    assert [t.update for t in ticks] == [250, 375, 500, 750]
+    assert [t.cut for t in ticks] == [False, True, False, True]
+    assert [t.extra is not None for t in ticks] == [False, True, False, False]  # none at the end
+    assert unprefixed("learner.store", ticks[1].extra)
+    assert ticks[-1].metrics["return"] == ticks[-1].metrics["length"] == 5.0
+    assert {"loss", "q", "grad_norm", "learning_rate"} <= ticks[-1].metrics.keys()
+    ticks.clear()
+    once = {"cut_every": 1000, "on_tick": ticks.append}
+    learn(replace(config, save_buffer=False), Countdown(4), 2000, **once)
+    assert unprefixed("collector", ticks[0].extra)
+    assert not unprefixed("learner.store", ticks[0].extra)
+
+
+def test_a_multiple_is_crossed_where_it_is_reached():
+    assert [crossed(10, *x) for x in ((0, 9), (9, 10), (10, 19), (11, 20), (5, 35))] == [
+        False, True, False, True, True,
+    ]  # fmt: skip
+
+
+# From what
 
 
 def test_priorities_come_back_and_their_correction_becomes_whole():
@@ -125,21 +185,22 @@ def test_members_learn_from_their_own_columns_or_share_all():
     assert seen(True) == [set(range(12))] * 3
 
 
-def test_reports_come_every_thousand_steps_and_at_cuts_and_the_buffer_at_cuts_but_the_last():
-    ticks: list[Tick] = []
-    config = replace(CONFIG, update_ratio=0.05)
-    learn(config, Countdown(4), 3000, cut_every=1500, on_tick=ticks.append)
-    assert [t.steps for t in ticks] == [1000, 1500, 2000, 3000]
-    assert [t.update for t in ticks] == [250, 375, 500, 750]
-    assert [t.cut for t in ticks] == [False, True, False, True]
-    assert [t.extra is not None for t in ticks] == [False, True, False, False]  # none at the end
-    assert ticks[-1].metrics["return"] == ticks[-1].metrics["length"] == 5.0
-    assert {"loss", "q", "grad_norm", "learning_rate"} <= ticks[-1].metrics.keys()
-    ticks.clear()
-    once = {"cut_every": 1000, "on_tick": ticks.append}
-    learn(replace(config, save_buffer=False), Countdown(4), 2000, **once)
-    assert unprefixed("collector", ticks[0].extra)
-    assert not unprefixed("buffer", ticks[0].extra)
+@pytest.mark.parametrize("n_step", [1, 2])
+def test_a_member_learns_from_shared_calls_with_its_own_discount(n_step):
+    env, gamma = Steady(12), torch.tensor([0.5, 0.9, 0.99])
+    spy = Spy(replace(CONFIG, n_step=n_step), env.observation_space, env.action_space)
+    state = spy.init([Seeds(m) for m in range(3)])
+    state.gamma[:] = gamma
+    training(spy, env, state=state, shared=True).run(2400)
+    reward = torch.cat([s.reward for s in spy.samples], 1)
+    discount = torch.cat([s.discount for s in spy.samples], 1)
+    assert spy.samples[-1].index.shape == (3, 8)
+    for m, g in enumerate(gamma.tolist()):
+        lasts = {g ** (10 * k): (1 - g ** (10 * k)) / (1 - g) for k in range(1, n_step + 1)}
+        for d, r in zip(discount[m].tolist(), reward[m].tolist(), strict=True):
+            known = min(lasts, key=lambda x, d=d: abs(x - d))
+            assert d == pytest.approx(known, rel=1e-4)
+            assert r == pytest.approx(lasts[known], rel=1e-4)
 
 
 def test_a_cut_ends_no_episode_and_nothing_is_learnt_as_an_end():
@@ -151,6 +212,24 @@ def test_a_cut_ends_no_episode_and_nothing_is_learnt_as_an_end():
         assert torch.equal(s.discount == 0.0, s.obs == 4)
 
 
+def test_where_environments_begin_anew_trajectories_and_returns_end():
+    config = replace(CONFIG, normalize_rewards=True, gamma=0.5, n_step=2)
+    env = Countdown(4)
+    algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    found: Any = training(algorithm, env)
+    found.run(4 * 2)  # in each environment the steps 0 and 1
+    found.learner.cut(np.array([1, 3]))
+    assert found.learner.counts()["returns"].tolist() == [1.5, 0.0, 1.5, 0.0]
+    found.collectors.parts[0]._begin_anew(np.array([1, 3]))
+    found.run(4 * 4, resume_from=Progress(2, 8))
+    drawn = found.learner.store.sample(500, found.state.gamma, [np.random.default_rng(0)])
+    after = {(int(o), int(n)) for o, n in zip(drawn.obs[0], drawn.next_obs[0], strict=True)}
+    assert after == {(0, 2), (1, 3), (2, 4), (3, 4), (1, 2)}
+
+
+# Going on
+
+
 FEW = {"tau": 0.05, "learning_rate": 1e-3}
 KINDS = {
     "dqn": (DQN(**SETTINGS, **FEW), Identity),
@@ -158,23 +237,21 @@ KINDS = {
     "td3": (TD3(**SETTINGS, **FEW, normalize_obs=True), BoxIdentity),
     "sac": (SAC(**SETTINGS, **FEW, normalize_rewards=True), BoxIdentity),
     "sac of choices": (SAC(**SETTINGS, **FEW, n_step=2), Identity),
+    "a selector": (DQN(**SETTINGS, **FEW, normalize_rewards=True, update_ratio=0.7), Calls),
 }
-
-
-def copied(state: Any) -> Any:
-    return type(state)(**{f.name: getattr(state, f.name).clone() for f in fields(state)})
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights(name):
     config, kind = KINDS[name]
     once = {"cut_every": 120}
-    _, whole = learn(config, kind(4), 500, **once)
+    told: list[Tick] = []
+    _, whole = learn(config, kind(4), 500, on_tick=told.append, **once)
     saved: list[tuple[Tick, Any]] = []
 
     def stop_at_second_cut(tick: Tick) -> None:
         if tick.cut:
-            saved.append((tick, copied(tick.state)))
+            saved.append((tick, copied(tick.state[0])))
         if len(saved) == 2:
             raise Stop
 
@@ -182,31 +259,39 @@ def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights(name):
         learn(config, kind(4), 500, on_tick=stop_at_second_cut, **once)
     tick, state = saved[-1]
     assert (tick.update, tick.steps) == (60, 240)
+    algorithm = make_algorithm(config, kind.observation_space, kind.action_space)
 
-    def under_way() -> Collector:
-        collector = Collector(kind(4))
-        collector.restore(unprefixed("collector", tick.extra), Seeds(0))
-        return collector
+    def resumed(extra: dict[str, torch.Tensor]) -> Any:
+        again = training(algorithm, kind(4), state=copied(state), goes_on_at=tick.steps)
+        again.resume(extra)
+        ticks.clear()
+        again.run(500, resume_from=Progress(60, 240), on_tick=ticks.append, **once)
+        return again.state
 
-    where = {"saved": unprefixed("buffer", tick.extra), "update": 60, "steps": 240, **once}
-    where["collector"] = under_way()
-    _, resumed = learn(config, kind(4), 500, state=copied(state), **where)
+    ticks: list[Tick] = []
+    found = resumed(tick.extra)
     for f in fields(state):
-        assert torch.equal(getattr(resumed, f.name), getattr(whole, f.name)), f.name
-    # The buffer is part of it:
-    where |= {"saved": None, "collector": under_way()}
-    _, without = learn(config, kind(4), 500, state=copied(state), **where)
-    assert not torch.equal(without.params, whole.params)
+        assert torch.equal(getattr(found, f.name), getattr(whole, f.name)), f.name
+        assert getattr(found, f.name).dtype == getattr(algorithm.init([Seeds(0)]), f.name).dtype
+    assert [(t.steps, t.metrics) for t in ticks] == [
+        (t.steps, t.metrics) for t in told if t.steps > 240
+    ]
+    # The store is part of it:
+    without = {k: v for k, v in tick.extra.items() if not k.startswith("learner.store.")}
+    assert not torch.equal(resumed(without).params, whole.params)
 
 
-def test_a_resumed_run_without_its_buffer_fills_it_by_what_it_has_learnt():
+def test_a_resumed_run_without_its_store_fills_it_by_what_it_has_learnt():
     env = Identity(4)
     spy = Spy(replace(CONFIG, save_buffer=False), env.observation_space, env.action_space)
-    state = spy.init([Seeds(0)])
-    train_off_policy(spy, Collector(env), state, Seeds(0), 400, update=50, steps=200)
+    found = training(spy, env, goes_on_at=200)
+    found.run(400, resume_from=Progress(50, 200))
     assert "random" not in spy.log
     assert spy.log[:11] == ["act"] * 11  # until there are more than 40 transitions again
     assert spy.log[11:16] == ["learn"] * 4 + ["act"]
+
+
+# Scales
 
 
 @pytest.mark.parametrize("kind", [DQN, SAC, TD3])
@@ -232,14 +317,32 @@ def test_returns_are_discounted_sums_within_episodes():
     assert state.return_var.item() == pytest.approx(np.var(returns), rel=1e-3)
 
 
-def test_returns_of_calls_are_discounted_by_their_length():
+@pytest.mark.parametrize("row_steps", [1, 25])
+def test_returns_of_calls_are_discounted_by_their_length(row_steps):
     config = replace(CONFIG, normalize_rewards=True, gamma=0.9)
-    _, state = learn(config, Calls(4, (False, True)), 4 * 10 * 30)
+    env = Calls(4, (False, True))
+    env.row_steps = row_steps
+    _, state = learn(config, env, 4 * 10 * 30)
     returns, running = [], 0.0
     for _ in range(30):
         running = 3 + 0.9**10 * running
         returns.append(running)
     assert state.return_mean.item() == pytest.approx(np.mean(returns), rel=1e-4)
+
+
+def test_members_have_scales_of_their_own_by_their_own_discounts():
+    config = replace(CONFIG, normalize_rewards=True)
+    env = Countdown(8)
+    algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    state = algorithm.init([Seeds(0), Seeds(1)])
+    state.gamma[:] = torch.tensor([0.0, 0.5])
+    found = training(algorithm, env, state=state)
+    found.run(8 * 50)
+    means = [1.0, np.mean([2 * (1 - 0.5**t) for t in range(1, 6)])]
+    assert found.state.return_mean.flatten().tolist() == pytest.approx(means, rel=1e-4)
+
+
+# Stopping, and what cannot be
 
 
 def test_learning_that_diverges_is_an_error_that_says_what_where_and_when():
@@ -259,8 +362,28 @@ def test_the_callback_may_stop_the_run_and_threads_are_given_back():
     assert torch.get_num_threads() == 1
 
 
-def test_a_buffer_that_does_not_fit_into_memory_is_refused_before_training():
+def test_a_store_that_does_not_fit_into_memory_is_refused_before_training():
     config = replace(CONFIG, buffer_size=10**13)
     algorithm = make_algorithm(config, Identity.observation_space, Identity.action_space)
     with pytest.raises(SkillweaveError, match="lower buffer_size"):
-        make_buffer(algorithm, Identity(4), 1)
+        store_of(algorithm, 4)
+
+
+def test_stacks_side_by_side_share_one_store_and_each_has_its_rows_by_its_own_ratio():
+    env = Identity(12)
+    stacks, spies = [], []
+    for members, ratio in (1, 1.0), (2, 0.5):
+        config = replace(CONFIG, update_ratio=ratio)
+        spies.append(Spy(config, env.observation_space, env.action_space))
+        stacks.append(Stack(spies[-1], spies[-1].init([Seeds(m) for m in range(members)])))
+
+    store = store_of(spies[0], 12, 3, shared=True)
+    learner = ReplayLearner(stacks, store, Seeds(0))
+    collector = env.collector(Acting([(s.algorithm, s.members) for s in stacks], 12))
+    train(learner, Collectors([collector], 3), Episodes(), Seeds(0), 300)
+    # 100 steps of each member, 40 of them at random.
+    assert [s.log.count("learn") for s in spies] == [60, 30]
+    assert [s.samples[0].reward.shape[0] for s in spies] == [1, 2]
+    for spy in spies:
+        columns = np.concatenate([s.index for s in spy.samples], axis=1) % 12
+        assert [set(row.tolist()) for row in columns] == [set(range(12))] * len(columns)

@@ -1,0 +1,429 @@
+"""The loop: what is collected and learnt when, what is told, and going on from a clean cut."""
+
+import os
+import signal
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from toys import (
+    Allowance,
+    BoxIdentity,
+    Broken,
+    Calls,
+    Clockwork,
+    Countdown,
+    Identity,
+    Masked,
+    Recall,
+    SeedsOfMember,
+    Toy,
+    Training,
+    copied,
+    learn,
+    training,
+)
+
+from skillweave.algorithms.config import DQN, PPO
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.ppo import PPOAlgorithm, State
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.group import Collectors
+from skillweave.collecting.processes import ProcessCollectors
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.networks.config import RNN, Network
+from skillweave.seeding import Seeds
+from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.learner import Stack, learner_of
+from skillweave.training.loop import Progress
+from skillweave.training.scene import skill_scene
+from skillweave.types import SkillweaveError
+
+CONFIG = PPO(
+    num_envs=16, n_steps=16, batch_size=64, learning_rate=5e-3, gamma=0.9, ent_coef=0.0,
+    network=Network((32,)),
+)  # fmt: skip
+RECURRENT = replace(CONFIG, network=Network((8,), rnn=RNN("gru", 4)))
+REPLAY = DQN(
+    num_envs=16, batch_size=8, learning_starts=100, buffer_size=400, update_ratio=0.05,
+    network=Network((8,)),
+)  # fmt: skip
+
+
+def made(env: Toy, config: PPO = CONFIG, members: int = 1, seed: int = 0) -> Training:
+    return training(PPOAlgorithm(config, env.observation_space, env.action_space), env, seed,
+                    range(members))  # fmt: skip
+
+
+def train(env: Toy, updates: int, config: PPO = CONFIG, seed: int = 0, **kwargs):
+    """The algorithm and its state after so many updates."""
+    return learn(config, env, updates * config.n_steps * env.num_envs, seed, **kwargs)
+
+
+def greedy(algorithm: PPOAlgorithm, state: State, obs: np.ndarray, mask=None) -> np.ndarray:
+    rows, allowed = (
+        torch.from_numpy(obs)[None],
+        None if mask is None else torch.from_numpy(mask)[None],
+    )
+    action, *_ = algorithm.act(algorithm.acting_params(state), rows, allowed, None)
+    return algorithm.to_env(action[0].numpy())
+
+
+# What is learnt
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_ppo_learns_that_the_action_must_equal_the_observation(overlap):
+    algorithm, state = train(Identity(16), 40, replace(CONFIG, overlap=overlap))
+    assert greedy(algorithm, state, np.arange(4)).tolist() == [0, 1, 2, 3]
+    head = algorithm.act(algorithm.acting_params(state), torch.arange(4)[None], None, None)[1]
+    assert head.softmax(-1)[0].diagonal().min() > 0.9
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_ppo_learns_that_a_continuous_action_must_equal_the_observation(overlap):
+    algorithm, state = train(BoxIdentity(16), 80, replace(CONFIG, overlap=overlap))
+    obs = np.linspace(-0.9, 0.9, 7, dtype=np.float32)[:, None]
+    assert np.abs(greedy(algorithm, state, obs) - obs).max() < 0.2
+    assert algorithm.acting_params(state).views["actor.log_std"].exp().item() < 0.3
+
+
+def test_a_forbidden_action_is_never_taken_and_the_best_of_the_others_is_learnt():
+    env = Masked(16)
+    algorithm, state = train(env, 30)
+    assert env.taken_though_forbidden == 0
+    obs = np.arange(3)
+    mask = np.arange(3) != obs[:, None]
+    assert greedy(algorithm, state, obs, mask).tolist() == [2, 2, 1]
+
+
+def test_a_time_limit_is_bootstrapped():
+    algorithm, state = train(Allowance(16), 60)
+    assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(
+        1 / (1 - 0.9), rel=0.05
+    )
+
+
+@pytest.mark.parametrize("normalize_returns", [True, False])
+def test_a_termination_is_not_bootstrapped(normalize_returns):
+    config = replace(CONFIG, normalize_returns=normalize_returns)
+    algorithm, state = train(Countdown(16), 60, config)
+    finite = [sum(0.9**i for i in range(5 - t)) for t in range(5)]
+    values = algorithm.value(state, torch.arange(5)[None])[0]
+    assert values.tolist() == pytest.approx(finite, rel=0.05)
+
+
+def test_rewards_of_any_size_are_learnt_in_their_own_units():
+    class Rich(Countdown):
+        def play(self, action):
+            next_obs, reward, *rest = super().play(action)
+            return next_obs, 1e4 * reward, *rest
+
+    algorithm, state = train(Rich(16), 60)
+    finite = [1e4 * sum(0.9**i for i in range(5 - t)) for t in range(5)]
+    assert algorithm.value(state, torch.arange(5)[None])[0].tolist() == pytest.approx(
+        finite, rel=0.05
+    )
+
+
+@pytest.mark.parametrize(
+    ("allowed", "n_steps", "value"),
+    [((True, False), 16, 1 / (1 - 0.9)), ((False, True), 160, 3 / (1 - 0.9**10))],
+)
+def test_the_value_of_calls_discounts_by_their_length(allowed, n_steps, value):
+    algorithm, state = train(Calls(16, allowed), 60, replace(CONFIG, n_steps=n_steps))
+    assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(value, rel=0.05)
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_step(overlap):
+    # Without γ^τ the long call would look three times as good.
+    config = replace(CONFIG, overlap=overlap, n_steps=64)
+    algorithm, state = learn(config, Calls(16), 30_000)
+    assert greedy(algorithm, state, np.zeros((1, 1), np.float32)).tolist() == [0]
+    assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(10.0, rel=0.1)
+
+
+# The lag, and the order of everything
+
+
+class Spy(PPOAlgorithm):
+    """Notes, at each update, how many updates old the policy is that collected the data."""
+
+    def __init__(self, *args) -> None:
+        super().__init__(*args)
+        self.versions, self.lags, self.spent = [], [], []
+
+    def update(self, state, batch, rng):
+        self.versions.append(self.acting_params(state))
+        obs, head = batch.obs.flatten(1, 2), batch.head.flatten(1, 2)
+        with torch.no_grad():
+            heads = [self.act(a, obs, None, None)[1] for a in self.versions]
+            acted = [torch.allclose(h, head) for h in heads]
+        self.lags.append(acted[::-1].index(True))
+        self.spent.append(batch.progress)
+        return super().update(state, batch, rng)
+
+
+def spied(updates: int, config: PPO = CONFIG, env: Toy | None = None, **how) -> Spy:
+    env = env or Identity(16)
+    spy = Spy(config, env.observation_space, env.action_space)
+    training(spy, env).run(updates * config.n_steps * env.num_envs, **how)
+    return spy
+
+
+@pytest.mark.parametrize(("overlap", "lags"), [(True, [0, 1, 1, 0, 1, 1]), (False, [0] * 6)])
+@pytest.mark.parametrize("kind", [Identity, BoxIdentity])
+def test_data_is_one_update_old_with_overlap_but_fresh_after_a_cut(overlap, lags, kind):
+    config = replace(CONFIG, overlap=overlap)
+    assert spied(6, config, kind(16), cut_every=3 * 256).lags == lags
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_schedules_count_from_where_a_rollout_began(overlap):
+    config = replace(CONFIG, overlap=overlap)
+    assert spied(4, config).spent == [0.0, 0.25, 0.5, 0.75]
+    assert spied(4, config, schedule_steps=8 * 256).spent == [0.0, 0.125, 0.25, 0.375]
+    assert spied(4, config, schedule_steps=2 * 256).spent == [0.0, 0.5, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_every_update_is_reported_once_and_in_order(overlap):
+    ticks: list[Tick] = []
+    train(Identity(16), 5, replace(CONFIG, overlap=overlap), cut_every=512, on_tick=ticks.append)
+    assert [t.update for t in ticks] == [1, 2, 3, 4, 5]
+    assert [t.steps for t in ticks] == [256, 512, 768, 1024, 1280]
+    assert [t.cut for t in ticks] == [False, True, False, True, True]
+    assert [t.extra is not None for t in ticks] == [False, True, False, True, False]
+    assert all(t.metrics["samples"] == 256 for t in ticks)
+
+
+@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, overlap=False), REPLAY])
+@pytest.mark.parametrize("env", [Identity, Calls])
+@pytest.mark.parametrize("budget", [1, 256, 257, 1500])
+def test_training_ends_within_one_rollout_of_its_budget(config, env, budget):
+    made_by, ticks = env(16), []
+    algorithm = make_algorithm(config, made_by.observation_space, made_by.action_space)
+    end = training(algorithm, made_by).run(budget, on_tick=ticks.append)
+    rollout = 16 * (config.n_steps if isinstance(config, PPO) else 1)
+    assert budget <= end.steps < budget + rollout
+    assert end.steps == made_by.steps_made == ticks[-1].steps
+    assert end.update == ticks[-1].update == -(-budget // rollout)
+
+
+def test_a_budget_that_is_spent_already_changes_nothing():
+    found = made(Identity(16))
+    before = found.state.params.clone()
+    assert found.run(256, resume_from=Progress(1, 256)) == Progress(1, 256)
+    assert torch.equal(found.state.params, before)
+
+
+def test_a_rollout_is_full_when_its_environment_steps_are_made():
+    ticks = []  # calls of 10 steps, where a rollout has 16: they end at 10; 20, 30; 40
+    train(Calls(16, (False, True)), 3, on_tick=ticks.append)
+    assert [t.steps for t in ticks] == [256, 512, 768]
+    assert [t.metrics["samples"] for t in ticks] == [16, 32, 16]
+
+
+def test_a_rollout_in_which_no_call_ends_is_told_but_not_learnt_from():
+    ticks: list[Tick] = []
+    config = replace(CONFIG, n_steps=4)
+    _, state = train(Calls(16, (False, True)), 5, config, on_tick=ticks.append)
+    assert ["samples" in t.metrics for t in ticks] == [False, False, True, False, True]
+    assert state.count.item() == 2 * config.update_epochs
+
+
+# Stacks and seeds
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_a_stack_of_three_trains_like_three_single_members(overlap):
+    config = replace(CONFIG, num_envs=4, batch_size=16, overlap=overlap)
+    updates = 5
+    stack = train(
+        Clockwork(range(12)), updates, config, seed=5, members=range(3), cut_every=2 * 12 * 16
+    )[1]
+    for m in range(3):
+        env, seeds = Clockwork(range(4 * m, 4 * m + 4)), SeedsOfMember(Seeds(5), m)
+        single = learn(config, env, updates * 4 * 16, seeds, [m], cut_every=2 * 4 * 16)[1]
+        assert single.count.tolist() == [updates * 16]
+        torch.testing.assert_close(stack.params[m], single.params[0], rtol=1e-3, atol=1e-4)
+    assert (stack.params[0] - stack.params[1]).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not(overlap):
+    def weights(seed: int) -> torch.Tensor:
+        return train(Identity(16), 6, replace(CONFIG, overlap=overlap), seed)[1].params
+
+    assert torch.equal(weights(1), weights(1))
+    assert not torch.equal(weights(1), weights(2))
+
+
+# Engines
+
+
+@pytest.mark.filterwarnings("ignore:.*precision lowered")  # see tests/envs/test_engine.py
+@pytest.mark.parametrize("engine", ["envpool", "sync"])
+def test_cartpole_is_learnt_with_every_engine(engine):
+    if engine == "envpool":
+        pytest.importorskip("envpool")
+    env = make_engine(EnvSpec("CartPole-v1", engine=engine), 16, threads=1)
+    ticks: list[Tick] = []
+    try:
+        train(env, 50, replace(CONFIG, gamma=0.98), on_tick=ticks.append)
+    finally:
+        env.close()
+    early, late = (t.metrics["return"] for t in (ticks[3], ticks[-1]))
+    assert early < 40
+    assert late > 60
+
+
+SMALL = {
+    "ppo": replace(CONFIG, num_envs=4, batch_size=16),
+    "recurrent ppo": replace(RECURRENT, num_envs=4, batch_size=16),
+    "dqn": replace(REPLAY, num_envs=4, train_freq=8),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_die(name):
+    config, scene = SMALL[name], skill_scene(EnvSpec("CartPole-v1", engine="sync"))
+    algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+
+    def collector(num_envs: int, first: int):
+        return scene.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
+
+    def weights(collectors: Collectors, kill: bool = False) -> torch.Tensor:
+        learner = learner_of(Stack(algorithm, algorithm.init([Seeds(0)])), 4, Seeds(0))
+        ticks: list[Tick] = []
+
+        def on_tick(tick: Tick) -> None:
+            ticks.append(tick)
+            if kill:  # while it collects, where learning overlaps
+                victim = collectors._workers[tick.update % 2].process
+                os.kill(victim.pid, signal.SIGKILL)
+
+        found = Training(learner, collectors, Seeds(0), Episodes())
+        try:
+            found.run(320, cut_every=100, on_tick=on_tick)
+        finally:
+            collectors.close()
+        assert len(ticks) >= 3
+        return found.state.params
+
+    here = weights(Collectors([collector(2, 0), collector(2, 2)]))
+    assert torch.equal(here, weights(ProcessCollectors(collector, 2, 2, 1, "CartPole-v1")))
+    assert torch.equal(here, weights(ProcessCollectors(collector, 2, 2, 1, "CartPole-v1"), True))
+
+
+# Clean cuts
+
+
+class Stop(Exception):
+    pass
+
+
+CUTS = {
+    "ppo": (CONFIG, Identity),
+    "ppo without overlap": (replace(CONFIG, overlap=False), Identity),
+    "recurrent ppo": (RECURRENT, Recall),
+    "a selector": (CONFIG, Calls),
+    "a recurrent selector": (RECURRENT, Calls),
+}
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights_and_metrics(name):
+    config, env = CUTS[name]
+    rollout, told, saved = 256, [], []
+    whole = made(env(16), config)
+    whole.run(10 * rollout, cut_every=3 * rollout, on_tick=told.append)
+
+    def stop_at_second_cut(tick: Tick) -> None:
+        if tick.cut:
+            saved.append((tick, copied(tick.state[0])))
+        if len(saved) == 2:
+            raise Stop
+
+    stopped = made(env(16), config)
+    with pytest.raises(Stop):
+        stopped.run(10 * rollout, cut_every=3 * rollout, on_tick=stop_at_second_cut)
+    tick, state = saved[-1]
+    assert (tick.update, tick.steps) == (6, 6 * rollout)
+    algorithm, again = PPOAlgorithm(config, env.observation_space, env.action_space), []
+    resumed = training(algorithm, env(16), state=state, goes_on_at=tick.steps)
+    assert not len(resumed.resume(tick.extra))
+    at = Progress(tick.update, tick.steps)
+    resumed.run(10 * rollout, resume_from=at, cut_every=3 * rollout, on_tick=again.append)
+    for f in fields(State):
+        assert torch.equal(getattr(resumed.state, f.name), getattr(whole.state, f.name)), f.name
+    assert [(t.update, t.steps, t.metrics) for t in again] == [
+        (t.update, t.steps, t.metrics) for t in told[6:]
+    ]
+
+
+def test_reported_returns_and_lengths_are_those_of_whole_episodes():
+    ticks: list[Tick] = []
+    train(Countdown(16), 2, on_tick=ticks.append)
+    assert ticks[-1].metrics["return"] == 5.0
+    assert ticks[-1].metrics["length"] == 5.0
+
+
+def test_a_cut_ends_no_episode():
+    ticks: list[Tick] = []
+    # rollouts of 3 steps, each cut, and episodes of 5
+    config = replace(CONFIG, n_steps=3, batch_size=48)
+    train(Countdown(16), 5, config, cut_every=3 * 16, on_tick=ticks.append)
+    assert [t.cut for t in ticks] == [True] * 5
+    assert ["return" in t.metrics for t in ticks] == [False, True, True, True, True]
+    assert {t.metrics["length"] for t in ticks[1:]} == {5.0}
+
+
+def test_a_checkpoint_of_other_environments_is_refused():
+    one, other = made(Identity(16)), made(Identity(8), replace(CONFIG, num_envs=8))
+    saved: list[Tick] = []
+    one.run(512, cut_every=1, on_tick=saved.append)
+    with pytest.raises(SkillweaveError, match=r"'age' of open episodes is int64 \(16,\)"):
+        other.resume(saved[0].extra)
+
+
+# Divergence and stopping
+
+
+@pytest.mark.parametrize("on_tick", [None, lambda tick: None])
+@pytest.mark.parametrize("overlap", [True, False])
+def test_learning_that_diverges_is_an_error_that_says_what_where_and_when(on_tick, overlap):
+    with pytest.raises(
+        SkillweaveError, match=r"of member 0 is nan at update 1: training has diverged"
+    ):
+        train(Broken(16), 3, replace(CONFIG, overlap=overlap), on_tick=on_tick)
+
+
+@pytest.mark.parametrize("config", [CONFIG, replace(REPLAY, num_envs=8)])
+def test_a_member_that_diverges_may_be_skipped(config):
+    env, ticks = Identity(16), []
+    algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    found = training(algorithm, env, members=range(2))
+    found.state.params[1] = float("nan")
+    found.run(2048, skip_diverged=True, on_tick=ticks.append)
+    assert found.state.params[0].isfinite().all()
+    assert all(np.isfinite(list(t.metrics.values())).all() for t in ticks)
+    assert {"policy_loss", "loss"} & ticks[-1].metrics.keys()
+    other = training(algorithm, Identity(16), members=range(2))
+    other.state.params[1] = float("nan")
+    with pytest.raises(SkillweaveError, match="of member 1 is nan"):
+        other.run(2048)
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_the_callback_may_stop_the_run_and_threads_are_given_back(overlap):
+    torch.set_num_threads(1)
+
+    def stop(tick: Tick) -> None:
+        raise Stop
+
+    with pytest.raises(Stop):
+        train(Identity(16), 5, replace(CONFIG, threads=2, overlap=overlap), on_tick=stop)
+    assert torch.get_num_threads() == 1
