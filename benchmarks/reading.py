@@ -24,8 +24,9 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.group import Collectors
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes
-from skillweave.training.learner import Stack, learner_of
+from skillweave.training.learner import Stack
 from skillweave.training.loop import train
+from skillweave.training.replay_learner import learner_of
 from skillweave.training.scene import skill_scene
 
 ROOT = Path(skillweave.__file__).parent

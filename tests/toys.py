@@ -27,8 +27,9 @@ from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import pack
 from skillweave.training.episodes import Episodes
-from skillweave.training.learner import Learner, ReplayLearner, Stack, learner_of, store_of
+from skillweave.training.learner import Learner, Stack
 from skillweave.training.loop import Progress, resume, train
+from skillweave.training.replay_learner import ReplayLearner, learner_of, store_of
 from skillweave.types import Array
 
 

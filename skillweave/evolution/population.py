@@ -29,9 +29,10 @@ from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import ReplayLearner, RolloutLearner, Stack, store_of
+from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.loop import Progress, train
 from skillweave.training.playing import returns_of
+from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Array, prefixed, unprefixed
 

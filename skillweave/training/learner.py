@@ -6,26 +6,17 @@ they found, ``learn`` turns it into new parameters.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from skillweave.buffers.replay import ReplayStore, replay_store
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Experience
-from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
-from skillweave.spaces import to_tensor
-from skillweave.types import Array, prefixed, unprefixed
-
-TOGETHER = 8
-"""Gradient steps whose samples are drawn at once."""
+from skillweave.types import Array
 
 
 @dataclass
@@ -137,190 +128,6 @@ class RolloutLearner:
         self._store.load(kept)
 
 
-class ReplayLearner:
-    """Stacks side by side that learn from one store of what all did, or each from its own rows.
-
-    What shapes the experience (``num_envs``, ``train_freq``, ``n_step``, the store's settings) is
-    that of the first stack. Budgets and ``learning_starts`` count environment steps; the update
-    ratio counts transitions, which a selector has one of for each decision.
-
-    Args:
-        store: made by ``replay_store``.
-        row_steps: environment steps of a row, about; a selector's calls have several.
-        goes_on_at: environment steps of the stage so far.
-    """
-
-    overlap = False
-    report_every = 1_000
-
-    def __init__(
-        self,
-        stacks: Sequence[Stack],
-        store: ReplayStore,
-        seeds: Seeds,
-        *,
-        row_steps: int = 1,
-        goes_on_at: int = 0,
-    ) -> None:
-        self.stacks, self._seeds, self._row_steps = stacks, seeds, row_steps
-        self.store, self.config = store, stacks[0].algorithm.config
-        self.threads = int(self.config.threads)
-        self.members = sum(s.members for s in stacks)
-        self._first = [0, *itertools.accumulate(s.members for s in stacks)]
-        self._random_until = int(self.config.learning_starts) * self.members
-        # A resumed stage whose store was not saved fills it by what it has learnt already.
-        self._learns_from = self._random_until + (0 if len(store) else goes_on_at)
-        self._transitions = np.zeros(2)  # of a member, all so far: when last learnt, and now
-        self._returns: Array | None = None  # (N,), the open episodes' discounted returns
-
-    def request(self, update: int, steps: int, progress: float) -> Request:
-        """``train_freq`` rows of every environment."""
-        params = tuple(s.algorithm.acting_params(s.state, progress) for s in self.stacks)
-        rows = int(self.config.train_freq) * self._row_steps
-        at_random = steps < self._random_until
-        seeds = self._seeds / "collect" / update
-        return Request(rows, params, self._gamma(), seeds, at_random)
-
-    def take(self, experience: Experience) -> None:
-        """Put rows into the store, and keep the running scales of observations and returns."""
-        self.store.add(experience)
-        valid = experience.valid
-        count = experience.reward.size if valid is None else int(valid.sum())
-        self._transitions[1] += count / self.members
-        for i, stack in enumerate(self.stacks):
-            columns = self._columns(i, experience)
-            stack.algorithm.update_obs_stats(
-                stack.state,
-                _rows(experience.obs, columns, stack),
-                None if valid is None else _rows(valid, columns, stack),
-            )
-        if any(s.algorithm.scales_rewards for s in self.stacks):
-            self._scale_returns(experience)
-
-    def _scale_returns(self, experience: Experience) -> None:
-        """Keep the running scale of discounted returns, row by row."""
-        n = experience.reward.shape[1]
-        each = n // self.members
-        if self._returns is None:
-            self._returns = np.zeros(n, np.float32)
-        gamma = self._gamma().repeat(each)
-        for at, ended in enumerate(experience.ended):
-            valid = None if experience.valid is None else experience.valid[at]
-            power = gamma ** experience.steps[at].astype(np.float32)
-            now = self._returns * power + experience.reward[at]
-            self._returns = now if valid is None else np.where(valid, now, self._returns)
-            for i, stack in enumerate(self.stacks):
-                columns = self._columns(i, experience)
-                stack.algorithm.update_return_stats(
-                    stack.state,
-                    _rows(self._returns[None], columns, stack),
-                    None if valid is None else _rows(valid[None], columns, stack),
-                )
-            self._returns[ended if valid is None else ended & valid] = 0.0
-
-    def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
-        """Make the gradient steps that are due; the metrics of the last one, if there were any."""
-        if steps <= self._learns_from or not self.store.ready:
-            self._transitions[0] = self._transitions[1]
-            return {}
-        found = [self._learn(i, update, progress) for i in range(len(self.stacks))]
-        self._transitions[0] = self._transitions[1]
-        if not all(found):
-            return {}
-        return {k: torch.cat([m[k] for m in found]) for k in found[0]}
-
-    def _learn(self, at: int, update: int, progress: float) -> dict[str, Tensor]:
-        """A stack's gradient steps."""
-        stack, first = self.stacks[at], self._first[at]
-        cfg = stack.algorithm.config
-        before, after = (int(t * cfg.update_ratio) for t in self._transitions)
-        due, metrics = after - before, {}
-        beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)
-        seeds = member_seeds(self._seeds, "learn", stack.members, update, first)
-        rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
-        # Several draws at once cost little more than one, but priorities change in between.
-        together, gamma = 1 if cfg.prioritized else TOGETHER, stack.state.gamma.cpu()
-        for done in range(0, due, together):
-            size = cfg.batch_size * min(together, due - done)
-            drawn = self.store.sample(size, gamma, rngs, beta, first, progress)
-            for sample in drawn.split(cfg.batch_size):
-                stack.state, report = stack.algorithm.update(stack.state, sample, generators)
-                metrics = report.metrics
-                if cfg.prioritized:
-                    self.store.update_priorities(sample.index, report.error, first)
-        return metrics
-
-    def cut(self, columns: Array) -> None:
-        """The open trajectories of ``columns`` (k,) end here."""
-        self.store.cut(columns)
-        if self._returns is not None:
-            self._returns[columns] = 0.0
-
-    def kept(self) -> dict[str, Tensor]:
-        """What is counted, and the store, if it is to be saved."""
-        store = prefixed("store", self.store.state()) if self.config.save_buffer else {}
-        return self.counts() | store
-
-    def counts(self) -> dict[str, Tensor]:
-        """What is kept beside the store."""
-        found = {"transitions": torch.from_numpy(self._transitions.copy())}
-        if self._returns is not None:
-            found["returns"] = torch.from_numpy(self._returns.copy())
-        return found
-
-    def load(self, kept: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint kept."""
-        self._transitions = kept["transitions"].numpy().copy()
-        if "returns" in kept:
-            self._returns = kept["returns"].numpy().copy()
-        if saved := unprefixed("store", kept):
-            self.store.load(saved)
-            self._learns_from = self._random_until
-
-    def _gamma(self) -> Array:
-        """(P,) float32, of all members."""
-        return np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks])
-
-    def _columns(self, stack: int, experience: Experience) -> slice:
-        """The columns of a stack's members."""
-        each = experience.reward.shape[1] // self.members
-        return slice(self._first[stack] * each, self._first[stack + 1] * each)
-
-
-def store_of(
-    algorithm: Any, num_envs: int, members: int = 1, *, shared: bool = False
-) -> ReplayStore:
-    """An empty replay store for an algorithm's samples.
-
-    Args:
-        num_envs: of all members together.
-        shared: members learn from what all did.
-
-    Raises:
-        SkillweaveError: it is larger than the machine's memory, or holds not even one row.
-    """
-    return replay_store(
-        algorithm.config, algorithm.codec, algorithm.observation_space, num_envs, members,
-        shared=shared, between=algorithm.between, device=resolve_device(algorithm.config.device),
-    )  # fmt: skip
-
-
-def learner_of(
-    stack: Stack, num_envs: int, seeds: Seeds, *, row_steps: int = 1, goes_on_at: int = 0
-) -> Learner:
-    """The learner of one stack, by what its algorithm learns from.
-
-    Args:
-        row_steps, goes_on_at: as of ``ReplayLearner``.
-    """
-    if stack.algorithm.store == "rollout":
-        # A skill that is seldom where it may start learns from batches that are worth it.
-        full = int(stack.algorithm.config.n_steps) * num_envs // stack.members
-        return RolloutLearner(stack, seeds, full // 2 if row_steps == 1 else 0)
-    store = store_of(stack.algorithm, num_envs, stack.members)
-    return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
-
-
 def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int = 0) -> list[Seeds]:
     """A node of the seed tree for each member from ``first`` on."""
     return [seeds / name / (first + member) / update for member in range(members)]
@@ -329,10 +136,3 @@ def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int 
 def crossed(every: int, before: int, after: int) -> bool:
     """Whether a multiple of ``every`` lies between ``before`` and ``after``, or is ``after``."""
     return after // every > before // every
-
-
-def _rows(x: Array, columns: slice, stack: Stack) -> Tensor:
-    """The columns of a stack, of (T, N, …), as (P, T·B, …) on the stack's device."""
-    rows = to_tensor(np.ascontiguousarray(x[:, columns])).unflatten(1, (stack.members, -1))
-    found: Tensor = rows.transpose(0, 1).flatten(1, 2)
-    return found.to(stack.state.params.device)

@@ -11,7 +11,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json, conf
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
-from skillweave.training.learner import store_of
+from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy, SkillweaveError
 

@@ -20,9 +20,10 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import Stack, learner_of
+from skillweave.training.learner import Stack
 from skillweave.training.loop import Progress, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.replay_learner import learner_of
 from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Stage, Target
 from skillweave.training.stage_log import START, Listener, StageLog, resumed

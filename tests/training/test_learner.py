@@ -29,8 +29,9 @@ from skillweave.collecting.group import Collectors
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import ReplayLearner, Stack, crossed, store_of
+from skillweave.training.learner import Stack, crossed
 from skillweave.training.loop import Progress, train
+from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.types import SkillweaveError, unprefixed
 
 SETTINGS: dict[str, Any] = {

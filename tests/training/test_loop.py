@@ -35,8 +35,9 @@ from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.networks.config import RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import Stack, learner_of
+from skillweave.training.learner import Stack
 from skillweave.training.loop import Progress
+from skillweave.training.replay_learner import learner_of
 from skillweave.training.scene import skill_scene
 from skillweave.types import SkillweaveError
 
