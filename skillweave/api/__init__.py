@@ -24,7 +24,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 from skillweave.skills import Skill
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import check_replay, check_stages
+from skillweave.training.stage import assign_workers, check_replay, check_stages
 from skillweave.types import SkillweaveError
 
 
@@ -218,6 +218,7 @@ def _train(
     observation_space, action_space = declared.check_spaces()
     plan(content["stages"], evolve)
     check_stages(content["stages"], content["eval_every"])
+    assign_workers(content["stages"], declared.spec)
     for stage in content["stages"]:
         acts: Any = action_space
         if stage["kind"] == "selector":

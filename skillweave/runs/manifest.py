@@ -71,6 +71,7 @@ class StageEntry(TypedDict):
     budget: Positive
     algorithm: dict[str, Any]
     status: Literal["waiting", "training", "done"]
+    workers: NotRequired[Positive]
     evolution: NotRequired[dict[str, Any] | None]
     target: NotRequired[TargetEntry | None]
     reached: NotRequired[Reached]

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
 from skillweave.training.learner import store_of
 from skillweave.training.scene import Scene
@@ -122,6 +123,32 @@ def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> N
                 f"{where}: it has a target, but is not evaluated while it trains: set eval_every "
                 "to the environment steps between evaluations"
             )
+
+
+def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
+    """Write into each stage's entry how many processes are to step its environments.
+
+    A number that was measured is lowered to one that divides ``num_envs``; a population's
+    environments stay in this process.
+
+    Raises:
+        SkillweaveError: a number that the user gave does not divide ``num_envs``.
+    """
+    workers = workers_for(spec)
+    for entry in entries:
+        num_envs = entry["algorithm"]["num_envs"]
+        if entry.get("evolution") is not None:
+            entry["workers"] = 1
+        elif spec.workers is None:
+            fitting = (k for k in range(workers, 0, -1) if num_envs % k == 0)
+            entry["workers"] = next(fitting)
+        elif num_envs % workers:
+            raise SkillweaveError(
+                f"stage {entry['name']!r}: num_envs is {num_envs}; it must be a multiple of "
+                f"workers, {workers}, so that each has as many environments"
+            )
+        else:
+            entry["workers"] = workers
 
 
 def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
