@@ -256,6 +256,8 @@ class Call(Skill):
 class Calls(Toy):
     """A selector's world: skill 0 lasts 1 step and pays 1, skill 1 lasts 10 and pays 3 at once."""
 
+    row_steps = 10
+
     def __init__(self, num_envs: int, allowed: tuple[bool, bool] = (True, True)) -> None:
         super().__init__(num_envs)
         self.allowed = allowed

@@ -207,7 +207,7 @@ def test_training_ends_within_one_rollout_of_its_budget(config, env, budget):
     made_by, ticks = env(16), []
     algorithm = make_algorithm(config, made_by.observation_space, made_by.action_space)
     end = training(algorithm, made_by).run(budget, on_tick=ticks.append)
-    rollout = 16 * (config.n_steps if isinstance(config, PPO) else 1)
+    rollout = 16 * (config.n_steps if isinstance(config, PPO) else env.row_steps)
     assert budget <= end.steps < budget + rollout
     assert end.steps == made_by.steps_made == ticks[-1].steps
     assert end.update == ticks[-1].update == -(-budget // rollout)
