@@ -78,9 +78,7 @@ class RolloutStore:
             named["log_std"] = log_std
         named = {name: x.to(self._device) for name, x in named.items()}
         memory = named.pop("memory", None)
-        return Rollout(
-            **named, memory=None if memory is None else memory[:, 0], progress=progress
-        )
+        return Rollout(**named, memory=None if memory is None else memory[:, 0], progress=progress)
 
     def state(self) -> dict[str, Tensor]:
         """Copies of what is held, to go on exactly; see ``load``."""

@@ -99,8 +99,10 @@ def _infos(infos: Sequence[dict[str, Any]], counts: Sequence[int]) -> dict[str, 
             found[name] = _infos([value or {} for value in values], counts)
         elif isinstance(example, np.ndarray) and example.ndim:
             rest, kind = example.shape[1:], example.dtype
-            found[name] = np.concatenate([
-                np.zeros((count, *rest), kind) if value is None else value
-                for value, count in zip(values, counts, strict=True)
-            ])
+            found[name] = np.concatenate(
+                [
+                    np.zeros((count, *rest), kind) if value is None else value
+                    for value, count in zip(values, counts, strict=True)
+                ]
+            )
     return found

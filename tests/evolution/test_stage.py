@@ -325,11 +325,11 @@ def test_members_go_on_with_the_open_episodes_of_their_places(name):
 def test_the_steps_of_members_are_those_that_their_environments_made(name):
     scene = skill_scene(spec(name), Patient())
     evolution = Evolution(3, 3, 1, mutations=EVERYTHING)
-    population = Population.fresh(CONFIGS[name], evolution, scene, Seeds(0))
+    population, told = Population.fresh(CONFIGS[name], evolution, scene, Seeds(0)), []
     for generation in range(3):
         before = [place.engine.steps_made for place in population.places]
-        were, told = population.steps, []
-        until = were // 3 + 50
+        were, until = population.steps, population.steps // 3 + 50
+        told.clear()
         population.train(until, 1000, Seeds(1) / generation, lambda n, tick: told.append(n))
         made = sum(p.engine.steps_made for p in population.places) - sum(before)
         assert population.steps - were == made == told[-1]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
 from toys import Calls, Clockwork, Countdown, Echo, Toy
 
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
@@ -19,7 +18,6 @@ from skillweave.seeding import Seeds
 from skillweave.training import playing
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.playing import returns_of
-
 
 SMALL = Network((8,), "relu")
 
