@@ -90,7 +90,10 @@ def _joined(steps: Sequence[RawStep], counts: Sequence[int]) -> RawStep:
 
 
 def _infos(infos: Sequence[dict[str, Any]], counts: Sequence[int]) -> dict[str, Any]:
-    """What parts of so many environments tell, array by array; zeros where one tells nothing."""
+    """What parts of so many environments tell, array by array, nested dicts included.
+
+    Where a part tells nothing stand zeros, or None among objects, as Gymnasium has them.
+    """
     found: dict[str, Any] = {}
     for name in dict.fromkeys(name for info in infos for name in info):
         values = [info.get(name) for info in infos]
@@ -99,9 +102,10 @@ def _infos(infos: Sequence[dict[str, Any]], counts: Sequence[int]) -> dict[str, 
             found[name] = _infos([value or {} for value in values], counts)
         elif isinstance(example, np.ndarray) and example.ndim:
             rest, kind = example.shape[1:], example.dtype
+            nothing = None if kind.kind == "O" else np.zeros((), kind)
             found[name] = np.concatenate(
                 [
-                    np.zeros((count, *rest), kind) if value is None else value
+                    np.full((count, *rest), nothing, kind) if value is None else value
                     for value, count in zip(values, counts, strict=True)
                 ]
             )
