@@ -11,6 +11,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json, conf
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
+from skillweave.ops.device import resolve_device
 from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy, SkillweaveError
@@ -104,6 +105,10 @@ def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> N
     """Raise a SkillweaveError where a stage of a manifest could not do what it is to do."""
     for entry in entries:
         where, population = f"stage {entry['name']!r}", entry.get("evolution")
+        try:
+            resolve_device(entry["algorithm"].get("device", "cpu"))
+        except SkillweaveError as error:
+            raise SkillweaveError(f"{where}: {error}") from error
         members = 1 if population is None else population["population"]
         starts, budget = entry["algorithm"].get("learning_starts", 0), entry["budget"] // members
         if budget <= starts:

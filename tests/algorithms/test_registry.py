@@ -123,7 +123,13 @@ def test_it_trains_skills_selectors_and_populations(tmp_path):
     )  # fmt: skip
     changes = Mutations(none=0.3, activation=0.0)
     search = Evolution(population=2, generations=2, episodes=1, mutations=changes)
-    run = hierarchy.train(tmp_path / "run", quiet=True, evolve={"left": search})
+    evolve = {"left": search, "selector": search}
+    run = hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
+    left, again, selector = run.info()["stages"]
+    assert [s["steps"] >= s["budget"] * 0.9 for s in (left, again, selector)] == [True] * 3
+    assert "winner" in left
+    assert "winner" not in again
+    assert "winner" in selector
     assert run.evaluate(2).mean > 0
 
 

@@ -15,6 +15,7 @@ import torch
 from skillweave import (
     DQN,
     PPO,
+    RNN,
     SAC,
     TD3,
     Agent,
@@ -34,6 +35,7 @@ from skillweave import (
 from skillweave.evolution import stage as evolving
 from skillweave.evolution.population import Population, has_diverged
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
 from skillweave.training.scene import skill_scene
 
@@ -82,6 +84,22 @@ def choices(render_mode: str | None = None) -> gym.Env[Any, Any]:
 
 def forces(render_mode: str | None = None) -> gym.Env[Any, Any]:
     return Aim()
+
+
+class Still(Skill):
+    """Always the first choice, for as long as it may."""
+
+    def policy(self, obs: Any) -> Any:
+        return np.zeros(len(obs), np.int64)
+
+
+class Moving(Skill):
+    """The second, three times."""
+
+    max_steps = 3
+
+    def policy(self, obs: Any) -> Any:
+        return np.ones(len(obs), np.int64)
 
 
 def spec(name: str) -> EnvSpec:
@@ -168,6 +186,47 @@ def test_a_killed_population_ends_with_the_very_same_weights(name, tmp_path, mon
             assert {**a, "seconds": 0} == {**b, "seconds": 0}
 
 
+RECURRENT = PPO(num_envs=2, n_steps=16, batch_size=16, network=Network((6,), rnn=RNN("gru", 4)))
+SCALED = DQN(**REPLAY, normalize_rewards=True)
+SCALED_RAINBOW = DQN.rainbow(**REPLAY, normalize_obs=True)
+
+
+@pytest.mark.parametrize("config", [CONFIGS["ppo"], RECURRENT, SCALED, SCALED_RAINBOW])
+def test_a_killed_population_of_selectors_ends_with_the_very_same_weights(
+    config, tmp_path, monkeypatch
+):
+    # Generations end in the middle of calls, which are up to 7 steps long.
+    hierarchy = Hierarchy(
+        spec("ppo"), [Still(), Moving()], selector=config, selector_steps=256, call_steps=7
+    )
+    evolve = {"selector": Evolution(3, 4, 2, mutations=EVERYTHING)}
+    whole = hierarchy.train(tmp_path / "whole", quiet=True, evolve=evolve)
+    cut, cuts = Population.cut, [0]
+
+    def dies(self: Population, seeds: Seeds) -> Any:
+        cuts[0] += 1
+        if cuts[0] == 3:  # goes on from the second
+            raise KeyboardInterrupt
+        return cut(self, seeds)
+
+    monkeypatch.setattr(Population, "cut", dies)
+    with pytest.raises(KeyboardInterrupt):
+        hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
+    monkeypatch.undo()
+    hierarchy.resume(tmp_path / "run", quiet=True)
+    assert lineage(tmp_path / "run") == lineage(whole.path)
+    ours, theirs = (
+        read_tensors(path / "policies" / "selector.safetensors")[0]
+        for path in (tmp_path / "run", whole.path)
+    )
+    assert all(torch.equal(value, ours[name]) for name, value in theirs.items())
+    records = (list(RunDirectory.open(tmp_path / n).metrics()) for n in ("run", "whole"))
+    for a, b in zip(*records, strict=True):
+        assert {**a, "seconds": 0} == {**b, "seconds": 0}
+    steps = [r.info()["stages"][0]["steps"] for r in (whole, hierarchy.load(tmp_path / "run"))]
+    assert steps[0] == steps[1]
+
+
 def test_the_same_seed_gives_the_same_lineage_and_another_one_another(tmp_path):
     first, second, other = (
         (train("ppo", tmp_path / str(i), seed=s).path / "lineage.jsonl").read_text()
@@ -237,6 +296,59 @@ def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tm
     assert [has_diverged(m) for m in population.members] == [False, True, False]
     fitness = population.fitness(scene.collector(2, None), Seeds(2))
     assert np.isfinite(fitness).tolist() == [True, False, True]
+
+
+class Patient(Skill):
+    """May start late in an episode, which random acting has to find."""
+
+    def initiation(self, obs: Any) -> Any:
+        return obs[:, 0] > 0.5
+
+
+@pytest.mark.parametrize("name", ["ppo", "dqn"])
+def test_members_go_on_with_the_open_episodes_of_their_places(name):
+    # Generations of 3 steps of each environment, episodes of 10.
+    evolution = Evolution(3, 4, 1, mutations=EVERYTHING)
+    population = Population.fresh(CONFIGS[name], evolution, skill_scene(spec(name)), Seeds(0))
+    ages = []
+    for generation in range(4):
+        until = population.steps // 3 + 6
+        population.train(until, 1000, Seeds(1) / generation, lambda steps, tick: None)
+        ages.append(population.places[0].kept["age"][0])
+        population.evolve(np.arange(3.0), Seeds(2) / generation)
+    rows = CONFIGS[name].n_steps if name == "ppo" else 3
+    assert ages == [rows * (g + 1) % 10 for g in range(4)]
+    population.close()
+
+
+@pytest.mark.parametrize("name", ["ppo", "dqn"])
+def test_the_steps_of_members_are_those_that_their_environments_made(name):
+    scene = skill_scene(spec(name), Patient())
+    evolution = Evolution(3, 3, 1, mutations=EVERYTHING)
+    population, told = Population.fresh(CONFIGS[name], evolution, scene, Seeds(0)), []
+    for generation in range(3):
+        before = [place.engine.steps_made for place in population.places]
+        were, until = population.steps, population.steps // 3 + 50
+        told.clear()
+        population.train(until, 1000, Seeds(1) / generation, lambda n, tick: told.append(n))
+        made = sum(p.engine.steps_made for p in population.places) - sum(before)
+        assert population.steps - were == made == told[-1]
+        assert made >= 3 * 50 - 3 * 32
+        population.evolve(np.arange(3.0), Seeds(2) / generation)
+    population.close()
+
+
+@pytest.mark.parametrize("name", ["dqn", "sac"])
+def test_what_begins_anew_at_a_cut_ends_its_returns_too(name, monkeypatch):
+    config = replace(CONFIGS[name], normalize_rewards=True)
+    population = Population.fresh(config, Evolution(2, 2, 1), skill_scene(spec(name)), Seeds(0))
+    population.train(25, 100, Seeds(1), lambda steps, tick: None)
+    before = population._kept["returns"].clone()
+    assert (before != 0).all()
+    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", -1)
+    population.cut(Seeds(2))
+    assert not population._kept["returns"].any()
+    population.close()
 
 
 def test_it_ends_early_at_the_target(tmp_path):
