@@ -28,6 +28,8 @@ ALL = (
     ["learning"],
     ["mixed"],
     ["population"],
+    ["collecting"],
+    ["reading"],
     ["search"],
 )
 

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from skillweave.types import Array
 
 if TYPE_CHECKING:
@@ -119,9 +117,3 @@ class Report:
 
     metrics: dict[str, Tensor] = field(default_factory=dict)  # each (P,)
     error: Tensor | None = None  # (P, B), for the priorities of replay
-
-
-def by_member(x: Array, members: int) -> Array:
-    """Rows (T, P·B, …) as (P, T, B, …)."""
-    split = x.reshape(x.shape[0], members, -1, *x.shape[2:])
-    return np.moveaxis(split, 1, 0)
