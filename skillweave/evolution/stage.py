@@ -26,7 +26,7 @@ from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.trainer import StageRun
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
 
 @dataclass
@@ -238,6 +238,11 @@ class EvolvingPopulation:
             member.state = state_from(
                 own, fresh, where, algorithm.parameter_groups(), may_diverge=True
             )
+            for name in algorithm.member_hyperparameters:  # they never diverge
+                if not bool(getattr(member.state, name).isfinite().all()):
+                    raise SkillweaveError(
+                        f"{where}: tensor {name} holds NaN or infinity: the file was altered"
+                    )
             members.append(member)
         self.population = Population(members, self.evolution, self.stage.scene, self.seeds)
         self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
