@@ -18,6 +18,7 @@ from skillweave.ops.device import on_host
 _CELLS = (
     "obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts",
 )  # fmt: skip
+"""Fields of a rollout that have a value for each cell."""
 
 
 def without_gaps(rollout: Rollout) -> Rollout:
@@ -42,18 +43,7 @@ def without_gaps(rollout: Rollout) -> Rollout:
         found: Tensor = take_rows(x.flatten(1, 2), rows).unflatten(1, lead)
         return found.masked_fill(~kept.view(*kept.shape, *[1] * (x.ndim - 3)), 0)
 
-    names = (
-        "obs",
-        "action",
-        "reward",
-        "discount",
-        "next_obs",
-        "last",
-        "obs_mask",
-        "head",
-        "starts",
-    )
-    parts: dict[str, Any] = {name: getattr(rollout, name) for name in names}
+    parts: dict[str, Any] = {name: getattr(rollout, name) for name in _CELLS}
     parts = {name: None if x is None else take(x) for name, x in parts.items()}
     following = torch.nn.functional.pad(kept[:, 1:], (0, 0, 0, 1))
     parts["last"] = parts["last"] | (kept & ~following)  # nothing follows the last valid row

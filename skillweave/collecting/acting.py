@@ -52,11 +52,11 @@ class Acting:
     """
 
     def __init__(self, stacks: Sequence[tuple[Algorithm, int]], num_envs: int) -> None:
-        self.stacks, self.num_envs = tuple(stacks), num_envs
+        self.stacks = tuple(stacks)
         self.members = sum(count for _, count in stacks)
         self.each = num_envs // self.members  # B
         first = stacks[0][0]
-        self.codec, self.to_env, self.memory_size = first.codec, first.to_env, first.memory_size
+        self.to_env, self.memory_size = first.to_env, first.memory_size
         self.keeps_head = first.store == "rollout"
 
     def begin(self, request: Request, every_step: bool = True) -> None:

@@ -257,9 +257,7 @@ def _beside(values: list[Any], members: int, name: str) -> Any:
     if known is None:
         return None
     if name in _FREE:
-        values = [
-            np.ones((*known.shape[:2], *known.shape[2:]), bool) if v is None else v for v in values
-        ]
+        values = [np.ones_like(known) if v is None else v for v in values]
     if name == "rewards":
         values = as_wide(values)
     axis = 0 if name == "memory" else 1

@@ -45,7 +45,7 @@ class Collectors:
 
     def state(self) -> dict[str, Array]:
         """All that ``restore`` needs, right after ``cut``."""
-        return _joined_states([part.state() for part in self.parts])
+        return joined_states([part.state() for part in self.parts])
 
     def restore(self, state: dict[str, Array]) -> Array:
         """Stand where ``state`` says; (k,) environments that begin anew."""
@@ -71,7 +71,8 @@ class Collectors:
         return np.sort(np.concatenate(found))
 
 
-def _joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:
+def joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:
+    """The states of several collectors as one; see ``split_states``."""
     found: dict[str, Array] = {"collectors": np.array([len(states)])}
     for i, state in enumerate(states):
         found |= prefixed(str(i), state)

@@ -23,7 +23,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected, Collector
-from skillweave.collecting.group import Collectors, _joined_states, split_states
+from skillweave.collecting.group import Collectors, joined_states, split_states
 from skillweave.collecting.shared_columns import ColumnWriter, SharedColumns
 from skillweave.messages import told
 from skillweave.seeding import Seeds
@@ -108,7 +108,7 @@ class ProcessCollectors(Collectors):
         """All that ``restore`` needs, right after ``cut``."""
         states = self._ask_all("state", None)
         self._set("restore", states, tell=False)
-        return _joined_states(states)
+        return joined_states(states)
 
     def restore(self, state: dict[str, Array]) -> Array:
         """Stand where ``state`` says; (k,) environments that begin anew."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +26,9 @@ class Starters:
         action_space: of one environment.
     """
 
-    def __init__(self, skills: SkillSet | None, num_envs: int, action_space: gym.Space) -> None:  # type: ignore[type-arg]
+    def __init__(
+        self, skills: SkillSet | None, num_envs: int, action_space: gym.Space[Any]
+    ) -> None:
         self.skills = None if skills is None else replace(skills, greedy=False)
         self._space, self._num_envs = action_space, num_envs
         self._calls: Memory = {} if skills is None else skills.start(num_envs)

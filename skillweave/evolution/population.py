@@ -28,17 +28,17 @@ from skillweave.evolution.stacks import Member, Origin, copy, grouped, join, spl
 from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
+from skillweave.training.arena import returns_of
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.loop import Progress, train
-from skillweave.training.playing import returns_of
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Array, prefixed, unprefixed
 
 NEVER = 2**62
 """Steps between cuts: a generation is one piece."""
-OnTick = Callable[[int, Tick], None]
+OnGenerationTick = Callable[[int, Tick], None]
 """Is told the steps of all members in this generation so far, and the tick."""
 
 
@@ -98,11 +98,13 @@ class Population:
     def steps(self) -> int:
         """Environment steps of all members and of their ancestors, each as often as it has heirs.
 
-        What was really spent is counted by the phase.
+        What was really spent is counted by the stage.
         """
         return sum(m.steps for m in self.members)
 
-    def train(self, until: int, schedule_steps: int, seeds: Seeds, on_tick: OnTick) -> None:
+    def train(
+        self, until: int, schedule_steps: int, seeds: Seeds, on_tick: OnGenerationTick
+    ) -> None:
         """Train every member until it has ``until`` steps."""
         for i, place in enumerate(self.places):
             place.start(self.seeds / "start" / i)
@@ -118,7 +120,7 @@ class Population:
         until: int,
         schedule_steps: int,
         seeds: Seeds,
-        on_tick: OnTick,
+        on_tick: OnGenerationTick,
     ) -> None:
         """A stack's rollouts are its own, so stacks learn one after another.
 
@@ -147,7 +149,7 @@ class Population:
         until: int,
         schedule_steps: int,
         seeds: Seeds,
-        on_tick: OnTick,
+        on_tick: OnGenerationTick,
     ) -> None:
         """All stacks act at once and learn from one store."""
         stacks = [self._stack(group) for group in groups]
@@ -263,7 +265,7 @@ def spaces_of(scene: Scene) -> tuple[Any, Any]:
     return scene.observation_space, scene.action_space
 
 
-def _telling(on_tick: OnTick, before: int) -> Callable[[Tick], None]:
+def _telling(on_tick: OnGenerationTick, before: int) -> Callable[[Tick], None]:
     """Tells the ticks of one loop in terms of the generation, ``before`` steps later."""
     return lambda tick: on_tick(before + tick.steps, tick)
 

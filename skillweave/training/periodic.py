@@ -9,8 +9,8 @@ import numpy as np
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.collector import RETURN, SUCCESS, Collector
 from skillweave.seeding import Seeds
+from skillweave.training.arena import episodes_of
 from skillweave.training.learner import crossed
-from skillweave.training.playing import episodes_of
 from skillweave.training.scene import Scene
 
 

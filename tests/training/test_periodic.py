@@ -15,9 +15,9 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
-from skillweave.training import playing
+from skillweave.training import arena
+from skillweave.training.arena import returns_of
 from skillweave.training.periodic import PeriodicEvaluation
-from skillweave.training.playing import returns_of
 
 SMALL = Network((8,), "relu")
 
@@ -63,12 +63,12 @@ def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit(monkeypatch
             obs, reward, terminated, truncated = super().play(action)
             return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated
 
-    monkeypatch.setattr(playing, "LONGEST_EPISODE", 8)
+    monkeypatch.setattr(arena, "LONGEST_EPISODE", 8)
     assert played(Forever(2)) == [5.0, 8.0]
 
 
 def test_the_limit_counts_environment_steps_not_decisions(monkeypatch):
-    monkeypatch.setattr(playing, "LONGEST_EPISODE", 25)
+    monkeypatch.setattr(arena, "LONGEST_EPISODE", 25)
     assert played(Calls(1, (False, True))) == [9.0]  # calls of 10 steps, of which each pays 3
 
 
