@@ -148,8 +148,9 @@ class Hierarchy(Declaration):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
         """The hierarchy of a run that needs none of the user's code (plain data says it all)."""
+        told = ("name", "max_steps", "call_steps")
         skills = [
-            type(s["name"], (Skill,), {"name": s["name"], "max_steps": s["max_steps"]})()
+            type(s["name"], (Skill,), {k: s[k] for k in told if k in s})()
             for s in manifest["skills"]
         ]
         return cls(_spec_of(manifest), skills, call_steps=manifest["call_steps"])

@@ -7,12 +7,28 @@ Collectors (training) and ``HierarchyPolicy`` (everything else) both run skills 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
 from skillweave.envs.infos import allowed_rows, info_rows
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+
+
+class Why(IntEnum):
+    """Why a call ended."""
+
+    RUNNING = 0
+    """It goes on."""
+    OWN = 1
+    """The skill's ``termination`` ended it."""
+    LIMIT = 2
+    """It had lasted as long as it may: ``max_steps``, or ``call_steps``."""
+    INTERRUPTED = 3
+    """The selector cut it, as another skill was worth more."""
+    EPISODE = 4
+    """The episode ended, or has just begun: there is no call."""
 
 
 @dataclass(frozen=True)
@@ -131,21 +147,29 @@ class SkillSet:
             return actions
         return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)
 
+    def limit(self, i: int) -> int | None:
+        """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""
+        skill = self.skills[i]
+        most = self.call_steps if skill.call_steps is None else skill.call_steps
+        limits = [x for x in (most, skill.max_steps) if x is not None]
+        return min(limits) if limits else None
+
     def observe(self, memory: Memory, rows: Array, step: Step | None) -> Array:
-        """Count a step of environments ``rows`` (k,); (k,) bool: the call is over.
+        """Count a step of environments ``rows`` (k,); (k,) int8, ``Why`` their calls are over.
+
+        That an episode ended is not noticed here.
 
         ``step`` may be None where nothing ``watches``; its ``elapsed`` and ``timed_out`` are set
         here, as seen by the running skill.
         """
         memory["elapsed"][rows] += 1
         elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
-        over = np.zeros(len(rows), bool)
-        for i, skill in enumerate(self.skills):
-            limits = [x for x in (self.call_steps, skill.max_steps) if x is not None]
-            if limits:
-                over |= (running == i) & (elapsed >= min(limits))
+        why = np.full(len(rows), Why.RUNNING, np.int8)
+        for i in range(len(self.skills)):
+            if (limit := self.limit(i)) is not None:
+                why[(running == i) & (elapsed >= limit)] = Why.LIMIT
         if step is None:
-            return over
+            return why
         for i, (skill, policy) in enumerate(zip(self.skills, self.policies, strict=True)):
             mine = np.flatnonzero(running == i)
             if not len(mine):
@@ -155,8 +179,8 @@ class SkillSet:
             self._put(memory, i, rows[mine], policy.observe(own, part))
             if skill.defines("termination"):
                 stops = asked(skill, "termination", part, len(mine), elapsed[mine], rows[mine])
-                over[mine] |= stops
-        return over
+                why[mine[stops]] = Why.OWN
+        return why
 
     def _own(self, memory: Memory, i: int, rows: Array) -> Memory:
         prefix = f"{i}."

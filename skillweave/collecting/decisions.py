@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.calls import SkillSet, Why
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import as_wide
 from skillweave.envs.checks import LONGEST_EPISODE
@@ -94,7 +94,8 @@ class DecisionCollector(Collector):
                 self._never, self._calls["elapsed"], raw.info,
             )  # fmt: skip
         ended = raw.terminated | raw.truncated
-        over = self.skills.observe(self._calls, self._all, seen) | ended
+        why = self.skills.observe(self._calls, self._all, seen)
+        over = (why != Why.RUNNING) | ended
         self.obs = raw.next_obs
         ids = np.flatnonzero(over)
         if len(ids):

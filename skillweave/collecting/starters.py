@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.calls import SkillSet, Why
 from skillweave.envs.engine import RawStep
 from skillweave.envs.infos import allowed_rows, info_rows, random_actions
 from skillweave.types import Array, Memory, Step, prefixed
@@ -63,7 +63,7 @@ class Starters:
             raw.truncated[own], np.zeros(len(own), bool), self._calls["elapsed"][own],
             info_rows(raw.info, own, self._num_envs),
         )  # fmt: skip
-        over = self.skills.observe(self._calls, own, seen)
+        over = self.skills.observe(self._calls, own, seen) != Why.RUNNING
         self.kept["starters.called"][own[over]] = False
 
     def stop(self, ids: Array) -> None:

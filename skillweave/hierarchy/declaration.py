@@ -91,7 +91,8 @@ class Declaration:
         check_fields(self)
         if self.call_steps is None:
             for skill in self.skills:
-                if skill.max_steps is None and not skill.defines("termination"):
+                ends = skill.max_steps or skill.call_steps or skill.defines("termination")
+                if not ends:
                     raise SkillweaveError(
                         f"call_steps is None, but skill {skill.name!r} never stops by itself: give "
                         "it max_steps or termination()"

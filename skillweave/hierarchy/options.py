@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.calls import SkillSet, Why
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import allowed_rows
@@ -132,7 +132,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
                 never, elapsed, raw.info,
             )  # fmt: skip
-        return self.skills.observe(self._memory, rows, seen)
+        over: Array = self.skills.observe(self._memory, rows, seen) != Why.RUNNING
+        return over
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the engine."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.calls import SkillSet, Why
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.types import Array, Memory, Policy, Step
@@ -18,7 +18,8 @@ _SELECTOR = "selector."
 class HierarchyPolicy:
     """Decides where a call is over, lets the skill act elsewhere.
 
-    Memory rows: those of ``SkillSet``, ``over`` (decide before acting), and the selector's own.
+    Memory rows: those of ``SkillSet``, ``why`` (int8, why the last call ended; one that is
+    running has not), and the selector's own.
     """
 
     def __init__(self, selector: Policy, skills: SkillSet) -> None:
@@ -35,14 +36,15 @@ class HierarchyPolicy:
         told = self.skills
         parts = [source_of(policy) for policy in (self.selector, *told.policies)]
         acts = [[part["kind"], part.get("sha256")] for part in parts]
-        skills = [[s.name, s.max_steps] for s in told.skills]
+        limits = [[x for x in (s.call_steps,) if x is not None] for s in told.skills]
+        skills = [[s.name, s.max_steps, *own] for s, own in zip(told.skills, limits, strict=True)]
         reflexes = [r.name for r in told.reflexes]
         whole = json.dumps([acts, skills, reflexes, told.call_steps, told.greedy])
         return {"sha256": checksum(whole.encode())}
 
     def start(self, n: int) -> Memory:
         """Memory of n environments that wait for their first decision."""
-        memory = self.skills.start(n) | {"over": np.ones(n, bool)}
+        memory = self.skills.start(n) | {"why": np.full(n, Why.EPISODE, np.int8)}
         return memory | {_SELECTOR + k: v for k, v in self.selector.start(n).items()}
 
     def act(
@@ -59,7 +61,7 @@ class HierarchyPolicy:
         ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills.
         """
         memory = {k: v.copy() for k, v in memory.items()}
-        rows = np.flatnonzero(memory["over"])
+        rows = np.flatnonzero(memory["why"] != Why.RUNNING)
         if len(rows):
             here = obs[rows]
             own = {
@@ -71,14 +73,15 @@ class HierarchyPolicy:
             for k, v in after.items():
                 memory[_SELECTOR + k][rows] = v
             self.skills.begin(memory, rows, skill)
-            memory["over"][rows] = False
+            memory["why"][rows] = Why.RUNNING
         return self.skills.act(memory, np.arange(len(obs)), obs, rng, mask), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Notice where calls are over."""
         memory = {k: v.copy() for k, v in memory.items()}
         seen = step if self.skills.watches else None
-        memory["over"] = self.skills.observe(memory, np.arange(len(step.reward)), seen)
+        why = self.skills.observe(memory, np.arange(len(step.reward)), seen)
+        memory["why"] = np.where(step.terminated | step.truncated, np.int8(Why.EPISODE), why)
         return memory
 
     def acting(self, memory: Memory) -> Array | None:

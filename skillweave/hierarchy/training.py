@@ -115,4 +115,6 @@ def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
 def _skill_entry(skill: Skill) -> dict[str, Any]:
     policy = ready_policy(skill)
     entry = {"name": skill.name, "max_steps": skill.max_steps, "ready": policy is not None}
+    if skill.call_steps is not None:
+        entry["call_steps"] = skill.call_steps
     return entry if policy is None else entry | {"policy": source_of(policy)}

@@ -32,6 +32,7 @@ class SkillEntry(TypedDict):
 
     name: Name
     max_steps: Positive | None
+    call_steps: NotRequired[Positive]
     ready: NotRequired[bool]
     policy: NotRequired[Source]
 

@@ -30,6 +30,7 @@ class Skill:
     Attributes:
         name: used in messages, files and captions; default: the class name in lower case.
         max_steps: the skill stops after so many steps; None: only by ``termination``.
+        call_steps: its calls last at most so long, wherever it is trained; None: the hierarchy's.
         steps: training budget in environment steps; None: the hierarchy's ``skill_steps``.
         algorithm: settings of the algorithm that trains it (its network is among them);
             None: the hierarchy's.
@@ -46,6 +47,7 @@ class Skill:
 
     name: str = ""
     max_steps: int | None = None
+    call_steps: int | None = None
     steps: int | None = None
     algorithm: Any = None
     target_return: float | None = None
@@ -91,7 +93,7 @@ class Skill:
             raise SkillweaveError(
                 f"{where}: the name names files too; use letters, digits, '_' and '-', at most 64"
             )
-        for field in ("max_steps", "steps"):
+        for field in ("max_steps", "steps", "call_steps"):
             value = getattr(self, field)
             if value is not None and (type(value) is not int or value < 1):
                 raise SkillweaveError(

@@ -27,7 +27,7 @@ from reference_calls import (
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Hierarchy, Run
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.calls import SkillSet, Why
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -82,7 +82,7 @@ def play(policy, engine, seed: int, steps: int, **how) -> list:
     obs, memory, happened = engine.reset(seed), policy.start(n), []
     elapsed = np.zeros(n, np.int64)
     for _ in range(steps):
-        decides = memory.get("over", np.zeros(n, bool)).copy()
+        decides = memory.get("why", np.zeros(n, bool)).astype(bool)
         action, memory = policy.act(memory, obs, **how)
         acting = policy.acting(memory)
         happened.append((obs.copy(), decides, None if acting is None else acting.copy(), action))
@@ -434,8 +434,8 @@ def test_alone_an_environment_is_acted_in_as_among_others(make):
             alone[i] = policy.observe(alone[i], part)
             acting = policy.acting(alone[i])
             assert acting.tolist() == [policy.acting(together)[i]]
-            where = together["over"][i]
-            assert alone[i]["over"].tolist() == [where]
+            where = together["why"][i]
+            assert alone[i]["why"].tolist() == [where]
     assert together.keys() == alone[0].keys()
 
 
@@ -499,7 +499,7 @@ def test_a_skill_that_terminates_is_followed_by_a_decision_and_only_there():
     assert action.tolist() == [2, 2]
     assert policy.acting(memory).tolist() == [0, 0]
     memory = policy.observe(memory, transition(obs, action, walk_obs(2, -4)))
-    assert memory["over"].tolist() == [True, False]
+    assert memory["why"].tolist() == [Why.OWN, Why.RUNNING]
     _, memory = policy.act(memory, walk_obs(2, -4))
     assert policy.acting(memory).tolist() == [1, 0]
     assert memory["elapsed"].tolist() == [0, 1]
@@ -511,10 +511,23 @@ def test_a_call_lasts_as_many_steps_as_the_least_limit_says():
         policy = HierarchyPolicy(Chooser(1), skill_set(Left, call_steps=call_steps))
         memory, obs, decided = policy.start(1), walk_obs(0), []
         for _ in range(12):
-            decided.append(bool(memory["over"][0]))
+            decided.append(bool(memory["why"][0]))
             action, memory = policy.act(memory, obs)
             memory = policy.observe(memory, transition(obs, action, obs))
         assert decided == [k % lasts == 0 for k in range(12)]
+
+
+def test_call_steps_of_a_skill_count_instead_of_those_of_the_hierarchy():
+    for own, lasts in ((2, 2), (5, 3), (None, 1)):
+        skills = skill_set(Left, call_steps=1)
+        skills.skills[0].call_steps = own
+        policy = HierarchyPolicy(Chooser(1), skills)
+        memory, obs, decided = policy.start(1), walk_obs(0), []
+        for _ in range(12):
+            decided.append(bool(memory["why"][0]))
+            action, memory = policy.act(memory, obs)
+            memory = policy.observe(memory, transition(obs, action, obs))
+        assert decided == [k % lasts == 0 for k in range(12)], "Left itself stops after 3"
 
 
 def test_a_skill_that_is_called_again_at_once_goes_on_with_its_memory():
