@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3
     from skillweave.algorithms.registry import register_algorithm
     from skillweave.api import Agent, Hierarchy, Run, train_agent
+    from skillweave.collecting.calls import Lengths
     from skillweave.envs.make import EnvSpec
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, Selection
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from skillweave.networks.encoders import Encoder, register_encoder
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
     from skillweave.training.evaluation import Evaluation, evaluate
+    from skillweave.training.stage import Together
     from skillweave.types import Array, SkillweaveError, Step
 
 __version__ = "0.1.0"
@@ -36,6 +38,7 @@ _HOME = {
     "Evolution": "evolution.config",
     "Heir": "evolution.selection",
     "Hierarchy": "api",
+    "Lengths": "collecting.calls",
     "Mutations": "evolution.config",
     "Network": "networks.config",
     "OptionsEnv": "hierarchy.options",
@@ -53,6 +56,7 @@ _HOME = {
     "SkillweaveError": "types",
     "Step": "types",
     "TD3": "algorithms.config",
+    "Together": "training.stage",
     "Tournament": "evolution.config",
     "Truncation": "evolution.config",
     "evaluate": "training.evaluation",
@@ -82,6 +86,7 @@ __all__ = [
     "Evolution",
     "Heir",
     "Hierarchy",
+    "Lengths",
     "Mutations",
     "Network",
     "OptionsEnv",
@@ -95,6 +100,7 @@ __all__ = [
     "Skill",
     "SkillweaveError",
     "Step",
+    "Together",
     "Tournament",
     "Truncation",
     "evaluate",

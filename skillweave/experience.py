@@ -15,6 +15,8 @@ from skillweave.types import Array
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from skillweave.algorithms.base import ActingParams
+
 
 @dataclass(slots=True)
 class Experience:
@@ -42,6 +44,9 @@ class Experience:
     memory: Array | None = None  # (N, M) float32, before each column's first valid row
     starts: Array | None = None  # (T, N) bool, an episode begins here, so memory is empty before it
     rewards: Array | None = None  # (T, N, L) float32, of each step of a call, then zeros
+    advantage: Array | None = None  # (T, N) float32, what counts beside the learner's own
+    parts: tuple[Experience, ...] = ()
+    """Of a selector: what its skills did in the same steps, those that learn, in their order."""
     spent: int = 0
     """Environment steps that were made for it, those of rows that are not valid included."""
 
@@ -72,7 +77,17 @@ class Rollout:
     log_std: Tensor | None = None  # (P, 1, 1, A), of who acted, where it is no part of ``head``
     memory: Tensor | None = None  # (P, B, M), before the first row
     starts: Tensor | None = None  # (P, T, B) bool, memory is empty before this row
+    advantage: Tensor | None = None  # (P, T, B), what counts beside the learner's own advantage
+    anchor: Anchor | None = None
     progress: float = 0.0  # share of the budget that is spent, for schedules
+
+
+@dataclass(slots=True)
+class Anchor:
+    """The policy that a learner is to stay near."""
+
+    params: ActingParams  # of P members
+    coef: Tensor  # (P,), what a nat of KL from it costs
 
 
 @dataclass(slots=True)

@@ -6,6 +6,7 @@ does not import torch, so that ``--help`` and argument errors are instant.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, TypeAlias
 
@@ -83,6 +84,10 @@ class PPO(OnPolicy):
     """Weight of the entropy bonus."""
     ent_coef_final: float | None = None
     """Weight of the entropy bonus at the end of the budget, reached linearly; None: constant."""
+    floor: float = 0.0
+    """Share of actions drawn uniformly from those allowed, discrete ones, at the start."""
+    floor_final: float | None = None
+    """The same at the end of the budget, reached linearly; None: constant."""
     vf_coef: float = 0.5
     """Weight of the value loss."""
     max_grad_norm: float = 0.5
@@ -108,8 +113,10 @@ class PPO(OnPolicy):
         number(self, "gae_lambda", high=1.0)
         positive(self, "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")
         number(self, "ent_coef", "vf_coef")
-        if self.ent_coef_final is not None:
-            number(self, "ent_coef_final")
+        number(self, "floor", high=1.0)
+        for name in ("ent_coef_final", "floor_final"):
+            if getattr(self, name) is not None:
+                number(self, name, high=1.0 if name == "floor_final" else math.inf)
         positive(self, *(k for k in ("target_kl", "clip_value") if getattr(self, k) is not None))
         one_of(self, "action_std", ("parameter", "state"))
         if self.learning_rate_schedule == "kl":

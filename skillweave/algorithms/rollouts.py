@@ -17,6 +17,7 @@ from skillweave.ops.device import on_host
 
 _CELLS = (
     "obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts",
+    "advantage",
 )  # fmt: skip
 """Fields of a rollout that have a value for each cell."""
 
@@ -116,6 +117,7 @@ class Samples:
     advantage: Tensor
     target: Tensor  # of the value, in units of normalised returns
     old_value: Tensor | None = None  # in the same units, where values are clipped
+    anchor: Tensor | None = None  # (P, N, H), heads of the policy that it is to stay near
     mask: Tensor | None = None  # bool, allowed actions; None: all
     valid: Tensor | None = None  # bool, samples that count; None: all
     starts: Tensor | None = None  # bool, memory is empty before this row

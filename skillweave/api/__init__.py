@@ -13,6 +13,7 @@ from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.run import Run, as_path
+from skillweave.collecting.calls import calls_from_json
 from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
@@ -153,13 +154,15 @@ class Hierarchy(Declaration):
             type(s["name"], (Skill,), {k: s[k] for k in told if k in s})()
             for s in manifest["skills"]
         ]
-        return cls(_spec_of(manifest), skills, call_steps=manifest["call_steps"])
+        calls = calls_from_json(manifest)
+        return cls(_spec_of(manifest), skills, call_steps=calls)
 
     def _adopt_run_config(self, run: RunDirectory) -> None:
         """Take over from a run how its skills are called, after a check that it fits."""
         _check_run(self, run)
         if run.manifest["kind"] == "hierarchy":
-            self.call_steps = run.manifest["call_steps"]
+            self.call_steps = calls_from_json(run.manifest)
+            self.learn = run.manifest.get("learn", "apart")
             self.reflexes_in_training = run.manifest.get("reflexes_in_training", True)
             self.greedy_skills = run.manifest["greedy_skills"]
 
@@ -222,9 +225,11 @@ def _train(
     assign_workers(content["stages"], declared.spec)
     for stage in content["stages"]:
         acts: Any = action_space
-        if stage["kind"] == "selector":
-            acts = gym.spaces.Discrete(len(content["skills"]))
+        if stage["decides"] is not None and isinstance(declared, Hierarchy):
+            acts = gym.spaces.Discrete(declared.choices)
         check_replay(stage, observation_space, acts)
+        for config in stage.get("algorithms", {}).values():
+            check_replay(stage | {"algorithm": config}, observation_space, action_space)
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.experience import Experience, Rollout
+from skillweave.experience import Anchor, Experience, Rollout
 from skillweave.spaces import to_tensor
 from skillweave.types import Array, unprefixed
 
@@ -42,6 +44,7 @@ class RolloutStore:
             "obs": e.obs, "action": e.action, "reward": e.reward, "steps": e.steps,
             "terminated": e.terminated, "next_obs": e.next_obs, "last": last,
             "obs_mask": e.obs_mask, "head": e.head, "starts": e.starts,
+            "advantage": e.advantage,
         }  # fmt: skip
         rows = {k: x for k, x in found.items() if x is not None}
         if valid.all():
@@ -58,13 +61,17 @@ class RolloutStore:
         self._held.append(held)
 
     def rollout(
-        self, gamma: Tensor, log_std: Tensor | None = None, progress: float = 0.0
+        self,
+        gamma: Tensor,
+        log_std: Tensor | None = None,
+        progress: float = 0.0,
+        anchor: Anchor | None = None,
     ) -> Rollout | None:
         """All that was collected since the last one; None: it is not enough yet.
 
         Args:
             gamma: (P,), each member's discount of one step.
-            log_std, progress: of the ``Rollout``.
+            log_std, progress, anchor: of the ``Rollout``.
         """
         if not self._held or (self._quota and self._valid_rows() < self._quota):
             return None
@@ -76,9 +83,10 @@ class RolloutStore:
             del named["valid"]
         if log_std is not None:
             named["log_std"] = log_std
-        named = {name: x.to(self._device) for name, x in named.items()}
-        memory = named.pop("memory", None)
-        return Rollout(**named, memory=None if memory is None else memory[:, 0], progress=progress)
+        parts: dict[str, Any] = {name: x.to(self._device) for name, x in named.items()}
+        memory = parts.pop("memory", None)
+        parts["memory"] = None if memory is None else memory[:, 0]
+        return Rollout(**parts, anchor=anchor, progress=progress)
 
     def state(self) -> dict[str, Tensor]:
         """Copies of what is held, to go on exactly; see ``load``."""

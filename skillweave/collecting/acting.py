@@ -29,10 +29,12 @@ class Request:
     seeds: Seeds
     at_random: bool = False  # act at random instead
     greedy: bool = False  # do not explore
+    parts: tuple[Request, ...] = ()  # the same of skills that learn below a selector
 
     def of_collector(self, number: int) -> Request:
         """The same for one of several collectors."""
-        return replace(self, seeds=self.seeds / number)
+        parts = tuple(part.of_collector(number) for part in self.parts)
+        return replace(self, seeds=self.seeds / number, parts=parts)
 
 
 @dataclass
@@ -91,9 +93,13 @@ class Acting:
                 None if head is None else head[rows],
                 None if after is None else after[rows],
             )
-        allowed = None if mask is None else mask[rows]
         own = None if memory is None else memory[rows]
-        return self._act(lambda stack: self._draw(stack, len(rows)), obs[rows], allowed, own)
+        return self.these(obs[rows], None if mask is None else mask[rows], own)
+
+    @torch.inference_mode()
+    def these(self, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        """Act in some environments, where there is one member; all arguments are of these n."""
+        return self._act(lambda stack: self._draw(stack, len(obs)), obs, mask, memory)
 
     def _draw(self, stack: int, each: int) -> Any:
         return self.stacks[stack][0].noise(self._generators[stack], 1, each)[0]

@@ -6,12 +6,16 @@ Collectors (training) and ``HierarchyPolicy`` (everything else) both run skills 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
+from typing import Any, cast
 
 import numpy as np
 
 from skillweave.envs.infos import allowed_rows, info_rows
+from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
@@ -31,23 +35,109 @@ class Why(IntEnum):
     """The episode ended, or has just begun: there is no call."""
 
 
+class Lengths:
+    """How long a call may last, where the selector chooses it together with the skill.
+
+    ``Lengths(1, 4, 16)`` are three lengths; ``Lengths(1, ..., 128)`` doubles from 1 to 128.
+
+    Args:
+        steps: environment steps, rising; ``...`` between two of them stands for those between, each
+            twice the one before.
+
+    Raises:
+        SkillweaveError: they do not rise, or one is less than 1.
+    """
+
+    def __init__(self, *steps: Any) -> None:
+        self.steps = tuple(self._all(steps))
+        rising = all(a < b for a, b in pairwise(self.steps))
+        if not self.steps or self.steps[0] < 1 or not rising:
+            raise SkillweaveError(
+                f"{self._written(steps)}: lengths are environment steps, at least 1, and each is "
+                "more than the one before"
+            )
+
+    def __repr__(self) -> str:
+        return self._written(self.steps)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Lengths) and other.steps == self.steps
+
+    def __hash__(self) -> int:
+        return hash(self.steps)
+
+    def _all(self, steps: tuple[Any, ...]) -> Iterator[int]:
+        """All lengths, with those that ``...`` stands for."""
+        for i, value in enumerate(steps):
+            whole = type(value) is int
+            between = value is ... and 0 < i < len(steps) - 1
+            if not (whole or (between and type(steps[i - 1]) is int)):
+                raise SkillweaveError(
+                    f"{self._written(steps)}: it holds {short(value)}, which is no whole number; "
+                    "write Lengths(1, 4, 16) or Lengths(1, ..., 128)"
+                )
+            if whole:
+                yield value
+                continue
+            last, following = steps[i - 1], steps[i + 1]
+            while type(following) is int and 0 < 2 * last < following:
+                last *= 2
+                yield last
+
+    @staticmethod
+    def _written(steps: tuple[Any, ...]) -> str:
+        return f"Lengths({', '.join('...' if s is ... else short(s) for s in steps)})"
+
+
+def calls_to_json(value: int | Lengths | None) -> dict[str, Any]:
+    """How long calls last, as entries of a JSON object."""
+    if isinstance(value, Lengths):
+        return {"call_steps": None, "call_lengths": list(value.steps)}
+    return {"call_steps": value}
+
+
+def calls_from_json(told: Mapping[str, Any]) -> int | Lengths | None:
+    """The inverse of ``calls_to_json``."""
+    lengths, steps = told.get("call_lengths"), told["call_steps"]
+    return steps if lengths is None else Lengths(*lengths)
+
+
 @dataclass(frozen=True)
 class SkillSet:
     """Skills with their policies, and how a call runs.
 
+    What is chosen is a number of ``choices``: a skill, or a skill and a length.
+
     Memory rows: ``skill`` (the running one, −1 where no call has begun in the episode),
-    ``elapsed`` (steps of its call), and under ``<index>.<key>`` what each skill's own policy
-    remembers. Where a skill is called again at once, in the same episode, its policy goes on with
-    what it remembers; after another skill's call, or in a new episode, it starts afresh.
+    ``elapsed`` (steps of its call), ``limit`` (the length that was chosen, where one is), and under
+    ``<index>.<key>`` what each skill's own policy remembers. Where a skill is called again at once,
+    in the same episode, its policy goes on with what it remembers; after another skill's call, or
+    in a new episode, it starts afresh.
     """
 
     skills: tuple[Skill, ...]
     policies: tuple[Policy, ...]
     reflexes: tuple[Reflex, ...] = ()
-    call_steps: int | None = None
+    call_steps: int | Lengths | None = None
     """A call lasts at most so long; None: until the skill stops by itself."""
     greedy: bool = True
     """Skills act greedily; else they sample."""
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """The lengths that are chosen from; none where no length is chosen."""
+        return self.call_steps.steps if isinstance(self.call_steps, Lengths) else ()
+
+    @property
+    def choices(self) -> int:
+        """Of how many a choice is one: the first skill with each length, then the next skill."""
+        return len(self.skills) * max(1, len(self.lengths))
+
+    @property
+    def usual_steps(self) -> int | None:
+        """Environment steps of a call, about; None: nothing says how long it lasts."""
+        lengths = self.lengths
+        return round(sum(lengths) / len(lengths)) if lengths else cast(Any, self.call_steps)
 
     @property
     def watches(self) -> bool:
@@ -56,7 +146,7 @@ class SkillSet:
         return stops or any(p.start(1) for p in self.policies)
 
     def mask(self, obs: Array) -> Array | None:
-        """Where each skill may start, (n, S) bool; None: everywhere.
+        """Which choices are allowed, (n, choices) bool; None: all, everywhere.
 
         Raises:
             SkillweaveError: in some observation no skill may start.
@@ -74,20 +164,20 @@ class SkillSet:
         return mask
 
     def startable(self, obs: Array) -> Array:
-        """Where each skill may start, (n, S) bool; perhaps none in some observation."""
-        return np.stack(
-            [
-                asked(s, "initiation", obs, len(obs))
-                if s.defines("initiation")
-                else np.ones(len(obs), bool)
-                for s in self.skills
-            ],
-            axis=1,
-        )
+        """Choices whose skill may start, (n, choices) bool; perhaps none in some observation."""
+        may = [
+            asked(s, "initiation", obs, len(obs))
+            if s.defines("initiation")
+            else np.ones(len(obs), bool)
+            for s in self.skills
+        ]
+        return np.stack(may, axis=1).repeat(max(1, len(self.lengths)), axis=1)
 
     def start(self, n: int) -> Memory:
         """Memory of n environments in which no call has begun."""
         memory: Memory = {"skill": np.full(n, -1), "elapsed": np.zeros(n, np.int64)}
+        if self.lengths:
+            memory["limit"] = np.zeros(n, np.int64)
         for i, (skill, policy) in enumerate(zip(self.skills, self.policies, strict=True)):
             for k, v in policy.start(n).items():
                 if v.dtype.kind not in "biuf":  # a checkpoint could not hold it
@@ -98,8 +188,15 @@ class SkillSet:
                 memory[f"{i}.{k}"] = v
         return memory
 
-    def begin(self, memory: Memory, rows: Array, skill: Array) -> None:
-        """Start a call of ``skill`` (k,) in environments ``rows`` (k,), in place."""
+    def skill_of(self, choice: Array) -> Array:
+        """The skills that choices (k,) are of."""
+        return choice // len(self.lengths) if self.lengths else choice
+
+    def begin(self, memory: Memory, rows: Array, choice: Array) -> None:
+        """Start the calls that ``choice`` (k,) says in environments ``rows`` (k,), in place."""
+        skill = self.skill_of(choice)
+        if self.lengths:
+            memory["limit"][rows] = np.array(self.lengths)[choice % len(self.lengths)]
         changed = memory["skill"][rows] != skill
         memory["skill"][rows] = skill
         memory["elapsed"][rows] = 0
@@ -151,7 +248,7 @@ class SkillSet:
         """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""
         skill = self.skills[i]
         most = self.call_steps if skill.call_steps is None else skill.call_steps
-        limits = [x for x in (most, skill.max_steps) if x is not None]
+        limits = [x for x in (most, skill.max_steps) if isinstance(x, int)]
         return min(limits) if limits else None
 
     def observe(self, memory: Memory, rows: Array, step: Step | None) -> Array:
@@ -165,6 +262,8 @@ class SkillSet:
         memory["elapsed"][rows] += 1
         elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
         why = np.full(len(rows), Why.RUNNING, np.int8)
+        if self.lengths:
+            why[elapsed >= memory["limit"][rows]] = Why.LIMIT
         for i in range(len(self.skills)):
             if (limit := self.limit(i)) is not None:
                 why[(running == i) & (elapsed >= limit)] = Why.LIMIT
@@ -174,7 +273,7 @@ class SkillSet:
             mine = np.flatnonzero(running == i)
             if not len(mine):
                 continue
-            part = _rows(step, mine, elapsed[mine], skill.max_steps)
+            part = rows_of(step, mine, elapsed[mine], skill.max_steps)
             own = self._own(memory, i, rows[mine])
             self._put(memory, i, rows[mine], policy.observe(own, part))
             if skill.defines("termination"):
@@ -191,7 +290,7 @@ class SkillSet:
             memory[f"{i}.{k}"][rows] = v
 
 
-def _rows(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
+def rows_of(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
     """Some rows of a step, with the time as the running skill counts it."""
     timed_out = np.zeros(len(rows), bool)
     if max_steps is not None:

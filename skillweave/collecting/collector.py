@@ -224,14 +224,23 @@ def side_by_side(parts: Sequence[Collected], members: int) -> Collected:
     """What several collectors found as one: each member's environments stand side by side."""
     if len(parts) == 1:
         return parts[0]
-    experiences = [p.experience for p in parts]
+    joined = _joined([p.experience for p in parts], members)
+    return Collected(joined, np.concatenate([p.episodes for p in parts]))
+
+
+def _joined(experiences: Sequence[Experience], members: int) -> Experience:
     height = max(e.reward.shape[0] for e in experiences)
     if any(e.reward.shape[0] < height for e in experiences):
         experiences = [_higher(e, height) for e in experiences]
-    names = [k for k in Experience.__dataclass_fields__ if k != "spent"]
+    names = [k for k in Experience.__dataclass_fields__ if k not in _WHOLE]
     found = {k: _beside([getattr(e, k) for e in experiences], members, k) for k in names}
+    below = zip(*(e.parts for e in experiences), strict=True)
     spent = sum(e.spent for e in experiences)
-    return Collected(Experience(**found, spent=spent), np.concatenate([p.episodes for p in parts]))
+    return Experience(**found, parts=tuple(_joined(b, members) for b in below), spent=spent)
+
+
+_WHOLE = ("parts", "spent")
+"""Fields of an experience that are no arrays."""
 
 
 def _higher(experience: Experience, height: int) -> Experience:
@@ -242,7 +251,7 @@ def _higher(experience: Experience, height: int) -> Experience:
 
     def padded(name: str) -> Any:
         value = getattr(full, name)
-        if value is None or name in ("memory", "spent"):
+        if value is None or name in ("memory", *_WHOLE):
             return value
         return np.concatenate([value, np.zeros((height - rows, *value.shape[1:]), value.dtype)])
 
@@ -258,6 +267,8 @@ def _beside(values: list[Any], members: int, name: str) -> Any:
         return None
     if name in _FREE:
         values = [np.ones_like(known) if v is None else v for v in values]
+    if name == "head":  # a skill that no one called there
+        values = [np.zeros_like(known) if v is None else v for v in values]
     if name == "rewards":
         values = as_wide(values)
     axis = 0 if name == "memory" else 1

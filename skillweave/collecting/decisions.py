@@ -37,7 +37,7 @@ class DecisionCollector(Collector):
         self, engine: Engine, acting: Acting | None, skills: SkillSet, keep_rewards: bool = False
     ) -> None:
         super().__init__(engine, acting)
-        n, count = self.num_envs, len(skills.skills)
+        n, count = self.num_envs, skills.choices
         self.skills, self.keep_rewards = skills, keep_rewards
         self._watches = skills.watches
         self._calls: Memory = skills.start(n)  # what the skills remember of each environment
@@ -83,21 +83,17 @@ class DecisionCollector(Collector):
         rows = np.flatnonzero(self.kept["over"])
         if len(rows):
             self._decide(rows)
-        obs = self.obs
-        action = self.skills.act(self._calls, self._all, obs, self._rng, self.engine.mask())
+        obs, mask = self.obs, self.engine.mask()
+        action = self.skills.act(self._calls, self._all, obs, self._rng, mask)
         raw = self.engine.step(action)
         self._count(raw)
-        seen = None
-        if self._watches:
-            seen = Step(
-                obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-                self._never, self._calls["elapsed"], raw.info,
-            )  # fmt: skip
         ended = raw.terminated | raw.truncated
-        why = self.skills.observe(self._calls, self._all, seen)
-        over = (why != Why.RUNNING) | ended
+        why = self._observe(obs, action, raw)
+        why[ended] = Why.EPISODE
+        if out is not None:
+            self._record(obs, mask, raw, why)
         self.obs = raw.next_obs
-        ids = np.flatnonzero(over)
+        ids = np.flatnonzero(why != Why.RUNNING)
         if len(ids):
             self.kept["over"][ids] = True
             if out is not None:
@@ -108,6 +104,19 @@ class DecisionCollector(Collector):
                 success = told_success(raw.info, self.num_envs)
                 self._tell(ids, None if success is None else success[ids])
                 self._begin_anew(ids)
+
+    def _observe(self, obs: Array, action: Array, raw: RawStep) -> Array:
+        """Show a step to the running skills; (N,) int8, why their calls are over."""
+        seen = None
+        if self._watches:
+            seen = Step(
+                obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+                self._never, self._calls["elapsed"], raw.info,
+            )  # fmt: skip
+        return self.skills.observe(self._calls, self._all, seen)
+
+    def _record(self, obs: Array, mask: Array | None, raw: RawStep, why: Array) -> None:
+        """Keep the step for skills that learn; here they do not."""
 
     def _decide(self, rows: Array) -> None:
         """The selector chooses a skill in environments ``rows`` (k,), and its call begins."""
@@ -159,7 +168,7 @@ class DecisionCollector(Collector):
         steps = self.kept["tau"]
         if steps.max() >= LONGEST_EPISODE:
             row = int(steps.argmax())
-            name = self.skills.skills[int(self.kept["choice"][row])].name
+            name = self.skills.skills[int(self._calls["skill"][row])].name
             raise SkillweaveError(
                 f"skill {name!r} has run for {int(steps[row]):,} steps in environment {row}, and "
                 "neither its termination() nor the episode's end has come: give it max_steps, or "

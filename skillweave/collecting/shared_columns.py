@@ -10,7 +10,7 @@ import numpy as np
 
 from skillweave.collecting.collector import Collected
 from skillweave.experience import Experience
-from skillweave.types import Array
+from skillweave.types import Array, prefixed, unprefixed
 
 
 @dataclass
@@ -38,7 +38,28 @@ class SharedColumns:
             k: np.ndarray(shape, dtype, memory.buf, at)
             for k, (at, dtype, shape) in self.places.items()
         }
-        return memory, Collected(Experience(**found, spent=self.spent), self.episodes)
+        return memory, Collected(_experience(found, self.spent), self.episodes)
+
+
+def _experience(found: dict[str, Array], spent: int = 0) -> Experience:
+    """The inverse of ``_arrays``."""
+    parts: list[Experience] = []
+    while below := unprefixed(str(len(parts)), found):
+        parts.append(_experience(below))
+    own: dict[str, Any] = {k: v for k, v in found.items() if "." not in k}
+    return Experience(**own, parts=tuple(parts), spent=spent)
+
+
+def _arrays(experience: Experience) -> dict[str, Array]:
+    """All arrays of an experience and of its parts, by name."""
+    found = {
+        f.name: value
+        for f in fields(experience)
+        if isinstance(value := getattr(experience, f.name), np.ndarray)
+    }
+    for i, part in enumerate(experience.parts):
+        found |= prefixed(str(i), _arrays(part))
+    return found
 
 
 class ColumnWriter:
@@ -50,23 +71,20 @@ class ColumnWriter:
     def write(self, collected: Collected) -> SharedColumns:
         """Copy all arrays; what the parent needs to read them."""
         experience = collected.experience
-        arrays = {
-            f.name: value
-            for f in fields(experience)
-            if isinstance(value := getattr(experience, f.name), np.ndarray)
-        }
-        size = sum(_room(a) for a in arrays.values())
+        arrays = _arrays(experience)
+        size = sum({id(a): _room(a) for a in arrays.values()}.values())
         name = ""
         if self.memory is None or self.memory.size < size:
             if self.memory is not None:
                 self.memory.close()
             self.memory = SharedMemory(create=True, size=size + size // 4)
             name = self.memory.name
-        places, at = {}, 0
+        places, at, where = {}, 0, dict[int, int]()
         for k, a in arrays.items():
-            np.ndarray(a.shape, a.dtype, self.memory.buf, at)[...] = a
-            places[k] = (at, a.dtype, a.shape)
-            at += _room(a)
+            if id(a) not in where:  # parts share columns
+                np.ndarray(a.shape, a.dtype, self.memory.buf, at)[...] = a
+                where[id(a)], at = at, at + _room(a)
+            places[k] = (where[id(a)], a.dtype, a.shape)
         return SharedColumns(name, places, experience.spent, collected.episodes)
 
 

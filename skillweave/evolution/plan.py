@@ -11,6 +11,7 @@ from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short
 from skillweave.training.trainer import MakeLearner, OneAgent, StageLearner, StageRun
+from skillweave.training.woven import WovenAgents
 from skillweave.types import SkillweaveError
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
@@ -25,6 +26,11 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
     """
     for name, how in _by_stage([p["name"] for p in stages], evolve).items():
         entry = next(p for p in stages if p["name"] == name)
+        if entry["kind"] == "together":
+            raise SkillweaveError(
+                f"stage {name!r}: a hierarchy that learns as a whole cannot evolve; name the "
+                "stages that are to: evolve={'selector': Evolution(...)}"
+            )
         check_mutations(config_from_json(entry["algorithm"]), how, f"stage {name!r}: ")
         entry["evolution"] = evolution_to_json(how)
         if how.target is not None:
@@ -44,7 +50,7 @@ def make_learner(stages: list[dict[str, Any]], evolve: Evolve) -> MakeLearner:
 
     def make(stage: StageRun) -> StageLearner:
         if stage.entry.get("evolution") is None:
-            return OneAgent(stage)
+            return WovenAgents(stage) if stage.entry["kind"] == "together" else OneAgent(stage)
         how = asked.get(stage.name)
         return EvolvingPopulation(stage, None if how is None else how.selection)
 

@@ -86,15 +86,15 @@ class EvolvingPopulation:
             self._resume_episodes(extra)
         self._started: float = time.perf_counter() - log.at["seconds"]
 
-    def train(self, log: StageLog) -> AgentPolicy:
-        """Train generation after generation; the best policy.
+    def train(self, log: StageLog) -> dict[str, AgentPolicy]:
+        """Train generation after generation; the best policy, by the stage's name.
 
         Raises:
             SkillweaveError: every member diverged.
         """
         while not self.over:
             self.generation()
-        return self._finish()
+        return {self.stage.name: self._finish()}
 
     def close(self) -> None:
         """Release the environments."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.calls import Lengths, SkillSet
 from skillweave.envs.make import EnvSpec
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
@@ -23,10 +23,13 @@ from skillweave.training.plain_agent import (
     check_fields,
     check_rollout,
 )
-from skillweave.training.stage import Target, target_of
+from skillweave.training.stage import SELECTOR, Target, Together, target_of
 from skillweave.types import Policy, SkillweaveError
 
-RESERVED = ("selector", AGENT, "flat")
+TOGETHER = "together"
+"""What the stage is named in which all learn together."""
+WAYS = ("apart", "together", "apart, then together")
+RESERVED = (SELECTOR, TOGETHER, AGENT, "flat")
 """Names of stages that are not skills; "flat" in runs of older versions."""
 
 
@@ -42,8 +45,10 @@ class Declaration:
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     skills: Sequence[Skill]
     """What the selector chooses from."""
-    call_steps: int | None = 40
+    call_steps: int | Lengths | None = 40
     """How long a skill acts before the selector decides again; None: until it stops by itself."""
+    learn: Literal["apart", "together", "apart, then together"] = "apart"
+    """Skills one by one, then the selector; or all from the same steps; or first so, then so."""
     reflexes: Sequence[Reflex] = ()
     """Rules that override the running skill's action."""
     algorithm: AlgorithmConfig = field(default_factory=PPO)
@@ -54,6 +59,10 @@ class Declaration:
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000
     """Training budget of the selector, in environment steps."""
+    together_steps: int = 1_000_000
+    """Training budget of learning together, in environment steps."""
+    together: Together = field(default_factory=Together)
+    """How skills and selector learn together."""
     selector_target_return: float | None = None
     """The selector's stage ends early at this mean return of the periodic evaluation."""
     flat: AlgorithmConfig | None = None
@@ -88,7 +97,26 @@ class Declaration:
         for name in ("algorithm", "selector", "flat"):
             check_algorithm(getattr(self, name), name, optional=name == "flat")
         target_of(self.selector_target_return, None, "selector")
+        if self.learn not in WAYS:
+            raise SkillweaveError(
+                f"learn is {short(self.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
+            )
+        if not isinstance(self.together, Together):
+            raise SkillweaveError(
+                f"together is {short(self.together)}; write together=Together(floor=0.3)"
+            )
         check_fields(self)
+        self._check_call_steps()
+
+    def _check_call_steps(self) -> None:
+        if isinstance(self.call_steps, Lengths):
+            return
+        value: object = self.call_steps
+        if value is not None and (type(value) is not int or value < 1):
+            raise SkillweaveError(
+                f"call_steps is {short(value)}; it must be at least 1, Lengths(1, ..., 128), or "
+                "None"
+            )
         if self.call_steps is None:
             for skill in self.skills:
                 ends = skill.max_steps or skill.call_steps or skill.defines("termination")
@@ -153,9 +181,26 @@ class Declaration:
         return 0 if skill.policy is not None else skill.steps or self.skill_steps
 
     @property
+    def choices(self) -> int:
+        """Of how many a selector's choice is one: skills, times lengths if these are chosen."""
+        lengths = self.call_steps.steps if isinstance(self.call_steps, Lengths) else (0,)
+        return len(self.skills) * len(lengths)
+
+    @property
     def total_steps(self) -> int:
         """All training steps of skills and selector: the flat baseline's budget."""
-        return sum(self.budget(s) for s in self.skills) + self.selector_steps
+        apart = sum(self.budget(s) for s in self.skills) + self.selector_steps
+        return (apart if self.learns_apart else 0) + (self.together_steps if self.weaves else 0)
+
+    @property
+    def learns_apart(self) -> bool:
+        """Whether there are stages in which one learns by itself."""
+        return self.learn != "together"
+
+    @property
+    def weaves(self) -> bool:
+        """Whether there is a stage in which all learn together."""
+        return self.learn != "apart"
 
     def scale(self, factor: float) -> None:
         """Multiply every training budget, in place."""
@@ -166,6 +211,7 @@ class Declaration:
                 skill.steps = max(1, round(skill.steps * factor))
         self.skill_steps = max(1, round(self.skill_steps * factor))
         self.selector_steps = max(1, round(self.selector_steps * factor))
+        self.together_steps = max(1, round(self.together_steps * factor))
         if self.flat_steps is not None:
             self.flat_steps = max(1, round(self.flat_steps * factor))
 
@@ -219,7 +265,7 @@ class Declaration:
             if skill.policy is None:
                 config = skill.algorithm or self.algorithm
                 check_spaces(config, space, f"skill {skill.name!r}: ")
-        check_spaces(self.selector, gym.spaces.Discrete(len(self.skills)), "selector: ")
+        check_spaces(self.selector, gym.spaces.Discrete(self.choices), "selector: ")
         if self.flat is not None:
             check_spaces(self.flat, space, "flat: ")
 

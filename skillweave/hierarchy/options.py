@@ -46,7 +46,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.engine, self.skills = engine, skills
         self.num_envs = engine.num_envs
         self.single_observation_space = engine.observation_space
-        self.single_action_space = gym.spaces.Discrete(len(skills.skills))
+        self.single_action_space = gym.spaces.Discrete(skills.choices)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = float(gamma)
@@ -167,7 +167,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             SkillweaveError: there have been so many that nothing seems to end them.
         """
         if turns >= LONGEST_EPISODE:
-            name = self.skills.skills[int(skill[rows[0]])].name
+            name = self._named(skill[rows[0]])
             raise SkillweaveError(
                 f"skill {name!r} has run for {turns:,} steps in environment {int(rows[0])}, and "
                 "neither its termination() nor the episode's end has come: give it max_steps, or "
@@ -175,14 +175,17 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             )
         return turns + 1
 
+    def _named(self, choice: Array) -> str:
+        return self.skills.skills[int(self.skills.skill_of(choice))].name
+
     def _check(self, skill: Array) -> None:
-        count = len(self.skills.skills)
+        count = self.skills.choices
         wrong = skill[(skill < 0) | (skill >= count)]
         if len(wrong):
             raise SkillweaveError(f"action {int(wrong[0])} is no skill: there are {count}")
         if self._mask is not None and not self._mask[np.arange(self.num_envs), skill].all():
             row = int(np.flatnonzero(~self._mask[np.arange(self.num_envs), skill])[0])
-            name = self.skills.skills[int(skill[row])].name
+            name = self._named(skill[row])
             raise SkillweaveError(
                 f"skill {name!r} may not start in environment {row}: its initiation() is False "
                 "there; choose among info['action_mask']"

@@ -39,7 +39,7 @@ class HierarchyPolicy:
         limits = [[x for x in (s.call_steps,) if x is not None] for s in told.skills]
         skills = [[s.name, s.max_steps, *own] for s, own in zip(told.skills, limits, strict=True)]
         reflexes = [r.name for r in told.reflexes]
-        whole = json.dumps([acts, skills, reflexes, told.call_steps, told.greedy])
+        whole = json.dumps([acts, skills, reflexes, told.lengths or told.call_steps, told.greedy])
         return {"sha256": checksum(whole.encode())}
 
     def start(self, n: int) -> Memory:

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from skillweave.hierarchy.declaration import Declaration, check_target
+from skillweave.algorithms.config import PPO
+from skillweave.collecting.calls import calls_to_json
+from skillweave.hierarchy.declaration import TOGETHER, Declaration, check_target
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import source_of
+from skillweave.training.evaluation import evaluate
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
-from skillweave.training.scene import Scene, selector_scene, skill_scene
-from skillweave.training.stage import Policies, Stage, target_of
+from skillweave.training.scene import (
+    Scene,
+    WovenScene,
+    selector_scene,
+    skill_scene,
+    woven_scene,
+)
+from skillweave.training.stage import SELECTOR, Policies, Stage, target_of
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, OneAgent, train_stages
 from skillweave.types import Policy
-
-SELECTOR = "selector"
-"""What the selector's stage is named."""
 
 
 def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
@@ -35,7 +43,8 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "eval_every": declaration.eval_every,
         "eval_episodes": declaration.eval_episodes,
         "skills": [_skill_entry(s) for s in declaration.skills],
-        "call_steps": declaration.call_steps,
+        **calls_to_json(declaration.call_steps),
+        "learn": declaration.learn,
         "greedy_skills": declaration.greedy_skills,
         "reflexes_in_training": declaration.reflexes_in_training,
         "resume_needs_recipe": not declaration.trains_from_data,
@@ -46,6 +55,30 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
 
 
 def stages_of(declaration: Declaration) -> list[Stage]:
+    """Who learns when: skills apart, then the selector; then all together."""
+    apart = _apart(declaration) if declaration.learns_apart else []
+    return [*apart, *([_together(declaration)] if declaration.weaves else [])]
+
+
+def _together(declaration: Declaration) -> Stage:
+    """The stage in which skills and selector learn from the same steps."""
+    how, learns = declaration.together, [s for s in declaration.skills if s.policy is None]
+
+    def scene(policies: Policies) -> WovenScene:
+        acts: Any = [None if s in learns else policies[s.name] for s in declaration.skills]
+        numbers = tuple(i for i, s in enumerate(declaration.skills) if s in learns)
+        return woven_scene(declaration.spec, declaration.skill_set(acts), numbers)
+
+    config: Any = declaration.selector
+    if isinstance(config, PPO) and not config.floor:
+        config = replace(config, floor=how.floor, floor_final=how.floor_final)
+    target = target_of(declaration.selector_target_return, None, TOGETHER)
+    skills = {s.name: s.algorithm or declaration.algorithm for s in learns}
+    budget = declaration.together_steps
+    return Stage(TOGETHER, "together", config, budget, scene, target, skills, how)
+
+
+def _apart(declaration: Declaration) -> list[Stage]:
     """The skills that are to be trained, each apart, then the selector."""
     reflexes = declaration.reflexes if declaration.reflexes_in_training else ()
 
@@ -72,6 +105,10 @@ def stages_of(declaration: Declaration) -> list[Stage]:
     ]
 
 
+JUDGED = 1_000
+"""Seeds of evaluations from here on tell which hierarchy is better: people take smaller ones."""
+
+
 @torch_threads(1)  # a loop sets its own; all else must not depend on how many there are
 def train(
     declaration: Declaration | PlainAgent,
@@ -88,9 +125,35 @@ def train(
     ready = _ready(declaration, run)
     for name, policy in ready.items():
         run.keep_policy(name, policy)
-    found = train_stages(stages_of(declaration), run, listeners, ready, make_learner)
-    skills = declaration.skill_set([found[s.name] for s in declaration.skills])
-    return HierarchyPolicy(found[SELECTOR], skills)
+    stages = stages_of(declaration)
+    apart = [s for s in stages if s.kind != "together"]
+    before = train_stages(apart, run, listeners, ready, make_learner)
+    if len(apart) == len(stages):
+        return _woven(declaration, before)
+    after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
+    if not apart:
+        return _woven(declaration, after)
+    return _better(declaration, run, before, after)
+
+
+def _better(
+    declaration: Declaration, run: RunDirectory, before: Policies, after: Policies
+) -> HierarchyPolicy:
+    """The better of two hierarchies, by episodes of the environment; written into the run."""
+    entry = run.stage(TOGETHER)
+    policies = {"before": _woven(declaration, before), "after": _woven(declaration, after)}
+    if "kept" not in entry:
+        seed = JUDGED + int(run.manifest["seed"])
+        means = {
+            name: evaluate(policy, declaration.spec, episodes=100, seed=seed)
+            for name, policy in policies.items()
+        }
+        entry["kept"] = {name: found.mean for name, found in means.items()}
+        better = means["after"].mean >= means["before"].mean
+        entry["kept"]["kept"] = "after" if better else "before"
+        entry["evaluation_steps"] += sum(sum(found.lengths) for found in means.values())
+        run.save()
+    return policies[entry["kept"]["kept"]]
 
 
 def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
@@ -99,11 +162,25 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
         return load_agent_of(run)
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
-    names = [s.name for s in declaration.skills]
-    policies = [ready[n] if n in ready else run.load_policy(n) for n in names]
-    selector = run.load_policy(SELECTOR)
-    check_parts(declaration, policies, selector, str(run.path))
-    return HierarchyPolicy(selector, declaration.skill_set(policies))
+    found = ready | _learnt(run)
+    policies = [found[s.name] for s in declaration.skills]
+    check_parts(declaration, policies, found[SELECTOR], str(run.path))
+    return _woven(declaration, found)
+
+
+def _learnt(run: RunDirectory) -> dict[str, Policy]:
+    """By name, everyone who learnt in a finished run, as they were in the end."""
+    found: dict[str, Policy] = {}
+    for entry in run.manifest["stages"]:
+        if entry.get("kept", {}).get("kept") != "before":
+            found |= run.load_policies(entry["name"])
+    return found
+
+
+def _woven(declaration: Declaration, found: Mapping[str, Policy]) -> HierarchyPolicy:
+    """The hierarchy of these policies."""
+    skills = declaration.skill_set([found[s.name] for s in declaration.skills])
+    return HierarchyPolicy(found[SELECTOR], skills)
 
 
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:

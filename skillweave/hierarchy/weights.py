@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
+from skillweave.collecting.calls import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -54,7 +55,7 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
         "recipe": getattr(declaration, "recipe", None),
         **place,
         "skills": [s.name for s in declaration.skills],
-        "call_steps": declaration.call_steps,
+        **calls_to_json(declaration.call_steps),
         "greedy_skills": declaration.greedy_skills,
         "parts": parts,
         "ready": ready,
@@ -71,6 +72,7 @@ class HierarchyHeader(TypedDict):
     recipe: NotRequired[str | None]
     skills: list[str]
     call_steps: Positive | None
+    call_lengths: NotRequired[list[Positive]]
     greedy_skills: bool
     parts: dict[str, dict[str, Any]]
     ready: NotRequired[dict[str, Source]]
@@ -152,8 +154,8 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
         else:
             policies.append(part(name))
     selector = part("selector")
+    declaration.call_steps = calls_from_json(header)
     check_parts(declaration, policies, selector, str(path))
-    declaration.call_steps = header["call_steps"]
     declaration.greedy_skills = header["greedy_skills"]
     return HierarchyPolicy(selector, declaration.skill_set(policies))
 
@@ -168,7 +170,7 @@ def check_parts(
     first = policies[0]
     wanted = {"observation_space": first.observation_space, "action_space": first.action_space}
     places = {s.name: (p, wanted) for s, p in zip(declaration.skills, policies, strict=True)}
-    choices = gym.spaces.Discrete(len(policies))
+    choices = gym.spaces.Discrete(declaration.choices)
     places["selector"] = selector, wanted | {"action_space": choices}
     for name, (policy, spaces) in places.items():
         for kind, space in spaces.items():

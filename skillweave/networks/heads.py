@@ -11,11 +11,13 @@ from torch import Tensor
 
 from skillweave.ops.device import Constant
 from skillweave.ops.distributions import (
+    categorical_kl,
     categorical_sample,
     categorical_stats,
     clamp_inward,
     gumbel,
     mask_logits,
+    normal_kl,
     normal_stats,
     tanh_log_det,
 )
@@ -95,6 +97,22 @@ class ActionHead:
             z = ((action - mean) * (-log_std).exp()).detach()
             entropy = entropy + tanh_log_det(mean + log_std.exp() * z).sum(-1)
         return log_prob, entropy
+
+    def kl(
+        self,
+        head: Tensor,
+        log_std: Tensor | None,
+        other: Tensor,
+        other_log_std: Tensor | None,
+        mask: Tensor | None,
+    ) -> Tensor:
+        """KL(p ‖ q), p by the first head and q by the other, before any squashing; (...)."""
+        if not self.discrete:
+            return normal_kl(*self.moments(head, log_std), *self.moments(other, other_log_std))
+        head, other = mask_logits(head, mask), mask_logits(other, mask)
+        if not self.codec.multi:
+            return categorical_kl(head, other)
+        return categorical_kl(self._parts(head), self._parts(other)).sum(-1)
 
     def with_log_prob(self, action: Tensor, log_prob: Tensor, log_std: Tensor | None) -> Tensor:
         """A head under which Discrete or Box actions have exactly these log-probabilities (...).

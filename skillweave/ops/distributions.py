@@ -25,6 +25,33 @@ def mask_logits(
     return logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
 
 
+def with_floor(logits: Tensor, mask: Tensor | None, floor: Tensor) -> Tensor:
+    """Logits (..., A) of ``(1 − ε)·softmax + ε·uniform`` over what ``mask`` (..., A) allows.
+
+    Args:
+        floor: ε, of a shape that broadcasts with (..., A).
+    """
+    allowed = torch.ones_like(logits) if mask is None else mask.to(logits.dtype)
+    uniform = allowed / allowed.sum(-1, keepdim=True)
+    share = mask_logits(logits, mask).softmax(-1)
+    return mask_logits(torch.lerp(share, uniform, floor).clamp_min(1e-30).log(), mask)
+
+
+def categorical_kl(logits: Tensor, other: Tensor) -> Tensor:
+    """KL(p ‖ q) of categoricals with these logits, masked alike; (..., A) to (...)."""
+    log_p = logits.log_softmax(-1)
+    log_q = other.log_softmax(-1).clamp_min(-200.0)
+    return (log_p.exp() * (log_p.clamp_min(-200.0) - log_q)).sum(-1)
+
+
+def normal_kl(mean: Tensor, log_std: Tensor, other: Tensor, other_log_std: Tensor) -> Tensor:
+    """KL(p ‖ q) of independent normals, q the other; (..., A) to (...)."""
+    variance, other_variance = (2.0 * log_std).exp(), (2.0 * other_log_std).exp()
+    moved = (mean - other).square()
+    found = other_log_std - log_std + 0.5 * ((variance + moved) / other_variance - 1.0)
+    return found.sum(-1)
+
+
 def gumbel(uniform: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Gumbel noise ``−log(−log u)`` from uniform noise in [0, 1); any shape."""
     tiny = torch.finfo(uniform.dtype).tiny

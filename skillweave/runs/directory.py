@@ -194,14 +194,20 @@ class RunDirectory:
             return state_from(tensors, like, str(path)), header, extra
         return None if kind is None else kind(**tensors), header, extra
 
-    def save_policy(self, stage: str, policy: AgentPolicy) -> None:
-        """Write the policy of a finished stage; ``save`` then binds it to the run."""
+    def save_policies(self, stage: str, policies: Mapping[str, AgentPolicy]) -> None:
+        """Write who learnt in a finished stage; ``save`` then binds the files to the run."""
         self._check()
-        tensors, header = policy.to_file()
-        path = self.policy_path(stage)
-        make_directory(path.parent)
-        sha256 = write_tensors(path, tensors, header | self._place(stage), make_directories=False)
-        self.stage(stage)["sha256"] = sha256
+        entry, sums = self.stage(stage), {}
+        for name, policy in policies.items():
+            tensors, header = policy.to_file()
+            path = self.policy_path(stage, name)
+            make_directory(path.parent)
+            header |= self._place(stage)
+            sums[name] = write_tensors(path, tensors, header, make_directories=False)
+        if list(sums) == [stage]:
+            entry["sha256"] = sums[stage]
+        else:
+            entry["policies"] = sums
 
     def _place(self, stage: str) -> dict[str, str]:
         """What the header of a stage's file says of where it belongs."""
@@ -213,8 +219,14 @@ class RunDirectory:
         if header.get("run", run) != run:
             raise SkillweaveError(f"{path} belongs to another run")
 
-    def load_policy(self, stage: str) -> AgentPolicy:
-        """The policy of a finished stage.
+    def load_policies(self, stage: str) -> dict[str, AgentPolicy]:
+        """By name, who learnt in a finished stage; errors are those of ``load_policy``."""
+        entry = self.stage(stage)
+        names = [stage] if entry.get("policies") is None else entry["policies"]
+        return {name: self.load_policy(stage, name) for name in names}
+
+    def load_policy(self, stage: str, name: str | None = None) -> AgentPolicy:
+        """The policy of a finished stage, or of one who learnt in it.
 
         Raises:
             SkillweaveError: the stage is not finished, or its file is damaged.
@@ -224,14 +236,15 @@ class RunDirectory:
             raise SkillweaveError(
                 f"{self.path}: the stage {stage!r} is not finished; skillweave resume {self.path}"
             )
-        path = self.policy_path(stage)
+        path = self.policy_path(stage, name)
         tensors, header, sha256 = read_signed(path)
         if header.get("kind") != "agent":
             raise SkillweaveError(f"{path} holds no agent's policy")
         if header.get("stage", stage) != stage:
             raise SkillweaveError(f"{path} holds the policy of stage {shown(header['stage'])}")
         self._must_be_ours(header, path)
-        if entry.get("sha256", sha256) != sha256:
+        known = entry.get("policies", {}).get(name, entry.get("sha256", sha256))
+        if known != sha256:
             raise SkillweaveError(
                 f"{path} is not the file that the run wrote there: another checksum. Put it back, "
                 "or train anew"
@@ -265,9 +278,10 @@ class RunDirectory:
     def _copy_path(self, skill: str, policy: Foreign) -> Path:
         return self.path / "policies" / f"{skill}{policy.suffix}"
 
-    def policy_path(self, stage: str) -> Path:
-        """Where a stage's policy lies."""
-        return self.path / "policies" / f"{stage}.safetensors"
+    def policy_path(self, stage: str, name: str | None = None) -> Path:
+        """Where the policy of a stage lies, or of one who learns in it."""
+        file = stage if name in (None, stage) else f"{stage}.{name}"
+        return self.path / "policies" / f"{file}.safetensors"
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""

@@ -60,11 +60,19 @@ class Reached(TypedDict):
     value: float
 
 
+class Kept(TypedDict):
+    """Which of two hierarchies a stage ended with, by their mean returns."""
+
+    before: float
+    after: float
+    kept: Literal["before", "after"]
+
+
 class StageEntry(TypedDict):
     """A stage: who learns in it and who decides, for how many steps, and how far it is."""
 
     name: Name
-    kind: Literal["agent", "skill", "selector"]
+    kind: Literal["agent", "skill", "selector", "together"]
     learns: Annotated[list[Name], Asked("at least one name", bool)]
     """Whose weights the stage changes: "agent", "selector" or a skill's name."""
     decides: Name | None
@@ -86,6 +94,14 @@ class StageEntry(TypedDict):
     winner: NotRequired[Winner]
     sha256: NotRequired[str]
     """Of its policy's file."""
+    policies: NotRequired[dict[Name, str]]
+    """The same where several learn: by name, checksums of their policies' files."""
+    together: NotRequired[dict[str, Any]]
+    """How skills and selector learn together."""
+    algorithms: NotRequired[dict[Name, dict[str, Any]]]
+    """Of the skills that learn together with the selector."""
+    kept: NotRequired[Kept]
+    """Whether what was there before was better than what was learnt together."""
 
 
 class Manifest(TypedDict):
@@ -113,6 +129,8 @@ class HierarchyManifest(Manifest):
 
     skills: list[SkillEntry]
     call_steps: Positive | None
+    call_lengths: NotRequired[list[Positive]]
+    learn: NotRequired[Literal["apart", "together", "apart, then together"]]
     greedy_skills: bool
     reflexes: NotRequired[list[str]]
     reflexes_in_training: NotRequired[bool]

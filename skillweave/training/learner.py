@@ -14,7 +14,7 @@ from torch import Tensor
 
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
-from skillweave.experience import Experience
+from skillweave.experience import Anchor, Experience
 from skillweave.seeding import Seeds
 from skillweave.types import Array
 
@@ -86,6 +86,8 @@ class RolloutLearner:
         self.overlap, self.threads = bool(config.overlap), int(config.threads)
         self._store = RolloutStore(stack.members, quota, stack.state.params.device)
         self._log_std: Tensor | None = None
+        self.anchor: Anchor | None = None
+        """The policy that it is to stay near, if there is one."""
         self._progress = 0.0  # where the rollout began, so that the first has the whole rate
 
     def request(self, update: int, steps: int, progress: float) -> Request:
@@ -107,7 +109,8 @@ class RolloutLearner:
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """An update, where there was something to learn from."""
         stack = self._stack
-        rollout = self._store.rollout(stack.state.gamma, self._log_std, self._progress)
+        gamma, anchor = stack.state.gamma, self.anchor
+        rollout = self._store.rollout(gamma, self._log_std, self._progress, anchor)
         if rollout is None:
             return {}
         seeds = member_seeds(self._seeds, "learn", stack.members, update)

@@ -6,12 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.collector import RETURN, SUCCESS, Collector
 from skillweave.seeding import Seeds
-from skillweave.training.arena import episodes_of
 from skillweave.training.learner import crossed
 from skillweave.training.scene import Scene
+from skillweave.types import Array
 
 
 class PeriodicEvaluation:
@@ -28,13 +27,18 @@ class PeriodicEvaluation:
         """Training stands at ``steps``: what was due until here is done."""
         self._last = steps
 
-    def due(self, steps: int, policy: Callable[[], AgentPolicy]) -> dict[str, float]:
-        """Evaluate where it is time to, and tell metrics; else none."""
+    def due(self, steps: int, play: Callable[[Collector, Seeds], Array]) -> dict[str, float]:
+        """Evaluate where it is time to, and tell metrics; else none.
+
+        Args:
+            play: plays an episode in each environment of an arena: (N, 4), as
+                ``Collected.episodes``.
+        """
         if self._every is None or not crossed(self._every, self._last, steps):
             return {}
         self._last = steps
         self._arena = self._arena or self._scene.collector(self._episodes, None)
-        told = episodes_of(policy(), self._arena, self._seeds)
+        told = play(self._arena, self._seeds)
         returns, success = told[:, RETURN], told[:, SUCCESS]
         found = {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
         if np.isnan(success).all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -13,6 +13,7 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Reflex, Skill
 
@@ -81,8 +82,44 @@ def selector_scene(spec: EnvSpec, skills: SkillSet) -> Scene:
         return DecisionCollector(engine, acting, skills, keep_rewards=shared)
 
     observation_space, _ = _spaces(spec)
-    choices = gym.spaces.Discrete(len(skills.skills))
-    return Scene(spec.name, observation_space, choices, collector, skills.call_steps or CALL)
+    choices = gym.spaces.Discrete(skills.choices)
+    return Scene(spec.name, observation_space, choices, collector, skills.usual_steps or CALL)
+
+
+@dataclass(frozen=True)
+class WovenScene(Scene):
+    """Environments in which a selector calls skills, and some of these learn too."""
+
+    skills: SkillSet = field(kw_only=True)
+    """Those that learn have any policy."""
+    learners: tuple[int, ...] = field(kw_only=True)
+    """The numbers of those that learn."""
+    skill_space: gym.Space[Any] = field(kw_only=True)
+    """What skills choose from."""
+    spec: EnvSpec = field(kw_only=True)
+
+    def woven(
+        self, num_envs: int, acting: Acting, learners: Sequence[Acting], first: int = 0
+    ) -> WovenCollector:
+        """A collector of ``num_envs`` environments.
+
+        Args:
+            acting: the selector.
+            learners: the skills that learn, in their order.
+        """
+        engine = make_engine(self.spec, num_envs, first=first)
+        by_number = dict(zip(self.learners, learners, strict=True))
+        return WovenCollector(engine, acting, self.skills, by_number)
+
+
+def woven_scene(spec: EnvSpec, skills: SkillSet, learners: tuple[int, ...]) -> WovenScene:
+    """The environments in which a selector calls skills, and those of ``learners`` learn too."""
+    plain = skill_scene(spec)
+    return WovenScene(
+        spec.name, plain.observation_space, gym.spaces.Discrete(skills.choices), plain.collector,
+        skills.usual_steps or CALL, skills=skills, learners=learners,
+        skill_space=plain.action_space, spec=spec,
+    )  # fmt: skip
 
 
 def _spaces(spec: EnvSpec) -> tuple[gym.Space[Any], gym.Space[Any]]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
+from skillweave.algorithms.config_off_policy import number, positive
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
@@ -16,6 +17,8 @@ from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy, SkillweaveError
 
+SELECTOR = "selector"
+"""What the selector is named."""
 Policies = Mapping[str, Policy]
 """By name, everyone who can act already: ready skills, and who learnt in earlier stages."""
 
@@ -73,11 +76,38 @@ def target_of(target_return: Any, target_success: Any, where: str) -> Target | N
 
 
 @dataclass(frozen=True)
+class Together:
+    """How skills and selector learn together, from the same steps.
+
+    Raises:
+        SkillweaveError: a value is out of its range.
+    """
+
+    floor: float = 0.3
+    """The least share of calls that are drawn uniformly from those allowed, at the start."""
+    floor_final: float = 0.02
+    """The same at the end of the budget, reached linearly."""
+    task_weight: float = 0.0
+    """β: what the task's advantage counts beside a skill's own, for skills that learn by PPO."""
+    anchor_nats: float | None = 0.05
+    """How far, in nats of KL, skills that were trained before may move; None: freely."""
+    quota: float = 0.25
+    """A skill learns when it has acted in this share of a rollout's rows, or more."""
+
+    def __post_init__(self) -> None:
+        for name in ("floor", "floor_final", "quota"):
+            number(self, name, high=1.0)
+        number(self, "task_weight")
+        if self.anchor_nats is not None:
+            positive(self, "anchor_nats")
+
+
+@dataclass(frozen=True)
 class Stage:
     """What to train, and in which environment."""
 
     name: str
-    kind: Literal["agent", "skill", "selector"]
+    kind: Literal["agent", "skill", "selector", "together"]
     config: AlgorithmConfig
     """The algorithm's settings."""
     budget: int
@@ -86,19 +116,28 @@ class Stage:
     """Where it learns, given everyone who can act already."""
     target: Target | None = None
     """Where it may end early."""
+    skills: Mapping[str, AlgorithmConfig] = field(default_factory=dict)
+    """In a stage where all learn together: the skills that do, and their algorithms."""
+    together: Together | None = None
+    """How they learn together."""
 
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
-        return {
+        first = SELECTOR if self.together else self.name
+        entry = {
             "name": self.name,
             "kind": self.kind,
-            "learns": [self.name],
-            "decides": self.name if self.kind == "selector" else None,
+            "learns": [first, *self.skills],
+            "decides": first if self.kind in ("selector", "together") else None,
             "budget": self.budget,
             "algorithm": config_to_json(self.config),
             "target": None if self.target is None else asdict(self.target),
             "status": "waiting",
         }
+        if self.together is not None:
+            entry["together"] = asdict(self.together)
+            entry["algorithms"] = {k: config_to_json(v) for k, v in self.skills.items()}
+        return entry
 
 
 def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> None:

@@ -91,10 +91,10 @@ class StageLog:
             f"at least {target['at_least']:g} was asked"
         )
 
-    def done(self, policy: AgentPolicy) -> None:
-        """The stage is over: keep its policy, and say how it went."""
+    def done(self, policies: Mapping[str, AgentPolicy]) -> None:
+        """The stage is over: keep who learnt in it, and say how it went."""
         entry, at = self.entry, self.at
-        self.run.save_policy(entry["name"], policy)
+        self.run.save_policies(entry["name"], policies)
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
         entry["evaluation_steps"] = at["evaluation_steps"]
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))

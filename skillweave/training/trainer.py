@@ -19,15 +19,16 @@ from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds
+from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import Stack
+from skillweave.training.learner import Learner, Stack
 from skillweave.training.loop import Progress, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Stage, Target
 from skillweave.training.stage_log import START, Listener, StageLog, resumed
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Array, Policy, SkillweaveError
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class StageRun:
     seeds: Seeds
     """The stage's node of the seed tree."""
     scene: Scene
+    policies: Policies
+    """Everyone who can act already."""
 
     @property
     def name(self) -> str:
@@ -77,8 +80,8 @@ class StageLearner(Protocol):
         """Stand where a checkpoint says, or at the start where ``extra`` is empty."""
         ...
 
-    def train(self, log: StageLog) -> AgentPolicy:
-        """Learn until the stage is over; the policy that it ends with."""
+    def train(self, log: StageLog) -> dict[str, AgentPolicy]:
+        """Learn until the stage is over; by name, those who learnt, as they end."""
         ...
 
     def close(self) -> None:
@@ -107,25 +110,53 @@ class OneAgent:
         every, episodes = manifest.get("eval_every"), manifest.get("eval_episodes", 0)
         self.evaluation = PeriodicEvaluation(scene, stage.seeds, every, episodes)
         self._open.callback(self.evaluation.close)
-        algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
-
-        def collector(num_envs: int, first: int) -> Collector:
-            return scene.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
-
+        fresh = self.make_agents()
         workers = int(stage.entry.get("workers", 1))
-        self.collectors = make_collectors(collector, config.num_envs, workers, 1, scene.name)
+        make: Any = self.collector
+        self.collectors = make_collectors(make, config.num_envs, workers, 1, scene.name)
         self._open.callback(self.collectors.close)
-        self.algorithm, self.episodes = algorithm, Episodes()
-        return algorithm.init([stage.seeds / "member" / 0])
+        self.episodes = Episodes()
+        return fresh
 
-    def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Stand where a checkpoint says."""
+    def make_agents(self) -> Any:
+        """Make who learns; the fresh state that checkpoints hold, or None."""
+        stage, scene = self.stage, self.stage.scene
+        spaces = scene.observation_space, scene.action_space
+        self.algorithm = make_algorithm(stage.config, *spaces)
+        return self.algorithm.init([stage.seeds / "member" / 0])
+
+    def collector(self, num_envs: int, first: int) -> Collector:
+        """A collector in which the agent acts."""
+        acting = Acting([(self.algorithm, 1)], num_envs)
+        return self.stage.scene.collector(num_envs, acting, first)
+
+    def learner_from(self, state: Any, extra: dict[str, Tensor], log: StageLog) -> Learner:
+        """Who learns, from this state on."""
         stage, config = self.stage, self.stage.config
         stack = Stack(self.algorithm, state_to(state, resolve_device(config.device)))
-        self.learner = learner_of(
+        return learner_of(
             stack, config.num_envs, stage.seeds, row_steps=stage.scene.row_steps,
             goes_on_at=log.at["steps"],
         )  # fmt: skip
+
+    def policies(self) -> dict[str, AgentPolicy]:
+        """By name, who learns, as they are now."""
+        (stack,) = self.learner.stacks
+        return {self.stage.name: AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))}
+
+    def play(self, arena: Collector, seeds: Seeds) -> Array:
+        """An episode in each environment of an arena, (N, 4); see ``Collected.episodes``."""
+        (policy,) = self.policies().values()
+        return episodes_of(policy, arena, seeds)
+
+    def save(self, tick: Tick, log: StageLog) -> None:
+        """Write a checkpoint."""
+        (stack,) = self.learner.stacks
+        log.save(state_to(stack.state, "cpu"), tick.extra)
+
+    def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
+        """Stand where a checkpoint says."""
+        self.learner = self.learner_from(state, extra, log)
         self._steps_before = int(log.at["steps"])
         if extra and "collector.collectors" not in extra:
             log.tell(
@@ -137,23 +168,19 @@ class OneAgent:
             log.tell_begun_anew(len(ids), self.collectors.num_envs)
         self.evaluation.start(log.at["steps"])
 
-    def train(self, log: StageLog) -> AgentPolicy:
+    def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Learn until the budget is spent or the target is reached."""
-        target, (stack,) = self.stage.target, self.learner.stacks
-        made = self.collectors.steps_made
-
-        def policy() -> AgentPolicy:
-            return AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))
+        target, made = self.stage.target, self.collectors.steps_made
 
         def on_tick(tick: Tick) -> None:
-            found = self.evaluation.due(tick.steps, policy)
+            found = self.evaluation.due(tick.steps, self.play)
             log.at["evaluation_steps"] += self.evaluation.spent()
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
             if target is not None and target.reached(found, self.stage.name) is not None:
                 # No checkpoint: who resumes from the one before comes here again.
                 raise _TargetReached
             if tick.cut:
-                log.save(state_to(stack.state, "cpu"), tick.extra)
+                self.save(tick, log)
 
         at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
         try:
@@ -167,7 +194,7 @@ class OneAgent:
             # What was collected since the update was made, too.
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
-        return policy()
+        return self.policies()
 
     def close(self) -> None:
         """Release the environments."""
@@ -185,8 +212,8 @@ def train_stage(
     listeners: tuple[Listener, ...] = (),
     policies: Policies | None = None,
     make_learner: MakeLearner = OneAgent,
-) -> AgentPolicy:
-    """Train a stage to its end, or return its policy where it is done already.
+) -> dict[str, AgentPolicy]:
+    """Train a stage to its end, or load it where it is done; by name, those who learnt.
 
     Args:
         seeds: the stage's node of the seed tree.
@@ -198,8 +225,9 @@ def train_stage(
     """
     entry = run.stage(stage.name)
     if entry["status"] == "done":
-        return run.load_policy(stage.name)
-    learner = make_learner(StageRun(entry, run, seeds, stage.scene(policies or {})))
+        return run.load_policies(stage.name)
+    known = policies or {}
+    learner = make_learner(StageRun(entry, run, seeds, stage.scene(known), known))
     try:
         fresh = learner.open()
         kind = None if fresh is None else type(fresh)
@@ -207,11 +235,11 @@ def train_stage(
         state, at, extra = found or (fresh, START, {})
         log = StageLog(stage.name, run, listeners, at)
         learner.go_on(state, extra, log)
-        policy = learner.train(log)
+        policies = learner.train(log)
     finally:
         learner.close()
-    log.done(policy)
-    return policy
+    log.done(policies)
+    return policies
 
 
 def train_stages(
@@ -229,7 +257,5 @@ def train_stages(
     found = dict(policies or {})
     root = Seeds(int(run.manifest["seed"]))
     for stage in stages:
-        found[stage.name] = train_stage(
-            stage, run, root / stage.name, listeners, found, make_learner
-        )
+        found |= train_stage(stage, run, root / stage.name, listeners, found, make_learner)
     return found

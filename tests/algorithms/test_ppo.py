@@ -335,9 +335,9 @@ def test_kl_counts_from_the_first_policy_of_an_update():
 class Weighed(PPOAlgorithm):
     """Keeps the weights of all samples."""
 
-    def loss(self, views, state, batch, ent_coef):
+    def loss(self, views, state, batch, now):
         self.found = [*getattr(self, "found", []), batch.importance]
-        return super().loss(views, state, batch, ent_coef)
+        return super().loss(views, state, batch, now)
 
 
 SPACES = pytest.mark.parametrize("asks", ["Discrete", "MultiDiscrete", "Box"])

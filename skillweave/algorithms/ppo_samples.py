@@ -1,0 +1,157 @@
+"""What an update of PPO learns from: the samples of a rollout, and the terms of its loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import ActingParams
+from skillweave.algorithms.config import PPO
+from skillweave.algorithms.rollouts import Cells, Samples, rows_where
+from skillweave.experience import Anchor, Rollout
+from skillweave.networks.stacked import take_rows
+from skillweave.ops.distributions import with_floor
+from skillweave.ops.moments import explained_variance, normalise
+from skillweave.ops.returns import gae
+
+if TYPE_CHECKING:
+    from skillweave.algorithms.ppo import PPOAlgorithm, State
+
+
+@dataclass
+class Terms:
+    """What schedules, and the stage, say of an update."""
+
+    rate: Tensor  # (P,), Adam's step size
+    ent_coef: Tensor  # (P,)
+    floor: Tensor | None  # (P, 1, 1), share of actions that is drawn uniformly
+    anchor: Anchor | None
+
+    @classmethod
+    def of(cls, config: PPO, state: Any, rollout: Rollout) -> Terms:
+        """Those of an update from this rollout."""
+        progress = rollout.progress
+        rate, ent_coef, final = state.learning_rate, state.ent_coef, config.ent_coef_final
+        if config.learning_rate_schedule == "linear":
+            rate = rate * (1.0 - progress)
+        if final is not None:
+            ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
+        return cls(rate, ent_coef, floor_now(config, progress, rate), rollout.anchor)
+
+
+def floor_now(config: PPO, progress: float, like: Tensor) -> Tensor | None:
+    """The share of actions that is drawn uniformly, (P, 1, 1); None: there is no such share.
+
+    Args:
+        like: (P,).
+    """
+    first, last = config.floor, config.floor_final
+    if max(first, last or 0.0) == 0.0:
+        return None
+    share = first if last is None else first + progress * (last - first)
+    return torch.full((len(like), 1, 1), share, device=like.device)
+
+
+@torch.no_grad()
+def samples_of(
+    agent: PPOAlgorithm, state: State, rollout: Rollout, now: Terms
+) -> tuple[Samples, dict[str, Tensor]]:
+    """What ``loss`` needs of a rollout without gaps, and metrics (P,)."""
+    cfg, memory, starts = agent.config, rollout.memory, rollout.starts
+    if not agent.memory_size:
+        memory = starts = None
+    cells = Cells(rollout, all_cells=memory is not None)
+    obs, valid = cells.flat(rollout.obs), cells.flat_or_none(rollout.valid)
+    agent.update_obs_stats(state, obs, valid)
+    params = agent.learning_params(state)
+    inputs = agent.inputs(params, obs)
+    if memory is not None:
+        inputs = {k: cells.unflat(v) for k, v in inputs.items()}
+    raw, after = agent.run(agent.critic_net, params.views, inputs, memory, starts)
+    value = agent.in_rewards(state, raw)
+    following = _next_values(agent, state, params, rollout, cells.grid(value), after)
+    reward, discount, last = rollout.reward, rollout.discount, rollout.last
+    grid = gae(reward, discount, cells.grid(value), following, last, state.gae_lambda)
+    advantage = cells.flat(grid)
+    returns = advantage + value
+    metrics = {"explained_variance": explained_variance(value, returns, valid)}
+    if cfg.normalize_returns:
+        agent.update_return_stats(state, returns, valid)
+    mean, scale = state.return_mean, agent.return_scale(state)
+    action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.obs_mask)
+    # Clipping and KL count from the policy as it is now, whoever acted.
+    head, _ = agent.run(agent.actor_net, params.views, inputs, memory, starts)
+    if now.floor is not None:
+        head = with_floor(head, mask, now.floor)
+    log_prob, _ = agent.head.stats(head, params.views.get("actor.log_std"), mask, action)
+    samples = Samples(
+        inputs={} if memory is not None else inputs,
+        action=action,
+        log_prob=log_prob,
+        importance=(log_prob - _acted(agent, rollout, cells, mask, action)).exp(),
+        advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), valid),
+        anchor=_anchor(agent, now, obs),
+        target=(returns - mean) / scale,
+        old_value=None if cfg.clip_value is None else (value - mean) / scale,
+        mask=mask,
+        valid=valid,
+        most=cells.most,
+    )
+    if memory is not None:
+        samples = samples.changed(cells.unflat)
+        samples.inputs, samples.memory, samples.starts = inputs, memory, starts
+    return samples, metrics
+
+
+def _anchor(agent: PPOAlgorithm, now: Terms, obs: Tensor) -> Tensor | None:
+    """Heads (P, N, H) of the policy that the learner is to stay near."""
+    if now.anchor is None or agent.memory_size:  # what the anchor would remember is not known
+        return None
+    params = now.anchor.params
+    return agent.actor_net(params.views, agent.inputs(params, obs))
+
+
+def _advantage(
+    agent: PPOAlgorithm, own: Tensor, other: Tensor | None, valid: Tensor | None
+) -> Tensor:
+    """The learner's own advantage, and what counts beside it in the same units, (P, N)."""
+    own = normalise(own, valid) if agent.config.normalize_advantage else own
+    return own if other is None else own + other
+
+
+def _acted(
+    agent: PPOAlgorithm, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor
+) -> Tensor:
+    """Log-probabilities (P, N) of the actions by the policy that acted."""
+    assert rollout.head is not None
+    log_std = None if rollout.log_std is None else rollout.log_std.flatten(1, 2)
+    return agent.head.stats(cells.flat(rollout.head), log_std, mask, action)[0]
+
+
+def _next_values(
+    agent: PPOAlgorithm,
+    state: State,
+    params: ActingParams,
+    rollout: Rollout,
+    value: Tensor,
+    after: Tensor | None,
+) -> Tensor:
+    """V(next_obs), (P, T, B): V(obs), (P, T, B), of the next row, except at ends.
+
+    Args:
+        after: (P, T·B, M), the critic's memory after each row, if it has one.
+    """
+    following = torch.zeros_like(value)
+    following[:, :-1] = value[:, 1:]
+    # Surplus rows of members with fewer ends get what the shift gave them.
+    rows = rows_where(rollout.last.flatten(1))
+    inputs = agent.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
+    if after is None:
+        raw = agent.critic_net(params.views, inputs)
+    else:
+        raw, _ = agent.critic_net.step(params.views, inputs, take_rows(after, rows))
+    ends = agent.in_rewards(state, raw)
+    return following.flatten(1).scatter(1, rows, ends).view_as(value)

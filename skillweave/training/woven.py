@@ -1,0 +1,199 @@
+"""A stage in which a selector and its skills learn together, from the same steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Algorithm, state_to
+from skillweave.algorithms.config import AlgorithmConfig, config_from_json
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
+from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.woven import WovenCollector
+from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.experience import Anchor, Experience
+from skillweave.ops.device import resolve_device
+from skillweave.ops.threads import torch_threads
+from skillweave.seeding import Seeds
+from skillweave.training.episodes import Tick
+from skillweave.training.learner import Learner, RolloutLearner, Stack
+from skillweave.training.replay_learner import ReplayLearner, store_of
+from skillweave.training.scene import WovenScene
+from skillweave.training.stage import SELECTOR, Together
+from skillweave.training.stage_log import StageLog
+from skillweave.training.trainer import OneAgent
+from skillweave.types import Array, prefixed, unprefixed
+
+
+class WovenLearner:
+    """A selector and skills, each with a learner of its own; nobody learns from others' rows.
+
+    Args:
+        parts: by name, the selector first, then the skills in their order.
+        nats: how far, in KL, skills with an anchor may move from it.
+    """
+
+    def __init__(self, parts: Mapping[str, Learner], nats: float = 0.0) -> None:
+        self.parts, self._nats = dict(parts), nats
+        self.stacks: Sequence[Stack] = [s for part in parts.values() for s in part.stacks]
+        self.overlap = all(part.overlap for part in parts.values())
+        self.report_every = max(part.report_every for part in parts.values())
+        self.threads = max(part.threads for part in parts.values())
+
+    def request(self, update: int, steps: int, progress: float) -> Request:
+        """As many rows as the selector's learner asks for, with the parameters of all."""
+        first, *others = (p.request(update, steps, progress) for p in self.parts.values())
+        return replace(first, parts=tuple(others))
+
+    def take(self, experience: Experience) -> None:
+        """Give each its own."""
+        own = (replace(experience, parts=()), *experience.parts)
+        for part, rows in zip(self.parts.values(), own, strict=True):
+            part.take(rows)
+
+    def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
+        """Let those learn that have enough rows; metrics under ``<name>.``."""
+        found: dict[str, Tensor] = {}
+        for name, part in self.parts.items():
+            metrics = part.learn(update, steps, progress)
+            if isinstance(part, RolloutLearner) and part.anchor and "anchor_kl" in metrics:
+                part.anchor.coef = adapted(part.anchor.coef, metrics["anchor_kl"], self._nats)
+            found |= prefixed(name, metrics)
+        return found
+
+    def cut(self, columns: Array) -> None:
+        """The environments of ``columns`` (k,) begin anew."""
+        for part in self.parts.values():
+            part.cut(columns)
+
+    def kept(self) -> dict[str, Tensor]:
+        """What going on exactly needs beside the states of the stacks, at a clean cut."""
+        found: dict[str, Tensor] = {}
+        for name, part in self.parts.items():
+            found |= prefixed(name, part.kept())
+            if isinstance(part, RolloutLearner) and part.anchor:
+                found[f"{name}.anchor_coef"] = part.anchor.coef.clone()
+        return found
+
+    def load(self, kept: dict[str, Tensor]) -> None:
+        """The inverse of ``kept``."""
+        for name, part in self.parts.items():
+            own = unprefixed(name, kept)
+            coef = own.pop("anchor_coef", None)
+            if isinstance(part, RolloutLearner) and part.anchor and coef is not None:
+                part.anchor.coef = coef.to(part.anchor.coef.device)
+            part.load(own)
+
+
+def adapted(coef: Tensor, kl: Tensor, nats: float) -> Tensor:
+    """What a nat of KL costs from now on, so that KL comes near ``nats``; (P,) each.
+
+    The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
+    """
+    factor = torch.where(kl > 1.5 * nats, 2.0, torch.where(kl < nats / 1.5, 0.5, 1.0))
+    return (coef * factor).clamp(1e-3, 1e3)
+
+
+class WovenAgents(OneAgent):
+    """A stage's learners where a selector and its skills learn together."""
+
+    stage: Any
+
+    def make_agents(self) -> None:
+        """Make who learns; checkpoints hold their states under ``extra``."""
+        scene = self.scene
+        self.together = Together(**self.stage.entry["together"])
+        told = self.stage.entry["algorithms"]
+        self.configs: dict[str, AlgorithmConfig] = {SELECTOR: self.stage.config}
+        self.configs |= {name: config_from_json(told[name]) for name in told}
+        seen = scene.observation_space
+        self.algorithms: dict[str, Algorithm] = {
+            name: make_algorithm(
+                config, seen, scene.action_space if name == SELECTOR else scene.skill_space
+            )
+            for name, config in self.configs.items()
+        }
+
+    @property
+    def scene(self) -> WovenScene:
+        """Where they learn."""
+        scene: WovenScene = self.stage.scene
+        return scene
+
+    def collector(self, num_envs: int, first: int) -> Collector:
+        """A collector in which all act."""
+        selector, *skills = (Acting([(a, 1)], num_envs) for a in self.algorithms.values())
+        return self.scene.woven(num_envs, selector, skills, first)
+
+    def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
+        """All learners, from a checkpoint, from what they learnt in earlier stages, or fresh."""
+        saved, parts = unprefixed("state", extra), dict[str, Learner]()
+        for name, algorithm in self.algorithms.items():
+            fresh = algorithm.init([self.stage.seeds / name / "member" / 0])
+            before = self.stage.policies.get(name)
+            if isinstance(before, AgentPolicy):
+                algorithm.set_weights(fresh, before.weights)
+                fresh.obs_count.fill_(float(self._steps_of(name)))
+            if saved:
+                fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
+            stack = Stack(algorithm, state_to(fresh, resolve_device(algorithm.config.device)))
+            part = self._part(name, stack, log)
+            near = self.together.anchor_nats is not None and name != SELECTOR
+            if near and isinstance(before, AgentPolicy) and isinstance(part, RolloutLearner):
+                params = algorithm.acting_params_of(before.weights)
+                if not algorithm.memory_size:
+                    part.anchor = Anchor(params, torch.ones(1))
+            parts[name] = part
+        return WovenLearner(parts, self.together.anchor_nats or 0.0)
+
+    def _part(self, name: str, stack: Stack, log: StageLog) -> Learner:
+        """The learner of the selector, or of a skill."""
+        num_envs, seeds = self.stage.config.num_envs, self.stage.seeds / name
+        config = stack.algorithm.config
+        if stack.algorithm.store == "rollout":
+            rows = num_envs * int(getattr(self.stage.config, "n_steps", config.n_steps))
+            quota = 0 if name == SELECTOR else max(1, round(rows * self.together.quota))
+            return RolloutLearner(stack, seeds, quota)
+        row_steps = self.scene.row_steps if name == SELECTOR else 1
+        store = store_of(stack.algorithm, num_envs)
+        return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"])
+
+    def _steps_of(self, name: str) -> int:
+        """Environment steps that ``name`` has learnt from in earlier stages."""
+        stages = self.stage.run.manifest["stages"]
+        return sum(s.get("steps", 0) for s in stages if s["learns"] == [name])
+
+    def policies(self) -> dict[str, AgentPolicy]:
+        """By name, who learns, as they are now."""
+        stacks = zip(self.algorithms, self.learner.stacks, strict=True)
+        return {k: AgentPolicy.of(s.algorithm, state_to(s.state, "cpu")) for k, s in stacks}
+
+    def play(self, arena: Collector, seeds: Seeds) -> Array:
+        """An episode in each environment of an arena, (N, 4), by the hierarchy as it is now."""
+        acting = [Acting([(a, 1)], arena.num_envs) for a in self.algorithms.values()]
+        scene = self.scene
+        numbers = dict(zip(scene.learners, acting[1:], strict=True))
+        player = WovenCollector(arena.engine, acting[0], scene.skills, numbers)
+        requests = [
+            Request(
+                0, (s.algorithm.acting_params(s.state),), s.state.gamma.cpu().numpy(),
+                seeds / name, greedy=True,
+            )
+            for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
+        ]  # fmt: skip
+        asked = replace(requests[0], parts=tuple(requests[1:]))
+        with torch_threads(1):
+            return player.play(asked, seeds / "start", LONGEST_EPISODE)
+
+    def save(self, tick: Tick, log: StageLog) -> None:
+        """Write a checkpoint: all states are in ``extra``."""
+        states: dict[str, Tensor] = {}
+        for name, stack in zip(self.algorithms, self.learner.stacks, strict=True):
+            own = vars(state_to(stack.state, "cpu"))
+            states |= prefixed(f"state.{name}", own)
+        log.save(None, (tick.extra or {}) | states)
