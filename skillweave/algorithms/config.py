@@ -130,6 +130,28 @@ class PPO(OnPolicy):
         check(self, "batch_size", self.batch_size <= most, says)
 
 
+@dataclass(frozen=True)
+class SkillCritic(OnPolicy):
+    """What each skill is worth to the task, Q(s, skill), learnt from every step of all."""
+
+    batch_size: int = 256
+    """Samples of one gradient step, about."""
+    update_epochs: int = 2
+    """Passes over each rollout."""
+    gae_lambda: float = 0.95
+    """λ of the returns that it learns."""
+    adam_eps: float = 1e-5
+    """Adam's ε."""
+    max_grad_norm: float = 0.5
+    """Gradients are scaled down to this norm."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole(self, "batch_size", "update_epochs")
+        number(self, "gae_lambda", high=1.0)
+        positive(self, "max_grad_norm", "adam_eps")
+
+
 AlgorithmConfig: TypeAlias = OnPolicy | OffPolicy
 """Any algorithm's settings, those of users' own algorithms included."""
 
@@ -144,6 +166,8 @@ class Registration:
     """Its class, or where that is, as ``module:class``."""
     action_spaces: tuple[type[gym.Space[Any]], ...]
     """The kinds of action spaces that it can act in."""
+    acts: bool = True
+    """Whether it can be chosen to act, or serves those that do."""
 
 
 _SPACES, _HOME = gym.spaces, "skillweave.algorithms"
@@ -152,6 +176,9 @@ _REGISTERED: dict[str, Registration] = {
         PPO,
         f"{_HOME}.ppo:PPOAlgorithm",
         (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box),
+    ),
+    "SkillCritic": Registration(
+        SkillCritic, f"{_HOME}.skill_critic:SkillCriticAlgorithm", (_SPACES.Discrete,), acts=False
     ),
     "DQN": Registration(DQN, f"{_HOME}.dqn:DQNAlgorithm", (_SPACES.Discrete,)),
     "TD3": Registration(TD3, f"{_HOME}.td3:TD3Algorithm", (_SPACES.Box,)),
@@ -191,7 +218,8 @@ def _not_registered(name: str) -> str:
 def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> None:
     """Raise a SkillweaveError where an algorithm cannot act in a space; it names those that can."""
     if not isinstance(action_space, registration_of(config).action_spaces):
-        able = [k for k, r in _REGISTERED.items() if isinstance(action_space, r.action_spaces)]
+        able = [k for k, r in _REGISTERED.items() if r.acts]
+        able = [k for k in able if isinstance(action_space, _REGISTERED[k].action_spaces)]
         raise SkillweaveError(
             f"{where}{type(config).__name__} cannot act in {action_space}; "
             + (f"{', '.join(able)} can" if able else "no algorithm here can")
@@ -205,7 +233,7 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
         SkillweaveError: there is none of this name; the message, which begins with ``where``,
             lists them.
     """
-    kinds = {name: found.config for name, found in _REGISTERED.items()}
+    kinds = {name: found.config for name, found in _REGISTERED.items() if found.acts}
     presets: dict[str, Any] = {**kinds, "Rainbow": DQN.rainbow, "DDPG": TD3.ddpg}
     for known, make in presets.items():
         if known.lower() == name.lower():

@@ -64,6 +64,15 @@ class AgentPolicy(Memoryless):
         memory = {} if after is None else {"rnn": after[0].numpy()}
         return self.algorithm.to_env(action[0].numpy()), memory
 
+    @torch.inference_mode()
+    def heads(self, obs: Array) -> Array:
+        """What actions are chosen from, (n, H), without a memory: logits, means or values."""
+        rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
+        _, head, _ = self.algorithm.act(self._params, rows, None, None)
+        assert head is not None
+        found: Array = head[0].numpy()
+        return found
+
     def source(self) -> dict[str, Any]:
         """The checksum of what it acts by, for a run that it is a skill of."""
         digest = hashlib.sha256(type(self.algorithm).__name__.encode())

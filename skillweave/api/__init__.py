@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 from skillweave.skills import Skill
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import assign_workers, check_replay, check_stages
+from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
 from skillweave.types import SkillweaveError
 
 
@@ -162,6 +163,10 @@ class Hierarchy(Declaration):
         _check_run(self, run)
         if run.manifest["kind"] == "hierarchy":
             self.call_steps = calls_from_json(run.manifest)
+            margin = run.manifest.get("interrupt")
+            self.interrupt = margin is not None
+            if margin is not None:
+                self.together = replace(self.together, margin=margin)
             self.learn = run.manifest.get("learn", "apart")
             self.reflexes_in_training = run.manifest.get("reflexes_in_training", True)
             self.greedy_skills = run.manifest["greedy_skills"]
@@ -228,8 +233,9 @@ def _train(
         if stage["decides"] is not None and isinstance(declared, Hierarchy):
             acts = gym.spaces.Discrete(declared.choices)
         check_replay(stage, observation_space, acts)
-        for config in stage.get("algorithms", {}).values():
-            check_replay(stage | {"algorithm": config}, observation_space, action_space)
+        for name, config in stage.get("algorithms", {}).items():
+            if name != CRITIC:  # it keeps nothing
+                check_replay(stage | {"algorithm": config}, observation_space, action_space)
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)

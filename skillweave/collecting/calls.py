@@ -6,7 +6,7 @@ Collectors (training) and ``HierarchyPolicy`` (everything else) both run skills 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -103,6 +103,17 @@ def calls_from_json(told: Mapping[str, Any]) -> int | Lengths | None:
 
 
 @dataclass(frozen=True)
+class Interruption:
+    """When a call is cut (Sutton, Precup & Singh 1999, sec. 4)."""
+
+    worth: Callable[[Array], Array]
+    """Observations (n, …) to what each skill is worth there, (n, S), in deviations of the return.
+    """
+    margin: float
+    """By how much another skill must be worth more, in the same unit."""
+
+
+@dataclass(frozen=True)
 class SkillSet:
     """Skills with their policies, and how a call runs.
 
@@ -122,6 +133,9 @@ class SkillSet:
     """A call lasts at most so long; None: until the skill stops by itself."""
     greedy: bool = True
     """Skills act greedily; else they sample."""
+
+    interruption: Interruption | None = None
+    """When the selector cuts a call; None: never."""
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -143,7 +157,8 @@ class SkillSet:
     def watches(self) -> bool:
         """Whether any skill needs to see transitions: to terminate, or because it remembers."""
         stops = any(s.defines("termination") for s in self.skills)
-        return stops or any(p.start(1) for p in self.policies)
+        remembers = any(p.start(1) for p in self.policies)
+        return stops or remembers or self.interruption is not None
 
     def mask(self, obs: Array) -> Array | None:
         """Which choices are allowed, (n, choices) bool; None: all, everywhere.
@@ -279,7 +294,20 @@ class SkillSet:
             if skill.defines("termination"):
                 stops = asked(skill, "termination", part, len(mine), elapsed[mine], rows[mine])
                 why[mine[stops]] = Why.OWN
+        if self.interruption is not None:
+            self._interrupt(self.interruption, running, step.next_obs, why)
         return why
+
+    def _interrupt(self, how: Interruption, running: Array, obs: Array, why: Array) -> None:
+        """Cut calls where another skill that may start is worth more, in place."""
+        rows = np.flatnonzero(why == Why.RUNNING)
+        if not len(rows):
+            return
+        worth = how.worth(obs[rows])
+        may = self.startable(obs[rows])[:, :: max(1, len(self.lengths))]
+        best = np.where(may, worth, -np.inf).max(axis=1)
+        own = worth[np.arange(len(rows)), running[rows]]
+        why[rows[best - own > how.margin]] = Why.INTERRUPTED
 
     def _own(self, memory: Memory, i: int, rows: Array) -> Memory:
         prefix = f"{i}."

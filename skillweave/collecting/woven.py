@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acted, Acting, Request
-from skillweave.collecting.calls import SkillSet, Why, rows_of
+from skillweave.collecting.calls import Interruption, SkillSet, Why, rows_of
 from skillweave.collecting.columns import stacked
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.experience import Experience
 from skillweave.skills import asked
+from skillweave.spaces import action_codec
 from skillweave.types import Array, Memory, Memoryless, SkillweaveError, Step
 
 
@@ -64,6 +65,9 @@ class WovenCollector(DecisionCollector):
         acting: the selector.
         skills: those that learn have any policy.
         learners: by its number, each skill that learns.
+        critic: of skills; None: nobody asks what they are worth.
+        margin: calls are cut where the critic says that another skill is worth so much more; None:
+            they are not.
     """
 
     def __init__(
@@ -72,10 +76,15 @@ class WovenCollector(DecisionCollector):
         acting: Acting | None,
         skills: SkillSet,
         learners: Mapping[int, Acting],
+        critic: Acting | None = None,
+        margin: float | None = None,
     ) -> None:
         self.learners = {i: LearningSkill(a) for i, a in learners.items()}
+        self.critic = critic
         policies = [self.learners.get(i, p) for i, p in enumerate(skills.policies)]
-        super().__init__(engine, acting, replace(skills, policies=tuple(policies)))
+        cuts = None if margin is None else Interruption(self._worth, margin)
+        skills = replace(skills, policies=tuple(policies), interruption=cuts)
+        super().__init__(engine, acting, skills)
         self._watches = True
         self.kept["fresh"] = np.zeros(self.num_envs, bool)  # the skill that acts begins to
         self._rows: Rows | None = None
@@ -93,8 +102,17 @@ class WovenCollector(DecisionCollector):
 
     def _prepare(self, request: Request) -> None:
         super()._prepare(request)
-        for skill, own in zip(self.learners.values(), request.parts, strict=True):
-            skill.acts.begin(replace(own, greedy=request.greedy), every_step=False)
+        others = [skill.acts for skill in self.learners.values()]
+        others += [] if self.critic is None else [self.critic]
+        for acting, own in zip(others, request.parts, strict=True):
+            acting.begin(replace(own, greedy=request.greedy), every_step=False)
+
+    def _worth(self, obs: Array) -> Array:
+        """What each skill is worth in observations (n, …), (n, S)."""
+        assert self.critic is not None
+        worth = self.critic.these(obs, None, None).head
+        assert worth is not None
+        return worth
 
     def _decide(self, rows: Array) -> None:
         """The selector chooses; a skill that is called again at once goes on."""
@@ -160,6 +178,7 @@ class Rows:
         self._terminated, self._truncated = np.zeros(lead, bool), np.zeros(lead, bool)
         self._owner = np.empty(lead, np.int64)
         self._fresh = np.empty(lead, bool)
+        self._ended, self._cut = np.empty(lead, bool), np.empty(lead, bool)  # the episode
         self._goes_on = np.zeros(n, bool)  # if the same skill is called again
         self._masks: list[Array | None] = []
         self._next_masks: list[Array | None] = []
@@ -168,8 +187,8 @@ class Rows:
         for i, skill in collector.learners.items():
             if skill.acts.memory_size:
                 self._memory[i] = collector._calls[f"{i}.rnn"].copy()
-        first = next(iter(collector.learners.values())).acts.stacks[0][0].codec
-        units = first.from_env(np.asarray(first.space.sample())[None])  # all skills have this space
+        codec = action_codec(collector.engine.action_space)  # all skills act in this space
+        units = codec.from_env(np.asarray(codec.space.sample())[None])
         self._action = np.zeros((*lead, *units.shape[1:]), units.dtype)
 
     def go_on(self, ids: Array) -> None:
@@ -183,6 +202,7 @@ class Rows:
         at, collector = self._at, self._collector
         self._obs[at], self._next_obs[at], self._task[at] = obs, raw.next_obs, raw.reward
         self._owner[at], self._fresh[at] = collector._calls["skill"], collector.kept["fresh"]
+        self._ended[at], self._cut[at] = raw.terminated, raw.truncated
         self._masks.append(mask)
         self._next_masks.append(next_mask)
         self._goes_on[:] = False
@@ -209,7 +229,7 @@ class Rows:
         self._at += 1
 
     def experiences(self) -> tuple[Experience, ...]:
-        """What each skill that learns did, in the order of the skills."""
+        """What each skill that learns did, in the order of the skills; then all for the critic."""
         mask, next_mask = stacked(self._masks), stacked(self._next_masks)
         steps = np.ones(self._reward.shape, np.int64)
         found = []
@@ -222,6 +242,14 @@ class Rows:
                     next_obs=self._next_obs, obs_mask=mask, next_obs_mask=next_mask,
                     valid=self._owner == i, head=self._heads.get(i), memory=memory,
                     starts=None if memory is None else self._fresh,
+                )
+            )  # fmt: skip
+        if self._collector.critic is not None:
+            found.append(
+                Experience(
+                    obs=self._obs, action=self._owner, reward=self._task, steps=steps,
+                    terminated=self._ended, truncated=self._cut & ~self._ended,
+                    next_obs=self._next_obs,
                 )
             )  # fmt: skip
         return tuple(found)

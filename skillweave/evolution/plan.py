@@ -26,10 +26,10 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
     """
     for name, how in _by_stage([p["name"] for p in stages], evolve).items():
         entry = next(p for p in stages if p["name"] == name)
-        if entry["kind"] == "together":
+        if "together" in entry:
             raise SkillweaveError(
-                f"stage {name!r}: a hierarchy that learns as a whole cannot evolve; name the "
-                "stages that are to: evolve={'selector': Evolution(...)}"
+                f"stage {name!r}: {' and '.join(entry['learns'])} learn together there, so it "
+                "cannot evolve; name the stages that are to: evolve={'a_skill': Evolution(...)}"
             )
         check_mutations(config_from_json(entry["algorithm"]), how, f"stage {name!r}: ")
         entry["evolution"] = evolution_to_json(how)
@@ -50,7 +50,7 @@ def make_learner(stages: list[dict[str, Any]], evolve: Evolve) -> MakeLearner:
 
     def make(stage: StageRun) -> StageLearner:
         if stage.entry.get("evolution") is None:
-            return WovenAgents(stage) if stage.entry["kind"] == "together" else OneAgent(stage)
+            return WovenAgents(stage) if "together" in stage.entry else OneAgent(stage)
         how = asked.get(stage.name)
         return EvolvingPopulation(stage, None if how is None else how.selection)
 

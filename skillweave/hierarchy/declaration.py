@@ -23,13 +23,13 @@ from skillweave.training.plain_agent import (
     check_fields,
     check_rollout,
 )
-from skillweave.training.stage import SELECTOR, Target, Together, target_of
+from skillweave.training.stage import CRITIC, SELECTOR, Target, Together, target_of
 from skillweave.types import Policy, SkillweaveError
 
 TOGETHER = "together"
 """What the stage is named in which all learn together."""
 WAYS = ("apart", "together", "apart, then together")
-RESERVED = (SELECTOR, TOGETHER, AGENT, "flat")
+RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT, "flat")
 """Names of stages that are not skills; "flat" in runs of older versions."""
 
 
@@ -61,6 +61,8 @@ class Declaration:
     """Training budget of the selector, in environment steps."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
+    interrupt: bool = False
+    """The selector cuts a call where another skill is clearly worth more (``Together.margin``)."""
     together: Together = field(default_factory=Together)
     """How skills and selector learn together."""
     selector_target_return: float | None = None

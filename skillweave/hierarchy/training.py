@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from skillweave.algorithms.config import PPO
-from skillweave.collecting.calls import calls_to_json
+from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
+from skillweave.collecting.calls import Interruption, calls_to_json
 from skillweave.hierarchy.declaration import TOGETHER, Declaration, check_target
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.weights import check_parts
@@ -24,7 +24,7 @@ from skillweave.training.scene import (
     skill_scene,
     woven_scene,
 )
-from skillweave.training.stage import SELECTOR, Policies, Stage, target_of
+from skillweave.training.stage import CRITIC, SELECTOR, Policies, Stage, target_of
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, OneAgent, train_stages
 from skillweave.types import Policy
@@ -45,6 +45,7 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "skills": [_skill_entry(s) for s in declaration.skills],
         **calls_to_json(declaration.call_steps),
         "learn": declaration.learn,
+        "interrupt": declaration.together.margin if declaration.interrupt else None,
         "greedy_skills": declaration.greedy_skills,
         "reflexes_in_training": declaration.reflexes_in_training,
         "resume_needs_recipe": not declaration.trains_from_data,
@@ -64,6 +65,10 @@ def _together(declaration: Declaration) -> Stage:
     """The stage in which skills and selector learn from the same steps."""
     how, learns = declaration.together, [s for s in declaration.skills if s.policy is None]
 
+    beside: dict[str, AlgorithmConfig] = {
+        s.name: s.algorithm or declaration.algorithm for s in learns
+    }
+
     def scene(policies: Policies) -> WovenScene:
         acts: Any = [None if s in learns else policies[s.name] for s in declaration.skills]
         numbers = tuple(i for i, s in enumerate(declaration.skills) if s in learns)
@@ -72,10 +77,19 @@ def _together(declaration: Declaration) -> Stage:
     config: Any = declaration.selector
     if isinstance(config, PPO) and not config.floor:
         config = replace(config, floor=how.floor, floor_final=how.floor_final)
+    beside |= _critic(declaration) if how.task_weight or declaration.interrupt else {}
     target = target_of(declaration.selector_target_return, None, TOGETHER)
-    skills = {s.name: s.algorithm or declaration.algorithm for s in learns}
-    budget = declaration.together_steps
-    return Stage(TOGETHER, "together", config, budget, scene, target, skills, how)
+    budget, cuts = declaration.together_steps, declaration.interrupt
+    return Stage(TOGETHER, "together", config, budget, scene, target, beside, how, cuts)
+
+
+def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
+    """The critic of skills, which sees and discounts as the selector does."""
+    own: Any = declaration.selector
+    shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
+    if isinstance(own, PPO):
+        shared |= {f: getattr(own, f) for f in ("n_steps", "gae_lambda", "network", "overlap")}
+    return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}
 
 
 def _apart(declaration: Declaration) -> list[Stage]:
@@ -97,12 +111,18 @@ def _apart(declaration: Declaration) -> list[Stage]:
         skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
         return selector_scene(declaration.spec, skills)
 
+    def watched_calls(policies: Policies) -> WovenScene:
+        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
+        return woven_scene(declaration.spec, skills, ())
+
     config, budget = declaration.selector, declaration.selector_steps
     target = target_of(declaration.selector_target_return, None, SELECTOR)
-    return [
-        *(skill_stage(s) for s in declaration.skills if s.policy is None),
-        Stage(SELECTOR, "selector", config, budget, calls, target),
-    ]
+    first = [skill_stage(s) for s in declaration.skills if s.policy is None]
+    if not declaration.interrupt:
+        return [*first, Stage(SELECTOR, "selector", config, budget, calls, target)]
+    how, beside = declaration.together, _critic(declaration)
+    last = config, budget, watched_calls, target, beside, how, True
+    return [*first, Stage(SELECTOR, "selector", *last)]
 
 
 JUDGED = 1_000
@@ -180,6 +200,10 @@ def _learnt(run: RunDirectory) -> dict[str, Policy]:
 def _woven(declaration: Declaration, found: Mapping[str, Policy]) -> HierarchyPolicy:
     """The hierarchy of these policies."""
     skills = declaration.skill_set([found[s.name] for s in declaration.skills])
+    if declaration.interrupt:
+        critic: Any = found[CRITIC]
+        cuts = Interruption(critic.heads, declaration.together.margin)
+        skills = replace(skills, interruption=cuts)
     return HierarchyPolicy(found[SELECTOR], skills)
 
 

@@ -100,6 +100,8 @@ class StageEntry(TypedDict):
     """How skills and selector learn together."""
     algorithms: NotRequired[dict[Name, dict[str, Any]]]
     """Of the skills that learn together with the selector."""
+    interrupt: NotRequired[bool]
+    """The selector cuts calls."""
     kept: NotRequired[Kept]
     """Whether what was there before was better than what was learnt together."""
 
@@ -130,6 +132,8 @@ class HierarchyManifest(Manifest):
     skills: list[SkillEntry]
     call_steps: Positive | None
     call_lengths: NotRequired[list[Positive]]
+    interrupt: NotRequired[float | None]
+    """By how much another skill must be worth more for a call to be cut."""
     learn: NotRequired[Literal["apart", "together", "apart, then together"]]
     greedy_skills: bool
     reflexes: NotRequired[list[str]]

@@ -14,6 +14,7 @@ from skillweave.collecting.collector import Collector
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
+from skillweave.envs.engine import Engine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Reflex, Skill
 
@@ -99,17 +100,22 @@ class WovenScene(Scene):
     spec: EnvSpec = field(kw_only=True)
 
     def woven(
-        self, num_envs: int, acting: Acting, learners: Sequence[Acting], first: int = 0
+        self,
+        engine: Engine,
+        acting: Acting,
+        learners: Sequence[Acting],
+        critic: Acting | None = None,
+        margin: float | None = None,
     ) -> WovenCollector:
-        """A collector of ``num_envs`` environments.
+        """A collector of these environments.
 
         Args:
             acting: the selector.
             learners: the skills that learn, in their order.
+            critic, margin: as of ``WovenCollector``.
         """
-        engine = make_engine(self.spec, num_envs, first=first)
         by_number = dict(zip(self.learners, learners, strict=True))
-        return WovenCollector(engine, acting, self.skills, by_number)
+        return WovenCollector(engine, acting, self.skills, by_number, critic, margin)
 
 
 def woven_scene(spec: EnvSpec, skills: SkillSet, learners: tuple[int, ...]) -> WovenScene:

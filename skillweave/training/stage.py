@@ -19,6 +19,8 @@ from skillweave.types import Policy, SkillweaveError
 
 SELECTOR = "selector"
 """What the selector is named."""
+CRITIC = "skill_critic"
+"""What the critic of skills is named."""
 Policies = Mapping[str, Policy]
 """By name, everyone who can act already: ready skills, and who learnt in earlier stages."""
 
@@ -88,7 +90,10 @@ class Together:
     floor_final: float = 0.02
     """The same at the end of the budget, reached linearly."""
     task_weight: float = 0.0
-    """β: what the task's advantage counts beside a skill's own, for skills that learn by PPO."""
+    """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
+    for skills that learn by PPO."""
+    margin: float = 0.2
+    """A call is cut where another skill is worth so much more, in deviations of the return."""
     anchor_nats: float | None = 0.05
     """How far, in nats of KL, skills that were trained before may move; None: freely."""
     quota: float = 0.25
@@ -98,6 +103,7 @@ class Together:
         for name in ("floor", "floor_final", "quota"):
             number(self, name, high=1.0)
         number(self, "task_weight")
+        number(self, "margin")
         if self.anchor_nats is not None:
             positive(self, "anchor_nats")
 
@@ -116,10 +122,12 @@ class Stage:
     """Where it learns, given everyone who can act already."""
     target: Target | None = None
     """Where it may end early."""
-    skills: Mapping[str, AlgorithmConfig] = field(default_factory=dict)
-    """In a stage where all learn together: the skills that do, and their algorithms."""
+    beside: Mapping[str, AlgorithmConfig] = field(default_factory=dict)
+    """Who learns beside the selector from the same steps, and by which algorithm."""
     together: Together | None = None
-    """How they learn together."""
+    """How they learn together; None: one learns alone."""
+    interrupt: bool = False
+    """The selector cuts calls."""
 
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
@@ -127,7 +135,7 @@ class Stage:
         entry = {
             "name": self.name,
             "kind": self.kind,
-            "learns": [first, *self.skills],
+            "learns": [first, *self.beside],
             "decides": first if self.kind in ("selector", "together") else None,
             "budget": self.budget,
             "algorithm": config_to_json(self.config),
@@ -136,7 +144,8 @@ class Stage:
         }
         if self.together is not None:
             entry["together"] = asdict(self.together)
-            entry["algorithms"] = {k: config_to_json(v) for k, v in self.skills.items()}
+            entry["algorithms"] = {k: config_to_json(v) for k, v in self.beside.items()}
+            entry["interrupt"] = self.interrupt
         return entry
 
 

@@ -6,16 +6,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
+from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.engine import Engine
+from skillweave.envs.make import make_engine
 from skillweave.experience import Anchor, Experience
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
@@ -24,7 +29,7 @@ from skillweave.training.episodes import Tick
 from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
-from skillweave.training.stage import SELECTOR, Together
+from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.training.stage_log import StageLog
 from skillweave.training.trainer import OneAgent
 from skillweave.types import Array, prefixed, unprefixed
@@ -35,11 +40,11 @@ class WovenLearner:
 
     Args:
         parts: by name, the selector first, then the skills in their order.
-        nats: how far, in KL, skills with an anchor may move from it.
+        how: how much the task counts, and how far skills may move from their anchors.
     """
 
-    def __init__(self, parts: Mapping[str, Learner], nats: float = 0.0) -> None:
-        self.parts, self._nats = dict(parts), nats
+    def __init__(self, parts: Mapping[str, Learner], how: Together) -> None:
+        self.parts, self._how, self._weight = dict(parts), how, 0.0
         self.stacks: Sequence[Stack] = [s for part in parts.values() for s in part.stacks]
         self.overlap = all(part.overlap for part in parts.values())
         self.report_every = max(part.report_every for part in parts.values())
@@ -47,14 +52,29 @@ class WovenLearner:
 
     def request(self, update: int, steps: int, progress: float) -> Request:
         """As many rows as the selector's learner asks for, with the parameters of all."""
+        self._weight = self._how.task_weight * progress
         first, *others = (p.request(update, steps, progress) for p in self.parts.values())
         return replace(first, parts=tuple(others))
 
     def take(self, experience: Experience) -> None:
-        """Give each its own."""
+        """Give each its own rows, and skills the task's advantage in them, if it counts."""
+        if self._how.task_weight > 0.0:
+            advantage = self._weight * self._task_advantage(experience.parts[-1])
+            for rows in experience.parts[:-1]:
+                rows.advantage = advantage
         own = (replace(experience, parts=()), *experience.parts)
         for part, rows in zip(self.parts.values(), own, strict=True):
             part.take(rows)
+
+    def _task_advantage(self, rows: Experience) -> Array:
+        """What each step did for the task, (T, N) float32, with deviation 1."""
+        (stack,) = self.parts[CRITIC].stacks
+        store = RolloutStore(1, device=stack.state.params.device)
+        store.add(rows)
+        rollout = store.rollout(stack.state.gamma)
+        assert rollout is not None
+        found: Array = stack.algorithm.advantage(stack.state, rollout)[0].cpu().numpy()
+        return found / (found.std() + np.float32(1e-8))
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """Let those learn that have enough rows; metrics under ``<name>.``."""
@@ -62,7 +82,9 @@ class WovenLearner:
         for name, part in self.parts.items():
             metrics = part.learn(update, steps, progress)
             if isinstance(part, RolloutLearner) and part.anchor and "anchor_kl" in metrics:
-                part.anchor.coef = adapted(part.anchor.coef, metrics["anchor_kl"], self._nats)
+                part.anchor.coef = adapted(
+                    part.anchor.coef, metrics["anchor_kl"], self._how.anchor_nats
+                )
             found |= prefixed(name, metrics)
         return found
 
@@ -90,11 +112,12 @@ class WovenLearner:
             part.load(own)
 
 
-def adapted(coef: Tensor, kl: Tensor, nats: float) -> Tensor:
+def adapted(coef: Tensor, kl: Tensor, nats: float | None) -> Tensor:
     """What a nat of KL costs from now on, so that KL comes near ``nats``; (P,) each.
 
     The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
     """
+    nats = nats or 0.0
     factor = torch.where(kl > 1.5 * nats, 2.0, torch.where(kl < nats / 1.5, 0.5, 1.0))
     return (coef * factor).clamp(1e-3, 1e3)
 
@@ -111,10 +134,13 @@ class WovenAgents(OneAgent):
         told = self.stage.entry["algorithms"]
         self.configs: dict[str, AlgorithmConfig] = {SELECTOR: self.stage.config}
         self.configs |= {name: config_from_json(told[name]) for name in told}
-        seen = scene.observation_space
+        spaces = {
+            SELECTOR: scene.action_space,
+            CRITIC: gym.spaces.Discrete(len(scene.skills.skills)),
+        }
         self.algorithms: dict[str, Algorithm] = {
             name: make_algorithm(
-                config, seen, scene.action_space if name == SELECTOR else scene.skill_space
+                config, scene.observation_space, spaces.get(name, scene.skill_space)
             )
             for name, config in self.configs.items()
         }
@@ -127,8 +153,15 @@ class WovenAgents(OneAgent):
 
     def collector(self, num_envs: int, first: int) -> Collector:
         """A collector in which all act."""
-        selector, *skills = (Acting([(a, 1)], num_envs) for a in self.algorithms.values())
-        return self.scene.woven(num_envs, selector, skills, first)
+        return self.woven(make_engine(self.scene.spec, num_envs, first=first))
+
+    def woven(self, engine: Engine) -> WovenCollector:
+        """A collector of these environments in which all act."""
+        n = engine.num_envs
+        acting = {name: Acting([(a, 1)], n) for name, a in self.algorithms.items()}
+        selector, critic = acting.pop(SELECTOR), acting.pop(CRITIC, None)
+        margin = self.together.margin if self.stage.entry.get("interrupt") else None
+        return self.scene.woven(engine, selector, list(acting.values()), critic, margin)
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """All learners, from a checkpoint, from what they learnt in earlier stages, or fresh."""
@@ -143,13 +176,13 @@ class WovenAgents(OneAgent):
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
             stack = Stack(algorithm, state_to(fresh, resolve_device(algorithm.config.device)))
             part = self._part(name, stack, log)
-            near = self.together.anchor_nats is not None and name != SELECTOR
+            near = self.together.anchor_nats is not None and name not in (SELECTOR, CRITIC)
             if near and isinstance(before, AgentPolicy) and isinstance(part, RolloutLearner):
                 params = algorithm.acting_params_of(before.weights)
                 if not algorithm.memory_size:
                     part.anchor = Anchor(params, torch.ones(1))
             parts[name] = part
-        return WovenLearner(parts, self.together.anchor_nats or 0.0)
+        return WovenLearner(parts, self.together)
 
     def _part(self, name: str, stack: Stack, log: StageLog) -> Learner:
         """The learner of the selector, or of a skill."""
@@ -157,7 +190,8 @@ class WovenAgents(OneAgent):
         config = stack.algorithm.config
         if stack.algorithm.store == "rollout":
             rows = num_envs * int(getattr(self.stage.config, "n_steps", config.n_steps))
-            quota = 0 if name == SELECTOR else max(1, round(rows * self.together.quota))
+            whole = name in (SELECTOR, CRITIC)
+            quota = 0 if whole else max(1, round(rows * self.together.quota))
             return RolloutLearner(stack, seeds, quota)
         row_steps = self.scene.row_steps if name == SELECTOR else 1
         store = store_of(stack.algorithm, num_envs)
@@ -175,10 +209,7 @@ class WovenAgents(OneAgent):
 
     def play(self, arena: Collector, seeds: Seeds) -> Array:
         """An episode in each environment of an arena, (N, 4), by the hierarchy as it is now."""
-        acting = [Acting([(a, 1)], arena.num_envs) for a in self.algorithms.values()]
-        scene = self.scene
-        numbers = dict(zip(scene.learners, acting[1:], strict=True))
-        player = WovenCollector(arena.engine, acting[0], scene.skills, numbers)
+        player = self.woven(arena.engine)
         requests = [
             Request(
                 0, (s.algorithm.acting_params(s.state),), s.state.gamma.cpu().numpy(),

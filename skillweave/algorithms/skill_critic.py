@@ -1,0 +1,136 @@
+"""What each skill's call is worth to the task: Q(s, skill), learnt from every step.
+
+One critic serves the skills, which may count the task's advantage beside their own (Zhang &
+Whiteson 2019, "DAC"), and interruption, which asks whether another skill is worth more (Sutton,
+Precup & Singh 1999, sec. 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
+from skillweave.algorithms.config import SkillCritic
+from skillweave.algorithms.parameters import ParameterGroup
+from skillweave.algorithms.rollouts import rows_where, without_gaps
+from skillweave.experience import Report, Rollout
+from skillweave.networks.net import Net
+from skillweave.networks.stacked import Layout, take_rows
+from skillweave.ops.losses import value_loss
+from skillweave.ops.moments import explained_variance
+from skillweave.ops.optim import adam_, clip_grad_norm_
+from skillweave.ops.returns import gae
+from skillweave.seeding import Seeds
+
+
+class SkillCriticAlgorithm(Algorithm):
+    """Learns the return of the task, while a skill is called and then whoever follows.
+
+    Rows are steps of all skills, in the order of time; an action is the skill that acted.
+    """
+
+    store = "rollout"
+    action_spaces = (gym.spaces.Discrete,)
+
+    def __init__(
+        self,
+        config: SkillCritic,
+        observation_space: gym.Space[Any],
+        action_space: gym.spaces.Discrete,
+    ) -> None:
+        super().__init__(config, observation_space, action_space)
+        self.net = Net("critic", self.obs, config.network, int(action_space.n))
+        self.acting = self.layout = Layout(self.net.shapes)
+
+    def fresh_state(self, seeds: Sequence[Seeds]) -> AgentState:
+        """A state of fresh members, to which all skills are worth about the same."""
+        params = torch.zeros(len(seeds), self.layout.size)
+        self.net.init_(self.layout.views(params), 0.01, self.member_generators(seeds))
+        return AgentState(**self.fresh_fields(params))
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """Everything in the state that has the shape of the network."""
+        return [ParameterGroup(self.layout, (("network", self.net),))]
+
+    def act(
+        self,
+        params: ActingParams,
+        obs: Tensor,
+        mask: Tensor | None,
+        noise: Any,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, None]:
+        """The skill that is worth most, and what each is worth in deviations of the return."""
+        worth = self.net(params.views, self.inputs(params, obs))
+        return worth.argmax(-1), worth, None
+
+    def value(self, state: AgentState, obs: Tensor, mask: Tensor | None = None) -> Tensor:
+        """What the best skill is worth, (P, B), in units of reward."""
+        params = self.learning_params(state)
+        worth = self.net(params.views, self.inputs(params, obs)).amax(-1)
+        return worth * _scale(state) + state.return_mean
+
+    def advantage(self, state: AgentState, rollout: Rollout) -> Tensor:
+        """GAE(λ) of the task's reward, (P, T, B), in deviations of the return."""
+        found, _ = self._judged(state, rollout)
+        return found / _scale(state)[..., None]
+
+    def update(
+        self, state: AgentState, batch: Rollout, rng: Sequence[torch.Generator]
+    ) -> tuple[AgentState, Report]:
+        """Learn λ-returns of the skills that acted, in place; ``rng`` orders the minibatches."""
+        rollout, cfg = without_gaps(batch), self.config
+        self.update_obs_stats(state, rollout.obs.flatten(1, 2))
+        advantage, value = self._judged(state, rollout)
+        returns = (advantage + value).flatten(1)
+        self.update_return_stats(state, returns)
+        target = (returns - state.return_mean) / _scale(state)
+        leaves = self.layout.leaves(state.params)
+        inputs = self.inputs(self.learning_params(state), rollout.obs.flatten(1, 2))
+        action, size = rollout.action.flatten(1), target.shape[1]
+        rate, loss = state.learning_rate * (1.0 - batch.progress), target.new_zeros(len(target))
+        parts = max(1, round(size / cfg.batch_size))
+        for _ in range(cfg.update_epochs):
+            order = torch.stack([torch.randperm(size, generator=g) for g in rng]).to(target.device)
+            for rows in order.chunk(parts, dim=1):
+                own = {k: take_rows(v, rows) for k, v in inputs.items()}
+                worth = self.net(leaves, own).gather(2, take_rows(action, rows)[..., None])
+                loss = value_loss(worth.squeeze(-1), take_rows(target, rows))
+                grad = self.layout.gradient(loss, leaves)
+                clip_grad_norm_(grad, torch.full_like(rate, cfg.max_grad_norm))
+                adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=cfg.adam_eps)
+        explained = explained_variance(value.flatten(1), returns)
+        return state, Report({"value_loss": loss.detach(), "explained_variance": explained})
+
+    @torch.no_grad()
+    def _judged(self, state: AgentState, rollout: Rollout) -> tuple[Tensor, Tensor]:
+        """Advantage and Q(s, the skill that acted), (P, T, B) each, in units of reward.
+
+        What follows a step is worth Q of whoever acts next; at ends, of who acted.
+        """
+        params, action = self.learning_params(state), rollout.action
+        scale, mean = _scale(state)[..., None], state.return_mean[..., None]
+        raw = self.net(params.views, self.inputs(params, rollout.obs.flatten(1, 2)))
+        own = raw.gather(2, action.flatten(1)[..., None]).view_as(rollout.reward)
+        value = own * scale + mean
+        following = torch.zeros_like(value)
+        following[:, :-1] = value[:, 1:]
+        rows = rows_where(rollout.last.flatten(1))
+        ends = self.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
+        chosen = take_rows(action.flatten(1), rows)[..., None]
+        worth = self.net(params.views, ends).gather(2, chosen).squeeze(-1)
+        worth = worth * scale.squeeze(-1) + mean.squeeze(-1)
+        following = following.flatten(1).scatter(1, rows, worth).view_as(value)
+        decay = torch.full_like(state.gamma, self.config.gae_lambda)
+        found = gae(rollout.reward, rollout.discount, value, following, rollout.last, decay)
+        return found, value
+
+
+def _scale(state: AgentState) -> Tensor:
+    """The running deviation of returns, (P, 1)."""
+    return (state.return_var + 1e-8).sqrt()
