@@ -62,6 +62,11 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         config = getattr(target, field) or declaration.algorithm
         if owner in kinds:
             config = named_config(kinds[owner], f"--set {'.'.join(owner)}={kinds[owner]}")
+        if not is_dataclass(config):
+            raise SkillweaveError(
+                f"{next(iter(changes))}: the selector is ready, so it has no settings; with "
+                "--set selector=PPO it is trained"
+            )
         setattr(target, field, replaced(config, by_path))
     declaration.__post_init__()
 
@@ -74,7 +79,8 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
             found[f"skills.{skill.name}.steps"] = declaration.budget(skill)
             config = skill.algorithm or declaration.algorithm
             found |= _flatten(f"skills.{skill.name}.", config)
-    return found | _flatten("selector.", declaration.selector)
+    trained = declaration.ready_selector is None
+    return found | (_flatten("selector.", declaration.selector) if trained else {})
 
 
 def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:

@@ -182,6 +182,26 @@ class SkillSet:
                 why[mine[stops]] = Why.OWN
         return why
 
+    def succeeded(self, memory: Memory, rows: Array, step: Step, why: Array) -> Array:
+        """(k,) bool: the calls of environments ``rows`` (k,) that are over and have succeeded.
+
+        The skill's ``success`` says so; of a skill without one, a call has that it ended by itself.
+
+        Args:
+            step: the one that ``observe`` was shown.
+            why: what ``observe`` said of it, or that the episode is over.
+        """
+        found: Array = why == Why.OWN
+        elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
+        for i, skill in enumerate(self.skills):
+            if not skill.defines("success"):
+                continue
+            over = np.flatnonzero((running == i) & (why != Why.RUNNING))
+            if len(over):
+                part = _rows(step, over, elapsed[over], skill.max_steps)
+                found[over] = asked(skill, "success", part, len(over), elapsed[over], rows[over])
+        return found
+
     def _own(self, memory: Memory, i: int, rows: Array) -> Memory:
         prefix = f"{i}."
         return {k[len(prefix) :]: v[rows] for k, v in memory.items() if k.startswith(prefix)}

@@ -12,6 +12,8 @@ from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
 from skillweave.collecting.calls import SkillSet
 from skillweave.envs.make import EnvSpec
 from skillweave.messages import short
+from skillweave.selectors import ReadySelector, ready_selector
+from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.foreign_policy import fitted
 from skillweave.spaces import action_codec, obs_codec
@@ -48,12 +50,13 @@ class Declaration:
     """Rules that override the running skill's action."""
     algorithm: AlgorithmConfig = field(default_factory=PPO)
     """Trains every skill that names none of its own."""
-    selector: AlgorithmConfig = field(default_factory=PPO)
-    """Trains the selector; its γ is that of one environment step, and so its n_steps."""
+    selector: AlgorithmConfig | ReadyValue = field(default_factory=PPO)
+    """Trains the selector; its γ is that of one environment step, and so its n_steps. Or a ready
+    selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
     skill_steps: int = 500_000
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000
-    """Training budget of the selector, in environment steps."""
+    """Training budget of the selector, in environment steps; a ready one takes none."""
     selector_target_return: float | None = None
     """The selector's stage ends early at this mean return of the periodic evaluation."""
     flat: AlgorithmConfig | None = None
@@ -85,8 +88,9 @@ class Declaration:
                     f"reflexes holds {short(reflex)}, which is not a Reflex: Reflex(condition, "
                     "action)"
                 )
-        for name in ("algorithm", "selector", "flat"):
+        for name in ("algorithm", "flat"):
             check_algorithm(getattr(self, name), name, optional=name == "flat")
+        self._check_selector()
         target_of(self.selector_target_return, None, "selector")
         check_fields(self)
         if self.call_steps is None:
@@ -97,6 +101,14 @@ class Declaration:
                         f"call_steps is None, but skill {skill.name!r} never stops by itself: give "
                         "it max_steps or termination()"
                     )
+
+    def _check_selector(self) -> None:
+        if self.ready_selector is None:
+            check_algorithm(self.selector, "selector", also="function, Automaton or tree")
+        elif self.selector_target_return is not None:
+            raise SkillweaveError(
+                "selector_target_return is given, but the selector is ready: it is not trained"
+            )
 
     def _check_skills(self) -> None:
         if isinstance(self.skills, str) or not isinstance(self.skills, Sequence):
@@ -130,7 +142,7 @@ class Declaration:
     def is_data(self) -> bool:
         """Whether acting needs none of the user's Python code, so a saved run says it all."""
         code = any(s.defines("termination") or s.defines("initiation") for s in self.skills)
-        ready = any(s.policy is not None for s in self.skills)
+        ready = any(s.policy is not None for s in self.skills) or self.ready_selector is not None
         return not code and not ready and not self.reflexes and self.spec.is_data
 
     @property
@@ -155,7 +167,8 @@ class Declaration:
     @property
     def total_steps(self) -> int:
         """All training steps of skills and selector: the flat baseline's budget."""
-        return sum(self.budget(s) for s in self.skills) + self.selector_steps
+        selector = self.selector_steps if self.ready_selector is None else 0
+        return sum(self.budget(s) for s in self.skills) + selector
 
     def scale(self, factor: float) -> None:
         """Multiply every training budget, in place."""
@@ -171,6 +184,11 @@ class Declaration:
 
     def plain_agent(self) -> PlainAgent:
         """The flat baseline: one agent on the task itself, without skills and reflexes."""
+        if not (self.flat_steps or self.total_steps):
+            raise SkillweaveError(
+                "nothing of this hierarchy is trained, so the flat baseline has no budget: give "
+                "flat_steps"
+            )
         return PlainAgent(
             self.env,
             self.flat or self.algorithm,
@@ -205,10 +223,12 @@ class Declaration:
             self._check_algorithms(env.action_space)
             own = (s.algorithm for s in self.skills)
             for config in (self.algorithm, self.selector, self.flat, *own):
-                check_rollout(config, env.observation_space)
+                if isinstance(config, AlgorithmConfig):
+                    check_rollout(config, env.observation_space)
             for reflex in self.reflexes:
                 reflex.check(env.action_space)
             self._fitted(env)
+            self.fitted_selector(env.observation_space)
             return env.observation_space, env.action_space
         finally:
             env.close()
@@ -219,9 +239,22 @@ class Declaration:
             if skill.policy is None:
                 config = skill.algorithm or self.algorithm
                 check_spaces(config, space, f"skill {skill.name!r}: ")
-        check_spaces(self.selector, gym.spaces.Discrete(len(self.skills)), "selector: ")
+        if isinstance(self.selector, AlgorithmConfig):
+            check_spaces(self.selector, gym.spaces.Discrete(len(self.skills)), "selector: ")
         if self.flat is not None:
             check_spaces(self.flat, space, "flat: ")
+
+    @property
+    def ready_selector(self) -> ReadySelector | None:
+        """The selector that is not trained; None: it is."""
+        return ready_selector(self.selector, tuple(s.name for s in self.skills))
+
+    def fitted_selector(self, observation_space: gym.Space[Any]) -> Policy | None:
+        """The selector that is not trained, on these observations; None: it is trained."""
+        if (found := self.ready_selector) is None:
+            return None
+        choices = gym.spaces.Discrete(len(self.skills))
+        return fitted(found, observation_space, choices, "selector", self.spec.name)
 
     def ready_policies(self) -> dict[str, Policy]:
         """By skill, the policies that are not trained, on the environment's spaces."""

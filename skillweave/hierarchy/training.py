@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.hierarchy.declaration import Declaration, check_target
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
-from skillweave.skills.foreign_policy import source_of
+from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.training.scene import Scene, selector_scene, skill_scene
 from skillweave.training.stage import Policies, Stage, target_of
@@ -41,12 +42,13 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "resume_needs_recipe": not declaration.trains_from_data,
         "reflexes": [r.name for r in declaration.reflexes],
         "needs_recipe": not declaration.is_data,
+        **_selector_entry(declaration),
         "stages": [stage.entry() for stage in stages_of(declaration)],
     }
 
 
 def stages_of(declaration: Declaration) -> list[Stage]:
-    """The skills that are to be trained, each apart, then the selector."""
+    """The skills that are to be trained, each apart, then the selector if it is not ready."""
     reflexes = declaration.reflexes if declaration.reflexes_in_training else ()
 
     def skill_stage(skill: Skill) -> Stage:
@@ -64,12 +66,12 @@ def stages_of(declaration: Declaration) -> list[Stage]:
         skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
         return selector_scene(declaration.spec, skills)
 
-    config, budget = declaration.selector, declaration.selector_steps
-    target = target_of(declaration.selector_target_return, None, SELECTOR)
-    return [
-        *(skill_stage(s) for s in declaration.skills if s.policy is None),
-        Stage(SELECTOR, "selector", config, budget, calls, target),
-    ]
+    stages = [skill_stage(s) for s in declaration.skills if s.policy is None]
+    if isinstance(config := declaration.selector, AlgorithmConfig):
+        target = target_of(declaration.selector_target_return, None, SELECTOR)
+        budget = declaration.selector_steps
+        stages.append(Stage(SELECTOR, "selector", config, budget, calls, target))
+    return stages
 
 
 @torch_threads(1)  # a loop sets its own; all else must not depend on how many there are
@@ -90,7 +92,8 @@ def train(
         run.keep_policy(name, policy)
     found = train_stages(stages_of(declaration), run, listeners, ready, make_learner)
     skills = declaration.skill_set([found[s.name] for s in declaration.skills])
-    return HierarchyPolicy(found[SELECTOR], skills)
+    selector = _ready_selector(declaration, run, skills.policies[0]) or found[SELECTOR]
+    return HierarchyPolicy(selector, skills)
 
 
 def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
@@ -101,7 +104,7 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     ready = _ready(declaration, run)
     names = [s.name for s in declaration.skills]
     policies = [ready[n] if n in ready else run.load_policy(n) for n in names]
-    selector = run.load_policy(SELECTOR)
+    selector = _ready_selector(declaration, run, policies[0]) or run.load_policy(SELECTOR)
     check_parts(declaration, policies, selector, str(run.path))
     return HierarchyPolicy(selector, declaration.skill_set(policies))
 
@@ -110,6 +113,22 @@ def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
     """The ready policies as they were when the run began."""
     ready = declaration.ready_policies()
     return {name: run.ready_policy(name, policy) for name, policy in ready.items()}
+
+
+def _ready_selector(declaration: Declaration, run: RunDirectory, skill: Policy) -> Policy | None:
+    """The selector where it is ready, after a check that it is that of the run."""
+    selector = declaration.fitted_selector(skill.observation_space)
+    if selector is None:
+        return None
+    return as_recorded(
+        selector, run.manifest.get(SELECTOR), lambda: None, f"{run.path}: the selector"
+    )
+
+
+def _selector_entry(declaration: Declaration) -> dict[str, Any]:
+    """Where a ready selector comes from; nothing where it is trained."""
+    selector = declaration.ready_selector
+    return {} if selector is None else {SELECTOR: source_of(selector)}
 
 
 def _skill_entry(skill: Skill) -> dict[str, Any]:

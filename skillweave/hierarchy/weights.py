@@ -19,6 +19,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
 from skillweave.reading import Positive, fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.selectors import ReadySelector
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT, PlainAgent
@@ -36,8 +37,12 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
     assert isinstance(declaration, Declaration)
     tensors: dict[str, Tensor] = {}
     parts: dict[str, Any] = {}
-    named: list[tuple[str, Policy]] = [("selector", policy.selector)]
+    named: list[tuple[str, Policy]] = []
     ready: dict[str, Any] = {}
+    if isinstance(policy.selector, ReadySelector):
+        ready["selector"] = source_of(policy.selector)
+    else:
+        named.append(("selector", policy.selector))
     for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
         if skill.policy is None:
             named.append((skill.name, own))
@@ -74,6 +79,7 @@ class HierarchyHeader(TypedDict):
     greedy_skills: bool
     parts: dict[str, dict[str, Any]]
     ready: NotRequired[dict[str, Source]]
+    """Of skills by name, and of "selector"."""
 
 
 def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -151,11 +157,27 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
             policies.append(as_recorded(ready[name], recorded.get(name), read, where))
         else:
             policies.append(part(name))
-    selector = part("selector")
+    selector = declaration.fitted_selector(policies[0].observation_space)
+    check_selector(selector is not None, "selector" in recorded, str(path))
+    if selector is None:
+        selector = part("selector")
+    else:
+        place = f"{path}: the selector"
+        selector = as_recorded(selector, recorded["selector"], lambda: None, place)
     check_parts(declaration, policies, selector, str(path))
     declaration.call_steps = header["call_steps"]
     declaration.greedy_skills = header["greedy_skills"]
     return HierarchyPolicy(selector, declaration.skill_set(policies))
+
+
+def check_selector(mine: bool, theirs: bool, where: str) -> None:
+    """Raise a SkillweaveError where of two selectors one is ready and the other is trained."""
+    if mine != theirs:
+        kinds = ("a trained selector", "a ready one (a function, an automaton or a tree)")
+        raise SkillweaveError(
+            f"{where} has {kinds[theirs]}, but this hierarchy has {kinds[mine]}: declare the "
+            "selector as it was, or train anew"
+        )
 
 
 def check_parts(

@@ -114,6 +114,8 @@ class HierarchyManifest(Manifest):
     skills: list[SkillEntry]
     call_steps: Positive | None
     greedy_skills: bool
+    selector: NotRequired[Source]
+    """Of a ready selector; absent where it is trained."""
     reflexes: NotRequired[list[str]]
     reflexes_in_training: NotRequired[bool]
 
