@@ -138,7 +138,6 @@ class _Leaf:
         fresh = ~over
         starts = tick.mask[rows, self.skill]
         status[fresh] = np.where(starts[fresh], Status.RUNNING, Status.FAILURE)
-        tick.leaf[rows[over]] = -1
         begins = rows[fresh & starts]
         tick.leaf[begins], tick.skill[begins] = self.number, self.skill
         return status
