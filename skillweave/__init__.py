@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from skillweave.hierarchy.options import OptionsEnv
     from skillweave.networks.config import CNN, RNN, Network
     from skillweave.networks.encoders import Encoder, register_encoder
+    from skillweave.selectors import Automaton, LastCall, tree
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
     from skillweave.training.evaluation import Evaluation, evaluate
     from skillweave.training.stage import Together
@@ -30,6 +31,7 @@ _HOME = {
     "Algorithm": "algorithms.base",
     "Agent": "api",
     "Array": "types",
+    "Automaton": "selectors",
     "CNN": "networks.config",
     "DQN": "algorithms.config",
     "Encoder": "networks.encoders",
@@ -40,6 +42,7 @@ _HOME = {
     "Hierarchy": "api",
     "Lengths": "collecting.calls",
     "Mutations": "evolution.config",
+    "LastCall": "selectors",
     "Network": "networks.config",
     "OptionsEnv": "hierarchy.options",
     "PPO": "algorithms.config",
@@ -67,6 +70,7 @@ _HOME = {
     "register_algorithm": "algorithms.registry",
     "register_encoder": "networks.encoders",
     "train_agent": "api",
+    "tree": "selectors",
 }
 
 __all__ = [
@@ -80,12 +84,14 @@ __all__ = [
     "Agent",
     "Algorithm",
     "Array",
+    "Automaton",
     "Encoder",
     "EnvSpec",
     "Evaluation",
     "Evolution",
     "Heir",
     "Hierarchy",
+    "LastCall",
     "Lengths",
     "Mutations",
     "Network",
@@ -111,6 +117,7 @@ __all__ = [
     "register_algorithm",
     "register_encoder",
     "train_agent",
+    "tree",
 ]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 4
+COUNT = 5
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
     "foreign_skills.py": ("--steps", "3000"),
@@ -26,6 +26,7 @@ NEEDS = {
 SAYS = {
     "foreign_skills.py": "woven by the selector: ",
     "own_algorithm.py": "mean return: ",
+    "ready_selectors.py": "automaton  return 1.00",
     "sb3_selector.py": "woven by the selector: ",
     "tutorial.py": "the hierarchy: ",
 }

@@ -22,7 +22,7 @@ LONGEST_FILE, LONGEST_FUNCTION = 300, 60
 # The table of docs/architecture.md: what a room may import. `seeding` is open to all.
 BASE = {"types", "messages", "reading", "experience", "shapes"}
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
-LEARNING |= {"collecting"}
+LEARNING |= {"collecting", "selectors"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "recipes", "api"}
 ROOMS: dict[str, set[str]] = {
     "seeding": set(),
@@ -39,6 +39,7 @@ ROOMS: dict[str, set[str]] = {
     "buffers": BASE | {"ops", "spaces", "experience"},
     "algorithms": BASE | {"ops", "spaces", "networks"},
     "collecting": BASE | {"spaces", "skills", "envs", "algorithms"},
+    "selectors": BASE | {"spaces", "skills", "collecting"},
     "runs": BASE | {"algorithms", "skills"},
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},

@@ -19,7 +19,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
+from skillweave.hierarchy.weights import check_selector, open_weights, read_agent, read_weights
 from skillweave.messages import short, whole_number
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
@@ -99,7 +99,7 @@ class Hierarchy(Declaration):
         track: Sequence[str] = (),
         evolve: Evolve = None,
     ) -> Run:
-        """Train every skill, then the selector; everything goes to ``run_dir``.
+        """Train every skill, then the selector if it is not ready; all goes to ``run_dir``.
 
         Args:
             run_dir: a new directory; an existing run is never overwritten.
@@ -277,6 +277,8 @@ def _check_run(declared: Hierarchy | Agent, run: RunDirectory) -> None:
                 f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
                 f"has {', '.join(mine)}"
             )
+        ready = declared.ready_selector is not None
+        check_selector(ready, "selector" in run.manifest, str(run.path))
     if run.manifest["env"] != declared.spec.name:
         what = "agent" if isinstance(declared, Agent) else "hierarchy"
         raise SkillweaveError(

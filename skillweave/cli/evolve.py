@@ -9,7 +9,7 @@ from typing import Any
 from skillweave.cli.overrides import replaced
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.training import stages_of
+from skillweave.hierarchy.schedule import stages_of
 from skillweave.types import SkillweaveError
 
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}

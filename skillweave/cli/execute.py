@@ -134,6 +134,7 @@ def _info(command: commands.Info) -> None:
     m = found.manifest
     lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
     calls = f", call_steps {m['call_steps']}" if m["kind"] == "hierarchy" else ""
+    calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
     lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}{calls}"]
     lines += [
         f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"

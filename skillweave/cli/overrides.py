@@ -11,13 +11,17 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from skillweave.algorithms.config import named_config
+from skillweave.collecting.calls import Lengths
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.types import SkillweaveError
 
 PLAIN = tuple(
-    f.name for f in fields(Declaration) if f.type in ("int", "int | None", "float | None", "bool")
+    f.name
+    for f in fields(Declaration)
+    if f.type in ("int", "int | None", "float", "float | None", "bool")
+    or f.name in ("call_steps", "learn")
 )
-CONFIGS = ("algorithm", "selector", "flat")
+CONFIGS = ("algorithm", "selector", "flat", "together")
 
 
 def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
@@ -62,6 +66,11 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         config = getattr(target, field) or declaration.algorithm
         if owner in kinds:
             config = named_config(kinds[owner], f"--set {'.'.join(owner)}={kinds[owner]}")
+        if not is_dataclass(config):
+            raise SkillweaveError(
+                f"{next(iter(changes))}: the selector is ready, so it has no settings; with "
+                "--set selector=PPO it is trained"
+            )
         setattr(target, field, replaced(config, by_path))
     declaration.__post_init__()
 
@@ -74,7 +83,8 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
             found[f"skills.{skill.name}.steps"] = declaration.budget(skill)
             config = skill.algorithm or declaration.algorithm
             found |= _flatten(f"skills.{skill.name}.", config)
-    return found | _flatten("selector.", declaration.selector)
+    trained = declaration.ready_selector is None
+    return found | (_flatten("selector.", declaration.selector) if trained else {})
 
 
 def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
@@ -124,6 +134,8 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return int(value)
         if option is float and whole:
             return float(value)
+        if option is Lengths and isinstance(value, tuple | list):
+            return Lengths(*value)
         if origin is tuple and isinstance(value, tuple | list | int):
             return tuple(value) if isinstance(value, tuple | list) else (value,)
         if origin is typing.Literal and value in typing.get_args(option):

@@ -111,6 +111,8 @@ class Interruption:
     """
     margin: float
     """By how much another skill must be worth more, in the same unit."""
+    critic: Policy | None = None
+    """Who says what skills are worth, where it is trained."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,8 @@ class SkillSet:
     greedy: bool = True
     """Skills act greedily; else they sample."""
 
+    call_cost: float = 0.0
+    """What a selector that learns pays for each call, in units of reward."""
     interruption: Interruption | None = None
     """When the selector cuts a call; None: never."""
 
@@ -308,6 +312,26 @@ class SkillSet:
         best = np.where(may, worth, -np.inf).max(axis=1)
         own = worth[np.arange(len(rows)), running[rows]]
         why[rows[best - own > how.margin]] = Why.INTERRUPTED
+
+    def succeeded(self, memory: Memory, rows: Array, step: Step, why: Array) -> Array:
+        """(k,) bool: the calls of environments ``rows`` (k,) that are over and have succeeded.
+
+        The skill's ``success`` says so; of a skill without one, a call has that it ended by itself.
+
+        Args:
+            step: the one that ``observe`` was shown.
+            why: what ``observe`` said of it, or that the episode is over.
+        """
+        found: Array = why == Why.OWN
+        elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
+        for i, skill in enumerate(self.skills):
+            if not skill.defines("success"):
+                continue
+            over = np.flatnonzero((running == i) & (why != Why.RUNNING))
+            if len(over):
+                part = rows_of(step, over, elapsed[over], skill.max_steps)
+                found[over] = asked(skill, "success", part, len(over), elapsed[over], rows[over])
+        return found
 
     def _own(self, memory: Memory, i: int, rows: Array) -> Memory:
         prefix = f"{i}."

@@ -189,7 +189,7 @@ class Decisions:
         values = {
             "obs": opened["obs"][ids],
             "action": kept["choice"][ids],
-            "reward": kept["reward"][ids].astype(np.float32),
+            "reward": (kept["reward"][ids] - collector.skills.call_cost).astype(np.float32),
             "steps": kept["tau"][ids],
             "terminated": raw.terminated[ids],
             "truncated": raw.truncated[ids],

@@ -11,7 +11,10 @@ import gymnasium as gym
 from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
 from skillweave.collecting.calls import Lengths, SkillSet
 from skillweave.envs.make import EnvSpec
+from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
 from skillweave.messages import short
+from skillweave.selectors import ReadySelector, ready_selector
+from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.foreign_policy import fitted
 from skillweave.spaces import action_codec, obs_codec
@@ -23,7 +26,7 @@ from skillweave.training.plain_agent import (
     check_fields,
     check_rollout,
 )
-from skillweave.training.stage import CRITIC, SELECTOR, Target, Together, target_of
+from skillweave.training.stage import CRITIC, SELECTOR, Together, target_of
 from skillweave.types import Policy, SkillweaveError
 
 TOGETHER = "together"
@@ -53,14 +56,18 @@ class Declaration:
     """Rules that override the running skill's action."""
     algorithm: AlgorithmConfig = field(default_factory=PPO)
     """Trains every skill that names none of its own."""
-    selector: AlgorithmConfig = field(default_factory=PPO)
-    """Trains the selector; its γ is that of one environment step, and so its n_steps."""
+    selector: AlgorithmConfig | ReadyValue = field(default_factory=PPO)
+    """Trains the selector; its γ is that of one environment step, and so its n_steps. Or a ready
+    selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
     skill_steps: int = 500_000
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000
-    """Training budget of the selector, in environment steps."""
+    """Training budget of the selector, in environment steps; a ready one takes none."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
+    call_cost: float = 0.0
+    """What the selector pays for each decision while it learns, in units of reward: a deliberation
+    cost, so that calls which change nothing are not worth as much as others."""
     interrupt: bool = False
     """The selector cuts a call where another skill is clearly worth more (``Together.margin``)."""
     together: Together = field(default_factory=Together)
@@ -84,72 +91,35 @@ class Declaration:
 
     def __post_init__(self) -> None:
         check_env(self.env)
-        self._check_skills()
-        if isinstance(self.reflexes, str) or not isinstance(self.reflexes, Sequence):
-            raise SkillweaveError(
-                f"reflexes is {short(self.reflexes)}; it must be a list: reflexes=[Reflex(...)]"
-            )
-        self.reflexes = tuple(self.reflexes)
-        for reflex in self.reflexes:
-            if not isinstance(reflex, Reflex):
-                raise SkillweaveError(
-                    f"reflexes holds {short(reflex)}, which is not a Reflex: Reflex(condition, "
-                    "action)"
-                )
-        for name in ("algorithm", "selector", "flat"):
+        self.skills = checked_skills(self.skills, RESERVED)
+        self.reflexes = checked_reflexes(self.reflexes)
+        for name in ("algorithm", "flat"):
             check_algorithm(getattr(self, name), name, optional=name == "flat")
+        self._check_selector()
         target_of(self.selector_target_return, None, "selector")
-        if self.learn not in WAYS:
-            raise SkillweaveError(
-                f"learn is {short(self.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
-            )
+        check_fields(self)
+        check_calls(self.call_steps, self.skills)
         if not isinstance(self.together, Together):
             raise SkillweaveError(
                 f"together is {short(self.together)}; write together=Together(floor=0.3)"
             )
-        check_fields(self)
-        self._check_call_steps()
 
-    def _check_call_steps(self) -> None:
-        if isinstance(self.call_steps, Lengths):
-            return
-        value: object = self.call_steps
-        if value is not None and (type(value) is not int or value < 1):
+    def _check_selector(self) -> None:
+        if self.learn not in WAYS:
             raise SkillweaveError(
-                f"call_steps is {short(value)}; it must be at least 1, Lengths(1, ..., 128), or "
-                "None"
+                f"learn is {short(self.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
             )
-        if self.call_steps is None:
-            for skill in self.skills:
-                ends = skill.max_steps or skill.call_steps or skill.defines("termination")
-                if not ends:
-                    raise SkillweaveError(
-                        f"call_steps is None, but skill {skill.name!r} never stops by itself: give "
-                        "it max_steps or termination()"
-                    )
-
-    def _check_skills(self) -> None:
-        if isinstance(self.skills, str) or not isinstance(self.skills, Sequence):
-            raise SkillweaveError("skills must be a list of skills: skills=[Center(), ...]")
-        self.skills = tuple(self.skills)
-        if not self.skills:
-            raise SkillweaveError("a hierarchy needs at least one skill: skills is empty")
-        for skill in self.skills:
-            if not isinstance(skill, Skill):
-                hint = " (write Center(), not Center)" if isinstance(skill, type) else ""
-                raise SkillweaveError(f"skills holds {short(skill)}, which is not a Skill{hint}")
-            skill.validate()
-            check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
-            check_target(skill)
-            ready_policy(skill)  # says so where it cannot act
-        names = [s.name for s in self.skills]
-        for name in names:
-            if names.count(name) > 1:
-                raise SkillweaveError(
-                    f"two skills are named {name!r}; give one another name: class attribute 'name'"
-                )
-            if name in RESERVED:
-                raise SkillweaveError(f"a skill cannot be named {name!r}, which names a stage")
+        if self.ready_selector is None:
+            check_algorithm(self.selector, "selector", also="function, Automaton or tree")
+            return
+        needs = {
+            "selector_target_return is given": self.selector_target_return is not None,
+            f"learn is {self.learn!r}": self.learn != "apart",
+            "interrupt is True": self.interrupt,
+        }
+        for what, asked in needs.items():
+            if asked:
+                raise SkillweaveError(f"{what}, but the selector is ready: it is not trained")
 
     @property
     def spec(self) -> EnvSpec:
@@ -160,7 +130,7 @@ class Declaration:
     def is_data(self) -> bool:
         """Whether acting needs none of the user's Python code, so a saved run says it all."""
         code = any(s.defines("termination") or s.defines("initiation") for s in self.skills)
-        ready = any(s.policy is not None for s in self.skills)
+        ready = any(s.policy is not None for s in self.skills) or self.ready_selector is not None
         return not code and not ready and not self.reflexes and self.spec.is_data
 
     @property
@@ -191,7 +161,8 @@ class Declaration:
     @property
     def total_steps(self) -> int:
         """All training steps of skills and selector: the flat baseline's budget."""
-        apart = sum(self.budget(s) for s in self.skills) + self.selector_steps
+        selector = self.selector_steps if self.ready_selector is None else 0
+        apart = sum(self.budget(s) for s in self.skills) + selector
         return (apart if self.learns_apart else 0) + (self.together_steps if self.weaves else 0)
 
     @property
@@ -219,6 +190,11 @@ class Declaration:
 
     def plain_agent(self) -> PlainAgent:
         """The flat baseline: one agent on the task itself, without skills and reflexes."""
+        if not (self.flat_steps or self.total_steps):
+            raise SkillweaveError(
+                "nothing of this hierarchy is trained, so the flat baseline has no budget: give "
+                "flat_steps"
+            )
         return PlainAgent(
             self.env,
             self.flat or self.algorithm,
@@ -238,6 +214,7 @@ class Declaration:
             tuple(self.reflexes),
             self.call_steps,
             self.greedy_skills,
+            self.call_cost,
         )
 
     def check_spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
@@ -253,10 +230,12 @@ class Declaration:
             self._check_algorithms(env.action_space)
             own = (s.algorithm for s in self.skills)
             for config in (self.algorithm, self.selector, self.flat, *own):
-                check_rollout(config, env.observation_space)
+                if isinstance(config, AlgorithmConfig):
+                    check_rollout(config, env.observation_space)
             for reflex in self.reflexes:
                 reflex.check(env.action_space)
             self._fitted(env)
+            self.fitted_selector(env.observation_space)
             return env.observation_space, env.action_space
         finally:
             env.close()
@@ -267,9 +246,22 @@ class Declaration:
             if skill.policy is None:
                 config = skill.algorithm or self.algorithm
                 check_spaces(config, space, f"skill {skill.name!r}: ")
-        check_spaces(self.selector, gym.spaces.Discrete(self.choices), "selector: ")
+        if isinstance(self.selector, AlgorithmConfig):
+            check_spaces(self.selector, gym.spaces.Discrete(self.choices), "selector: ")
         if self.flat is not None:
             check_spaces(self.flat, space, "flat: ")
+
+    @property
+    def ready_selector(self) -> ReadySelector | None:
+        """The selector that is not trained; None: it is."""
+        return ready_selector(self.selector, tuple(s.name for s in self.skills))
+
+    def fitted_selector(self, observation_space: gym.Space[Any]) -> Policy | None:
+        """The selector that is not trained, on these observations; None: it is trained."""
+        if (found := self.ready_selector) is None:
+            return None
+        choices = gym.spaces.Discrete(len(self.skills))
+        return fitted(found, observation_space, choices, "selector", self.spec.name)
 
     def ready_policies(self) -> dict[str, Policy]:
         """By skill, the policies that are not trained, on the environment's spaces."""
@@ -288,18 +280,3 @@ class Declaration:
             for s in self.skills
             if (policy := ready_policy(s)) is not None
         }
-
-
-def check_target(skill: Skill) -> Target | None:
-    """The target of a skill's stage.
-
-    Raises:
-        SkillweaveError: it is no number in its range, or asks for a success that is not defined.
-    """
-    where = f"skill {skill.name!r}"
-    target = target_of(skill.target_return, skill.target_success, where)
-    if target is not None and target.of == "success" and not skill.defines("success"):
-        raise SkillweaveError(
-            f"{where} has a target_success, but does not say what success is: define success()"
-        )
-    return target

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet, Why
+from skillweave.collecting.calls import Interruption, SkillSet, Why
+from skillweave.selectors import LastCall, ReadySelector
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.types import Array, Memory, Policy, Step
@@ -39,6 +41,9 @@ class HierarchyPolicy:
         limits = [[x for x in (s.call_steps,) if x is not None] for s in told.skills]
         skills = [[s.name, s.max_steps, *own] for s, own in zip(told.skills, limits, strict=True)]
         reflexes = [r.name for r in told.reflexes]
+        cuts = told.interruption
+        if cuts is not None and cuts.critic is not None:
+            acts.append([cuts.margin, source_of(cuts.critic).get("sha256")])
         whole = json.dumps([acts, skills, reflexes, told.lengths or told.call_steps, told.greedy])
         return {"sha256": checksum(whole.encode())}
 
@@ -64,9 +69,7 @@ class HierarchyPolicy:
         rows = np.flatnonzero(memory["why"] != Why.RUNNING)
         if len(rows):
             here = obs[rows]
-            own = {
-                k[len(_SELECTOR) :]: v[rows] for k, v in memory.items() if k.startswith(_SELECTOR)
-            }
+            own = {k: v[rows] for k, v in self._selectors(memory).items()}
             skill, after = self.selector.act(
                 own, here, self.skills.mask(here), deterministic=deterministic, rng=rng
             )
@@ -80,13 +83,28 @@ class HierarchyPolicy:
         """Notice where calls are over."""
         memory = {k: v.copy() for k, v in memory.items()}
         seen = step if self.skills.watches else None
-        why = self.skills.observe(memory, np.arange(len(step.reward)), seen)
+        rows = np.arange(len(step.reward))
+        why = self.skills.observe(memory, rows, seen)
         memory["why"] = np.where(step.terminated | step.truncated, np.int8(Why.EPISODE), why)
+        if isinstance(self.selector, ReadySelector):
+            succeeded = self.skills.succeeded(memory, rows, step, memory["why"])
+            last = LastCall(memory["skill"], memory["why"], succeeded)
+            after = self.selector.watch(self._selectors(memory), step, last)
+            memory |= {_SELECTOR + k: v for k, v in after.items()}
         return memory
 
     def acting(self, memory: Memory) -> Array | None:
         """(n,) int64, the running skill."""
         return memory["skill"]
+
+    def _selectors(self, memory: Memory) -> Memory:
+        """What the selector remembers."""
+        return {k[len(_SELECTOR) :]: v for k, v in memory.items() if k.startswith(_SELECTOR)}
+
+
+def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:
+    """The same skills, whose calls are cut where a trained critic finds another one better."""
+    return replace(skills, interruption=Interruption(critic.heads, margin, critic))
 
 
 class SkillAlone:

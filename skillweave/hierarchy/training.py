@@ -1,30 +1,22 @@
-"""A hierarchy's schedule: every skill apart, then the selector; or one plain agent."""
+"""Training what a run says, and loading what it learnt: a hierarchy, or one plain agent."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
-from skillweave.collecting.calls import Interruption, calls_to_json
-from skillweave.hierarchy.declaration import TOGETHER, Declaration, check_target
-from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.collecting.calls import calls_to_json
+from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
+from skillweave.hierarchy.schedule import stages_of
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
-from skillweave.skills.foreign_policy import source_of
+from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.training.evaluation import evaluate
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
-from skillweave.training.scene import (
-    Scene,
-    WovenScene,
-    selector_scene,
-    skill_scene,
-    woven_scene,
-)
-from skillweave.training.stage import CRITIC, SELECTOR, Policies, Stage, target_of
+from skillweave.training.stage import CRITIC, SELECTOR, Policies
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, OneAgent, train_stages
 from skillweave.types import Policy
@@ -51,78 +43,9 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "resume_needs_recipe": not declaration.trains_from_data,
         "reflexes": [r.name for r in declaration.reflexes],
         "needs_recipe": not declaration.is_data,
+        **_selector_entry(declaration),
         "stages": [stage.entry() for stage in stages_of(declaration)],
     }
-
-
-def stages_of(declaration: Declaration) -> list[Stage]:
-    """Who learns when: skills apart, then the selector; then all together."""
-    apart = _apart(declaration) if declaration.learns_apart else []
-    return [*apart, *([_together(declaration)] if declaration.weaves else [])]
-
-
-def _together(declaration: Declaration) -> Stage:
-    """The stage in which skills and selector learn from the same steps."""
-    how, learns = declaration.together, [s for s in declaration.skills if s.policy is None]
-
-    beside: dict[str, AlgorithmConfig] = {
-        s.name: s.algorithm or declaration.algorithm for s in learns
-    }
-
-    def scene(policies: Policies) -> WovenScene:
-        acts: Any = [None if s in learns else policies[s.name] for s in declaration.skills]
-        numbers = tuple(i for i, s in enumerate(declaration.skills) if s in learns)
-        return woven_scene(declaration.spec, declaration.skill_set(acts), numbers)
-
-    config: Any = declaration.selector
-    if isinstance(config, PPO) and not config.floor:
-        config = replace(config, floor=how.floor, floor_final=how.floor_final)
-    beside |= _critic(declaration) if how.task_weight or declaration.interrupt else {}
-    target = target_of(declaration.selector_target_return, None, TOGETHER)
-    budget, cuts = declaration.together_steps, declaration.interrupt
-    return Stage(TOGETHER, "together", config, budget, scene, target, beside, how, cuts)
-
-
-def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
-    """The critic of skills, which sees and discounts as the selector does."""
-    own: Any = declaration.selector
-    shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
-    if isinstance(own, PPO):
-        shared |= {f: getattr(own, f) for f in ("n_steps", "gae_lambda", "network", "overlap")}
-    return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}
-
-
-def _apart(declaration: Declaration) -> list[Stage]:
-    """The skills that are to be trained, each apart, then the selector."""
-    reflexes = declaration.reflexes if declaration.reflexes_in_training else ()
-
-    def skill_stage(skill: Skill) -> Stage:
-        config, budget = skill.algorithm or declaration.algorithm, declaration.budget(skill)
-        target = check_target(skill)
-
-        def scene(policies: Policies) -> Scene:
-            others = [s for s in declaration.skills if s.name in policies]
-            starters = declaration.skill_set([policies[s.name] for s in others], others)
-            return skill_scene(declaration.spec, skill, reflexes, starters if others else None)
-
-        return Stage(skill.name, "skill", config, budget, scene, target)
-
-    def calls(policies: Policies) -> Scene:
-        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
-        return selector_scene(declaration.spec, skills)
-
-    def watched_calls(policies: Policies) -> WovenScene:
-        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
-        return woven_scene(declaration.spec, skills, ())
-
-    config, budget = declaration.selector, declaration.selector_steps
-    target = target_of(declaration.selector_target_return, None, SELECTOR)
-    first = [skill_stage(s) for s in declaration.skills if s.policy is None]
-    if not declaration.interrupt:
-        return [*first, Stage(SELECTOR, "selector", config, budget, calls, target)]
-    how, beside = declaration.together, _critic(declaration)
-    last = config, budget, watched_calls, target, beside, how, True
-    return [*first, Stage(SELECTOR, "selector", *last)]
 
 
 JUDGED = 1_000
@@ -149,10 +72,10 @@ def train(
     apart = [s for s in stages if s.kind != "together"]
     before = train_stages(apart, run, listeners, ready, make_learner)
     if len(apart) == len(stages):
-        return _woven(declaration, before)
+        return _woven(declaration, run, before)
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
     if not apart:
-        return _woven(declaration, after)
+        return _woven(declaration, run, after)
     return _better(declaration, run, before, after)
 
 
@@ -161,7 +84,10 @@ def _better(
 ) -> HierarchyPolicy:
     """The better of two hierarchies, by episodes of the environment; written into the run."""
     entry = run.stage(TOGETHER)
-    policies = {"before": _woven(declaration, before), "after": _woven(declaration, after)}
+    policies = {
+        "before": _woven(declaration, run, before),
+        "after": _woven(declaration, run, after),
+    }
     if "kept" not in entry:
         seed = JUDGED + int(run.manifest["seed"])
         means = {
@@ -183,9 +109,9 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
     found = ready | _learnt(run)
-    policies = [found[s.name] for s in declaration.skills]
-    check_parts(declaration, policies, found[SELECTOR], str(run.path))
-    return _woven(declaration, found)
+    policy = _woven(declaration, run, found)
+    check_parts(declaration, policy.skills.policies, policy.selector, str(run.path))
+    return policy
 
 
 def _learnt(run: RunDirectory) -> dict[str, Policy]:
@@ -197,20 +123,37 @@ def _learnt(run: RunDirectory) -> dict[str, Policy]:
     return found
 
 
-def _woven(declaration: Declaration, found: Mapping[str, Policy]) -> HierarchyPolicy:
+def _woven(
+    declaration: Declaration, run: RunDirectory, found: Mapping[str, Policy]
+) -> HierarchyPolicy:
     """The hierarchy of these policies."""
     skills = declaration.skill_set([found[s.name] for s in declaration.skills])
     if declaration.interrupt:
-        critic: Any = found[CRITIC]
-        cuts = Interruption(critic.heads, declaration.together.margin)
-        skills = replace(skills, interruption=cuts)
-    return HierarchyPolicy(found[SELECTOR], skills)
+        skills = with_interruption(skills, found[CRITIC], declaration.together.margin)
+    selector = _ready_selector(declaration, run, skills.policies[0]) or found[SELECTOR]
+    return HierarchyPolicy(selector, skills)
 
 
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
     """The ready policies as they were when the run began."""
     ready = declaration.ready_policies()
     return {name: run.ready_policy(name, policy) for name, policy in ready.items()}
+
+
+def _ready_selector(declaration: Declaration, run: RunDirectory, skill: Policy) -> Policy | None:
+    """The selector where it is ready, after a check that it is that of the run."""
+    selector = declaration.fitted_selector(skill.observation_space)
+    if selector is None:
+        return None
+    return as_recorded(
+        selector, run.manifest.get(SELECTOR), lambda: None, f"{run.path}: the selector"
+    )
+
+
+def _selector_entry(declaration: Declaration) -> dict[str, Any]:
+    """Where a ready selector comes from; nothing where it is trained."""
+    selector = declaration.ready_selector
+    return {} if selector is None else {SELECTOR: source_of(selector)}
 
 
 def _skill_entry(skill: Skill) -> dict[str, Any]:

@@ -16,13 +16,15 @@ from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.calls import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.messages import short
 from skillweave.reading import Positive, fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.selectors import ReadySelector
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT, PlainAgent
+from skillweave.training.stage import CRITIC
 from skillweave.types import Policy, SkillweaveError
 
 
@@ -37,8 +39,15 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
     assert isinstance(declaration, Declaration)
     tensors: dict[str, Tensor] = {}
     parts: dict[str, Any] = {}
-    named: list[tuple[str, Policy]] = [("selector", policy.selector)]
+    named: list[tuple[str, Policy]] = []
     ready: dict[str, Any] = {}
+    if isinstance(policy.selector, ReadySelector):
+        ready["selector"] = source_of(policy.selector)
+    else:
+        named.append(("selector", policy.selector))
+    cuts = policy.skills.interruption
+    if cuts is not None and cuts.critic is not None:
+        named.append((CRITIC, cuts.critic))
     for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
         if skill.policy is None:
             named.append((skill.name, own))
@@ -56,6 +65,7 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
         **place,
         "skills": [s.name for s in declaration.skills],
         **calls_to_json(declaration.call_steps),
+        "interrupt": None if cuts is None else cuts.margin,
         "greedy_skills": declaration.greedy_skills,
         "parts": parts,
         "ready": ready,
@@ -73,9 +83,11 @@ class HierarchyHeader(TypedDict):
     skills: list[str]
     call_steps: Positive | None
     call_lengths: NotRequired[list[Positive]]
+    interrupt: NotRequired[float | None]
     greedy_skills: bool
     parts: dict[str, dict[str, Any]]
     ready: NotRequired[dict[str, Source]]
+    """Of skills by name, and of "selector"."""
 
 
 def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -153,11 +165,30 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
             policies.append(as_recorded(ready[name], recorded.get(name), read, where))
         else:
             policies.append(part(name))
-    selector = part("selector")
     declaration.call_steps = calls_from_json(header)
+    selector = declaration.fitted_selector(policies[0].observation_space)
+    check_selector(selector is not None, "selector" in recorded, str(path))
+    if selector is None:
+        selector = part("selector")
+    else:
+        place = f"{path}: the selector"
+        selector = as_recorded(selector, recorded["selector"], lambda: None, place)
     check_parts(declaration, policies, selector, str(path))
     declaration.greedy_skills = header["greedy_skills"]
-    return HierarchyPolicy(selector, declaration.skill_set(policies))
+    skills = declaration.skill_set(policies)
+    if (margin := header.get("interrupt")) is not None:
+        skills = with_interruption(skills, part(CRITIC), margin)
+    return HierarchyPolicy(selector, skills)
+
+
+def check_selector(mine: bool, theirs: bool, where: str) -> None:
+    """Raise a SkillweaveError where of two selectors one is ready and the other is trained."""
+    if mine != theirs:
+        kinds = ("a trained selector", "a ready one (a function, an automaton or a tree)")
+        raise SkillweaveError(
+            f"{where} has {kinds[theirs]}, but this hierarchy has {kinds[mine]}: declare the "
+            "selector as it was, or train anew"
+        )
 
 
 def check_parts(

@@ -55,6 +55,10 @@ def make_encoder(name: str, obs: ObsCodec) -> Encoder:
     Raises:
         SkillweaveError: nobody registered it.
     """
+    if name == "cells" and name not in _REGISTERED:
+        from skillweave.networks.cells import CellsEncoder
+
+        return CellsEncoder(obs)
     if name not in _REGISTERED:
         raise SkillweaveError(
             f"Network.encoder is {name!r}, which is not registered: call "

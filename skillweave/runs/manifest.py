@@ -136,6 +136,8 @@ class HierarchyManifest(Manifest):
     """By how much another skill must be worth more for a call to be cut."""
     learn: NotRequired[Literal["apart", "together", "apart, then together"]]
     greedy_skills: bool
+    selector: NotRequired[Source]
+    """Of a ready selector; absent where it is trained."""
     reflexes: NotRequired[list[str]]
     reflexes_in_training: NotRequired[bool]
 

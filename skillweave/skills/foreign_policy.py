@@ -80,7 +80,7 @@ class Foreign(Memoryless):
             SkillweaveError: it failed; the message names who, and the space.
         """
         try:
-            self.act({}, _made_up(self.observation_space, 2))
+            self.act(self.start(2), made_up(self.observation_space, 2))
         except SkillweaveError:
             raise
         except Exception as error:
@@ -161,7 +161,7 @@ def as_recorded(
     if content is None or not isinstance(policy, Foreign):
         raise SkillweaveError(
             f"{where} had the policy {_described(recorded)}, but now it is {_described(now)}: "
-            "another checksum. Put the file back that it was trained with, or train anew"
+            "another checksum. Put back what it was trained with, or train anew"
         )
     if checksum(content) != recorded.get("sha256"):
         raise SkillweaveError(f"{where}: the copy of its policy is damaged: another checksum")
@@ -185,7 +185,7 @@ def _described(source: dict[str, Any]) -> str:
     return f"{source['kind']} {(source.get('file') or source.get('name') or '')[:300]}{sha256}"
 
 
-def _made_up(space: Space[Any], n: int) -> Array:
+def made_up(space: Space[Any], n: int) -> Array:
     """n members of a space as one batch."""
     from skillweave.spaces import pack
 

@@ -34,7 +34,8 @@ def ready_policy(skill: Skill) -> Policy | None:
         return from_torch(value)
     # A function in a class body becomes a method when it is looked up. It is meant as one if it
     # needs two arguments (``def policy(self, obs)``), and as a function of obs if it needs one.
-    if isinstance(value, MethodType) and value.__self__ is skill and _needs(value.__func__) < 2:
+    bound = isinstance(value, MethodType) and value.__self__ is skill
+    if bound and required_arguments(value.__func__) < 2:
         value = value.__func__
     if callable(value):
         return from_function(value)
@@ -44,8 +45,11 @@ def ready_policy(skill: Skill) -> Policy | None:
     )
 
 
-def _needs(function: Any) -> int:
-    """How many arguments a function cannot do without."""
+def required_arguments(function: Any) -> int:
+    """How many arguments a function cannot do without; 1 where Python cannot tell."""
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    parameters = inspect.signature(function).parameters.values()
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of some functions written in C
+        return 1
     return sum(p.kind in positional and p.default is p.empty for p in parameters)

@@ -117,12 +117,13 @@ def check_env(env: object) -> None:
         )
 
 
-def check_algorithm(value: object, where: str, *, optional: bool = False) -> None:
-    """Raise a SkillweaveError where ``value`` is no algorithm's settings."""
+def check_algorithm(value: object, where: str, *, optional: bool = False, also: str = "") -> None:
+    """Raise a SkillweaveError where ``value`` is no algorithm's settings; ``also`` may be given."""
     if (value is None and optional) or isinstance(value, AlgorithmConfig):
         return
     hint = f" (write {value.__name__}(), not {value.__name__})" if isinstance(value, type) else ""
-    raise SkillweaveError(f"{where} is {short(value)}, which is no algorithm's settings{hint}")
+    kinds = "no algorithm's settings" + (f", and no {also}" if also else "")
+    raise SkillweaveError(f"{where} is {short(value)}, which is {kinds}{hint}")
 
 
 def check_fields(declared: Any) -> None:

@@ -74,7 +74,8 @@ class WovenLearner:
         rollout = store.rollout(stack.state.gamma)
         assert rollout is not None
         found: Array = stack.algorithm.advantage(stack.state, rollout)[0].cpu().numpy()
-        return found / (found.std() + np.float32(1e-8))
+        scaled: Array = found / (found.std() + np.float32(1e-8))
+        return scaled
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """Let those learn that have enough rows; metrics under ``<name>.``."""

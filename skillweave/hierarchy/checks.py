@@ -1,0 +1,93 @@
+"""Checks of what a hierarchy is declared with; the messages name the skill and the field."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from skillweave.collecting.calls import Lengths
+from skillweave.messages import short
+from skillweave.skills import Reflex, Skill, ready_policy
+from skillweave.training.plain_agent import check_algorithm
+from skillweave.training.stage import Target, target_of
+from skillweave.types import SkillweaveError
+
+
+def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ...]:
+    """The skills, if a hierarchy can be made of them.
+
+    Raises:
+        SkillweaveError: it cannot.
+    """
+    if isinstance(skills, str) or not isinstance(skills, Sequence):
+        raise SkillweaveError("skills must be a list of skills: skills=[Center(), ...]")
+    if not skills:
+        raise SkillweaveError("a hierarchy needs at least one skill: skills is empty")
+    for skill in skills:
+        if not isinstance(skill, Skill):
+            hint = " (write Center(), not Center)" if isinstance(skill, type) else ""
+            raise SkillweaveError(f"skills holds {short(skill)}, which is not a Skill{hint}")
+        skill.validate()
+        check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
+        check_target(skill)
+        ready_policy(skill)  # says so where it cannot act
+    names = [s.name for s in skills]
+    for name in names:
+        if names.count(name) > 1:
+            raise SkillweaveError(
+                f"two skills are named {name!r}; give one another name: class attribute 'name'"
+            )
+        if name in reserved:
+            raise SkillweaveError(f"a skill cannot be named {name!r}, which names a stage")
+    return tuple(skills)
+
+
+def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:
+    """The reflexes, if they are a list of them.
+
+    Raises:
+        SkillweaveError: they are not.
+    """
+    if isinstance(reflexes, str) or not isinstance(reflexes, Sequence):
+        raise SkillweaveError(
+            f"reflexes is {short(reflexes)}; it must be a list: reflexes=[Reflex(...)]"
+        )
+    for reflex in reflexes:
+        if not isinstance(reflex, Reflex):
+            raise SkillweaveError(
+                f"reflexes holds {short(reflex)}, which is not a Reflex: Reflex(condition, action)"
+            )
+    return tuple(reflexes)
+
+
+def check_calls(call_steps: object, skills: Sequence[Skill]) -> None:
+    """Raise a SkillweaveError where calls of skills would never end, or no length is given."""
+    if isinstance(call_steps, Lengths):
+        return
+    if call_steps is not None:
+        if type(call_steps) is not int or call_steps < 1:
+            raise SkillweaveError(
+                f"call_steps is {short(call_steps)}; it must be at least 1, Lengths(1, ..., 128), "
+                "or None"
+            )
+        return
+    for skill in skills:
+        if not (skill.max_steps or skill.call_steps or skill.defines("termination")):
+            raise SkillweaveError(
+                f"call_steps is None, but skill {skill.name!r} never stops by itself: give it "
+                "max_steps or termination()"
+            )
+
+
+def check_target(skill: Skill) -> Target | None:
+    """The target of a skill's stage.
+
+    Raises:
+        SkillweaveError: it is no number in its range, or asks for a success that is not defined.
+    """
+    where = f"skill {skill.name!r}"
+    target = target_of(skill.target_return, skill.target_success, where)
+    if target is not None and target.of == "success" and not skill.defines("success"):
+        raise SkillweaveError(
+            f"{where} has a target_success, but does not say what success is: define success()"
+        )
+    return target

@@ -1,0 +1,91 @@
+"""A hierarchy's schedule: every skill apart, then the selector; or all together; or both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
+from skillweave.hierarchy.checks import check_target
+from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.skills import Skill
+from skillweave.training.scene import (
+    Scene,
+    WovenScene,
+    selector_scene,
+    skill_scene,
+    woven_scene,
+)
+from skillweave.training.stage import CRITIC, SELECTOR, Policies, Stage, target_of
+
+
+def stages_of(declaration: Declaration) -> list[Stage]:
+    """Who learns when: skills apart, then the selector; then all together."""
+    apart = _apart(declaration) if declaration.learns_apart else []
+    return [*apart, *([_together(declaration)] if declaration.weaves else [])]
+
+
+def _together(declaration: Declaration) -> Stage:
+    """The stage in which skills and selector learn from the same steps."""
+    how, learns = declaration.together, [s for s in declaration.skills if s.policy is None]
+
+    beside: dict[str, AlgorithmConfig] = {
+        s.name: s.algorithm or declaration.algorithm for s in learns
+    }
+
+    def scene(policies: Policies) -> WovenScene:
+        acts: Any = [None if s in learns else policies[s.name] for s in declaration.skills]
+        numbers = tuple(i for i, s in enumerate(declaration.skills) if s in learns)
+        return woven_scene(declaration.spec, declaration.skill_set(acts), numbers)
+
+    config: Any = declaration.selector
+    if isinstance(config, PPO) and not config.floor:
+        config = replace(config, floor=how.floor, floor_final=how.floor_final)
+    beside |= _critic(declaration) if how.task_weight or declaration.interrupt else {}
+    target = target_of(declaration.selector_target_return, None, TOGETHER)
+    budget, cuts = declaration.together_steps, declaration.interrupt
+    return Stage(TOGETHER, "together", config, budget, scene, target, beside, how, cuts)
+
+
+def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
+    """The critic of skills, which sees and discounts as the selector does."""
+    own: Any = declaration.selector
+    shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
+    if isinstance(own, PPO):
+        shared |= {f: getattr(own, f) for f in ("n_steps", "gae_lambda", "network", "overlap")}
+    return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}
+
+
+def _apart(declaration: Declaration) -> list[Stage]:
+    """The skills that are to be trained, each apart, then the selector if it is not ready."""
+    reflexes = declaration.reflexes if declaration.reflexes_in_training else ()
+
+    def skill_stage(skill: Skill) -> Stage:
+        config, budget = skill.algorithm or declaration.algorithm, declaration.budget(skill)
+        target = check_target(skill)
+
+        def scene(policies: Policies) -> Scene:
+            others = [s for s in declaration.skills if s.name in policies]
+            starters = declaration.skill_set([policies[s.name] for s in others], others)
+            return skill_scene(declaration.spec, skill, reflexes, starters if others else None)
+
+        return Stage(skill.name, "skill", config, budget, scene, target)
+
+    def calls(policies: Policies) -> Scene:
+        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
+        return selector_scene(declaration.spec, skills)
+
+    def watched_calls(policies: Policies) -> WovenScene:
+        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
+        return woven_scene(declaration.spec, skills, ())
+
+    first = [skill_stage(s) for s in declaration.skills if s.policy is None]
+    if not isinstance(config := declaration.selector, AlgorithmConfig):
+        return first
+    budget = declaration.selector_steps
+    target = target_of(declaration.selector_target_return, None, SELECTOR)
+    if not declaration.interrupt:
+        return [*first, Stage(SELECTOR, "selector", config, budget, calls, target)]
+    how, beside = declaration.together, _critic(declaration)
+    last = config, budget, watched_calls, target, beside, how, True
+    return [*first, Stage(SELECTOR, "selector", *last)]

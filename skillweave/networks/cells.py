@@ -1,0 +1,65 @@
+"""Images whose pixels are kinds, not brightnesses: grids of objects, as MiniGrid's."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from skillweave.networks.encoders import Inputs
+from skillweave.networks.stacked import Views, orthogonal_
+from skillweave.spaces import ObsCodec
+from skillweave.types import SkillweaveError
+
+KINDS = 16
+"""Values of a cell that are told apart: those from here on count as the last."""
+WIDTH = 64
+"""Features."""
+
+
+class CellsEncoder:
+    """Each value of each cell has a learnt vector; features are the ReLU of their sum.
+
+    This is a dense layer on the one-hot cells, without the zeros. Numbers beside the images are
+    features as they are.
+    """
+
+    def __init__(self, obs: ObsCodec) -> None:
+        if not obs.images:
+            raise SkillweaveError(
+                'Network(encoder="cells") reads images of whole numbers, but the observations have '
+                "none"
+            )
+        self._sizes = [math.prod(shape) for shape in obs.images]
+        self._vector = obs.size > 0
+        self.size = WIDTH * len(self._sizes) + obs.size
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        for i, cells in enumerate(self._sizes):
+            self.shapes |= {f"{i}.weight": (cells * KINDS, WIDTH), f"{i}.bias": (1, WIDTH)}
+
+    def init_(self, views: Views, generators: list[torch.Generator]) -> None:
+        """Orthogonal vectors, gain √2, biases zero."""
+        for name, view in views.items():
+            if name.endswith("weight"):
+                orthogonal_(view, math.sqrt(2.0), generators)
+            else:
+                view.zero_()
+
+    def __call__(self, views: Views, inputs: Inputs) -> Tensor:
+        """Images (P, B, …) of whole numbers to features (P, B, F)."""
+        found = [self._image(views, i, inputs[f"image.{i}"]) for i in range(len(self._sizes))]
+        if self._vector:
+            found.append(inputs["vector"])
+        return torch.cat(found, -1)
+
+    def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
+        members, batch, cells = *image.shape[:2], self._sizes[i]
+        table, bias = views[f"{i}.weight"], views[f"{i}.bias"]
+        kind = image.reshape(members, batch, cells).long().clamp(0, KINDS - 1)
+        first = torch.arange(cells, device=image.device) * KINDS
+        member = torch.arange(members, device=image.device) * (cells * KINDS)
+        rows = kind + first + member[:, None, None]
+        total = F.embedding_bag(rows.flatten(0, 1), table.flatten(0, 1), mode="sum")
+        return torch.relu(total.view(members, batch, WIDTH) + bias)

@@ -1,0 +1,216 @@
+"""An automaton as a selector: states with skills, and transitions by what happens in steps.
+
+Its states and events are those of a reward machine (Toro Icarte, Klassen, Valenzano & McIlraith
+2018, "Using Reward Machines for High-Level Task Specification"), without the rewards.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from skillweave.collecting.calls import Why
+from skillweave.messages import short
+from skillweave.selectors.base import LastCall, ReadySelector, function_name, listed, shown_obs
+from skillweave.skills.base import answer
+from skillweave.skills.foreign_policy import checksum
+from skillweave.types import Array, Memory, SkillweaveError, Step
+
+Event = Callable[[Step], Any] | str
+"""What makes a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""
+Choices = str | Sequence[str] | set[str] | frozenset[str]
+"""The skills of a state."""
+ENDS = ("success", "failure")
+
+
+class Automaton(ReadySelector):
+    """States, each with the skills that are called in it, and transitions between them.
+
+    ::
+
+        def has_key(step):
+            return step.next_obs[:, KEY] == 1
+
+        selector = sw.Automaton(
+            states={"no key": "get_key", "key": {"open_door", "push_door"}, "open": "leave"},
+            transitions={("no key", "key"): has_key, ("key", "open"): "success"},
+        )
+
+    After every step, also within a call, the transitions of each environment's state are looked
+    at in the order in which they are written; the first whose event has happened is taken, and no
+    other in this step. The event "success" is that the call ended with this step and succeeded,
+    "failure" that it ended without. A transition ends no call: the skills of the new state are
+    called when the running call is over. Every episode starts in ``start``.
+
+    Of several skills one that may start is called: if greedy, the first (of a list in its order,
+    of a set in the hierarchy's), else one at random, all equally likely.
+
+    Args:
+        states: by name, a skill's name, or several.
+        transitions: by (from, to), the event.
+        start: the first state; None: the one that is written first.
+
+    Raises:
+        SkillweaveError: a state has no skill, or a transition names a state that is not there;
+            when it acts: no skill of the state may start.
+    """
+
+    kind = "automaton"
+
+    def __init__(
+        self,
+        states: Mapping[str, Choices],
+        transitions: Mapping[tuple[str, str], Event],
+        start: str | None = None,
+    ) -> None:
+        super().__init__("automaton")
+        if not isinstance(states, Mapping) or not states:
+            raise SkillweaveError(
+                f"an Automaton's states are {short(states)}; give at least one, with its skills: "
+                "states={'search': 'explore'}"
+            )
+        self.states = {_name(name): _skills(name, skills) for name, skills in states.items()}
+        self.state_names = tuple(self.states)
+        self.start_state = self.state_names[0] if start is None else start
+        self._number_of_state(self.start_state, "start")
+        if not isinstance(transitions, Mapping):
+            raise SkillweaveError(
+                f"an Automaton's transitions are {short(transitions)}; write "
+                "transitions={('from', 'to'): event}"
+            )
+        self.transitions = dict(transitions)
+        self._arrows = [(*self._ends_of(pair, e), e) for pair, e in self.transitions.items()]
+        self._rank = np.zeros((len(states), 0))
+
+    def among(self, skills: tuple[str, ...]) -> Self:
+        """A copy that chooses among the skills of these names."""
+        found = super().among(skills)
+        # The larger, the earlier: 0 where the skill is none of the state's.
+        found._rank = np.zeros((len(self.states), len(skills)), np.int64)
+        for i, (state, names) in enumerate(self.states.items()):
+            numbers = [found._number(n, f"automaton: state {short(state)}") for n in names]
+            numbers = sorted(numbers) if isinstance(names, frozenset) else numbers
+            for place, number in enumerate(numbers):
+                found._rank[i, number] = len(numbers) - place
+        return found
+
+    def start(self, n: int) -> Memory:
+        """Every environment in the first state."""
+        return {"state": np.full(n, self.state_names.index(self.start_state))}
+
+    def allowed(self, memory: Memory) -> Array:
+        """(n, S) bool: the skills of the state that each environment is in."""
+        allowed: Array = self._rank[memory["state"]] > 0
+        return allowed
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """A skill of each environment's state, (n,)."""
+        allowed = self.allowed(memory)
+        if mask is not None:
+            allowed &= mask
+        if not allowed.any(axis=1).all():
+            self._nothing_may_start(memory, obs, int(np.flatnonzero(~allowed.any(axis=1))[0]))
+        score = self._rank[memory["state"]]
+        if not deterministic:
+            score = (rng or np.random.default_rng()).random(allowed.shape)
+        return np.where(allowed, score, -1).argmax(axis=1), memory
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """Take the transitions whose events have happened."""
+        before, after = memory["state"], memory["state"].copy()
+        waiting = np.ones(len(before), bool)  # no transition was taken yet
+        for origin, target, event in self._arrows:
+            here = waiting & (before == origin)
+            if not here.any():
+                continue
+            here &= self._happened(event, step, last)
+            after[here] = target
+            waiting &= ~here
+        return {"state": after}
+
+    def source(self) -> dict[str, Any]:
+        """The checksum of its states and transitions; of functions the names alone are in it."""
+        arrows = [
+            [*pair, event if isinstance(event, str) else [function_name(event)]]
+            for pair, event in self.transitions.items()
+        ]
+        states = [
+            [name, sorted(skills) if isinstance(skills, frozenset) else ["in order", *skills]]
+            for name, skills in self.states.items()
+        ]
+        whole = json.dumps([self.start_state, states, arrows])
+        return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
+
+    def _happened(self, event: Event, step: Step, last: LastCall) -> Array:
+        """Whether an event has happened in this step, (n,) bool."""
+        if isinstance(event, str):
+            wanted = last.succeeded if event == "success" else ~last.succeeded
+            happened: Array = (last.why != Why.RUNNING) & wanted
+            return happened
+        name, n = function_name(event), len(step.reward)
+        return answer(event, step, n, bool, self._who, name, step.elapsed)
+
+    def _ends_of(self, pair: Any, event: Any) -> tuple[int, int]:
+        """The states that a transition is between, after a check of both and of its event."""
+        if not isinstance(pair, tuple) or len(pair) != 2:
+            raise SkillweaveError(
+                f"an Automaton's transition is from {short(pair)}; write ('from', 'to'): event"
+            )
+        where = f"transition {short(pair)}"
+        origin, target = (self._number_of_state(name, where) for name in pair)
+        if event not in ENDS and not callable(event):
+            raise SkillweaveError(
+                f"automaton: {where} has the event {short(event)}; give a function of a Step, "
+                "'success' or 'failure'"
+            )
+        return origin, target
+
+    def _number_of_state(self, name: Any, where: str) -> int:
+        if name not in self.state_names:
+            raise SkillweaveError(
+                f"automaton: {where} names the state {short(name)}, which is not there; there are: "
+                f"{listed(self.state_names)}"
+            )
+        return self.state_names.index(name)
+
+    def _nothing_may_start(self, memory: Memory, obs: Array, row: int) -> None:
+        state = self.state_names[int(memory["state"][row])]
+        raise SkillweaveError(
+            f"{self._who}: in state {short(state)} none of its skills ("
+            f"{listed(tuple(self.states[state]))}) may start in observation {shown_obs(obs[row])}: "
+            "initiation() is False there. Give the state another skill too, or let one start there"
+        )
+
+
+def _name(state: Any) -> str:
+    if not isinstance(state, str) or not state:
+        raise SkillweaveError(f"an Automaton's state is named {short(state)}; it must be text")
+    return state
+
+
+def _skills(state: str, skills: Any) -> tuple[str, ...] | frozenset[str]:
+    """The names of a state's skills: in order, or as a set."""
+    if isinstance(skills, str):
+        return (skills,)
+    where = f"automaton: state {short(state)}"
+    if not isinstance(skills, list | tuple | set | frozenset):
+        raise SkillweaveError(
+            f"{where} has {short(skills)}; give a skill's name, or a list or a set of names"
+        )
+    if not skills:
+        raise SkillweaveError(f"{where} has no skill: give at least one, to be called in it")
+    for name in skills:
+        if not isinstance(name, str):
+            raise SkillweaveError(f"{where} has {short(name)} among its skills; give their names")
+    return frozenset(skills) if isinstance(skills, set | frozenset) else tuple(skills)

@@ -1,0 +1,81 @@
+"""What every ready selector is, and what it is told of the last call."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from skillweave.messages import short, shortened
+from skillweave.skills.foreign_policy import Foreign
+from skillweave.types import Array, Memory, SkillweaveError, Step
+
+
+@dataclass(frozen=True, slots=True)
+class LastCall:
+    """How the last call of n environments ended; where one still runs, that is said."""
+
+    skill: Array  # (n,) int64, its place in the hierarchy's list; −1: the episode has just begun
+    why: Array  # (n,) int8, ``Why`` it ended
+    succeeded: Array  # (n,) bool: by the skill's success(), where it has none by its own end
+
+
+class ReadySelector(Foreign):
+    """A selector that is not trained: a policy over skills that also sees how calls end.
+
+    It is asked only where a call is over. It keeps to the skills' initiation sets itself, as its
+    mask tells them. All that it remembers is in its memory, with a row for each environment.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.skills: tuple[str, ...] = ()
+
+    def among(self, skills: tuple[str, ...]) -> Self:
+        """A copy that chooses among the skills of these names, in the hierarchy's order.
+
+        Raises:
+            SkillweaveError: it names a skill that is none of them.
+        """
+        found = copy.copy(self)
+        found.skills = skills
+        return found
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """The memory after a step of n environments; called after every step.
+
+        Args:
+            step: as the environments answered; its ``elapsed`` counts as for any policy.
+            last: ``why`` is 0 (``Why.RUNNING``) where the call goes on.
+        """
+        return memory
+
+    def _number(self, skill: Any, where: str) -> int:
+        """The place of a skill in the hierarchy's list.
+
+        Raises:
+            SkillweaveError: there is no skill of this name; the message begins with ``where``.
+        """
+        if not isinstance(skill, str) or skill not in self.skills:
+            raise SkillweaveError(
+                f"{where} names {short(skill)}, which is no skill of the hierarchy; there are: "
+                f"{listed(self.skills)}"
+            )
+        return self.skills.index(skill)
+
+
+def listed(names: tuple[str, ...]) -> str:
+    """Names as one part of a sentence."""
+    return shortened(", ".join(names), 300)
+
+
+def shown_obs(obs: Array) -> str:
+    """One observation in a message."""
+    return shortened(np.array2string(obs, precision=3, threshold=20), 300)
+
+
+def function_name(function: Any) -> str:
+    """What a function of the user is called in messages and checksums."""
+    return str(getattr(function, "__name__", type(function).__name__))

@@ -1,0 +1,92 @@
+"""A function of observations as a selector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Discrete
+
+from skillweave.collecting.calls import Why
+from skillweave.selectors.base import LastCall, ReadySelector, function_name, listed, shown_obs
+from skillweave.skills.foreign_policy import qualified
+from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.ready import required_arguments
+from skillweave.types import Array, Memory, SkillweaveError, Step, read_only
+
+
+class FunctionSelector(ReadySelector):
+    """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
+
+    If it needs a second argument, it is given the ``LastCall``.
+
+    Raises:
+        SkillweaveError: when it acts: the function failed, or chose what is no skill, or a skill
+            that may not start.
+    """
+
+    kind = "function"
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(f"function {function_name(function)}()")
+        self.function = function
+        self._asks_last = required_arguments(function) > 1
+
+    def start(self, n: int) -> Memory:
+        """How the last call ended, for functions that are told; else nothing."""
+        if not self._asks_last:
+            return {}
+        return {
+            "skill": np.full(n, -1),
+            "why": np.full(n, Why.EPISODE, np.int8),
+            "succeeded": np.zeros(n, bool),
+        }
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """What the function chooses, (n,), checked."""
+        function = self.function
+        if self._asks_last:
+            last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
+            value = called(lambda given: function(given, last), read_only(obs), self._who)
+        else:
+            value = called(function, read_only(obs), self._who)
+        chosen = as_array(value, self._who)
+        if chosen.dtype.kind in "UO" and chosen.shape == (len(obs),):
+            chosen = np.array([self._number(name, self._who) for name in chosen.tolist()], int)
+        chosen = checked_actions(chosen, len(obs), Discrete(len(self.skills)), self._who)
+        self._check_starts(chosen, obs, mask)
+        return chosen, memory
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """Keep how the last call ended."""
+        if not self._asks_last:
+            return memory
+        return {
+            "skill": last.skill.copy(), "why": last.why.copy(), "succeeded": last.succeeded.copy()
+        }  # fmt: skip
+
+    def source(self) -> dict[str, Any]:
+        """The function's name."""
+        return {"kind": self.kind, "name": qualified(self.function)}
+
+    def _check_starts(self, chosen: Array, obs: Array, mask: Array | None) -> None:
+        if mask is None:
+            return
+        wrong = np.flatnonzero(~mask[np.arange(len(obs)), chosen])
+        if len(wrong):
+            row = int(wrong[0])
+            may = tuple(n for n, yes in zip(self.skills, mask[row], strict=True) if yes)
+            raise SkillweaveError(
+                f"{self._who} chose skill {self.skills[int(chosen[row])]!r} in observation "
+                f"{shown_obs(obs[row])}, but its initiation() is False there; choose a skill that "
+                f"may start there: {listed(may)}"
+            )

@@ -1,0 +1,114 @@
+"""Behaviour trees as selectors: ``Sequence``, ``Fallback`` and ``Condition``; leaves are skills.
+
+::
+
+    from skillweave import tree
+
+    selector = tree.Sequence(
+        tree.Fallback(has_key, "get_key"),
+        "open_door",
+        "leave",
+    )
+
+Text is a skill's name; a function of observations (n, *obs_shape) to (n,) bool is a condition.
+
+The tree is asked only where a call is over. A skill's leaf is RUNNING while its call is under way,
+SUCCESS where the call succeeded (by the skill's ``success``; where it has none, by its own end),
+and FAILURE where it ended otherwise: at a limit (``max_steps``, ``call_steps``) without success.
+A skill that may not start is FAILURE at once. When the whole tree has come to SUCCESS or FAILURE,
+it begins anew from its root. The field's terms: Colledanchise & Ögren 2018, "Behavior Trees in
+Robotics and AI".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any, ClassVar
+
+from skillweave.messages import short
+from skillweave.selectors.base import function_name
+from skillweave.types import Array, SkillweaveError
+
+
+class Status(IntEnum):
+    """What a node of a tree answers."""
+
+    RUNNING = 0
+    SUCCESS = 1
+    FAILURE = 2
+
+
+class Condition:
+    """A function of observations (n, *obs_shape) to (n,) bool: SUCCESS where it holds.
+
+    Args:
+        function: asked where a call is over.
+        name: used in messages; default: the function's name.
+    """
+
+    def __init__(self, function: Callable[[Array], Any], name: str = "") -> None:
+        if not callable(function) or isinstance(function, type):
+            raise SkillweaveError(
+                f"tree: a Condition is {short(function)}; it must be a function of observations"
+            )
+        self.function, self.name = function, name or function_name(function)
+
+
+class Composite:
+    """A node with children: a ``Sequence`` or a ``Fallback``.
+
+    Args:
+        children: skills' names, conditions (or bare functions), sequences and fallbacks.
+        memory: go on with the child that is under way; else begin with the first child whenever
+            the tree is asked, so conditions before it are looked at again, and skills before it
+            are called again.
+
+    Raises:
+        SkillweaveError: there are no children, or one is none of these.
+    """
+
+    goes_on_after: ClassVar[Status]
+    """The children's status after which the next child's turn comes."""
+
+    def __init__(self, *children: str | Callable[[Array], Any] | Condition | Composite,
+                 memory: bool = True) -> None:  # fmt: skip
+        where = f"tree: {type(self).__name__}"
+        if not children:
+            raise SkillweaveError(f"{where} has no children: give skills' names or conditions")
+        if not isinstance(memory, bool):
+            raise SkillweaveError(f"{where}: memory is {short(memory)}; it must be True or False")
+        self.children = tuple(_child(c, where) for c in children)
+        self.memory = memory
+
+
+class Sequence(Composite):
+    """Its children one after another, as long as they succeed.
+
+    FAILURE as soon as one fails, SUCCESS when all have succeeded.
+    """
+
+    goes_on_after = Status.SUCCESS
+
+
+class Fallback(Composite):
+    """Its children one after another, until one succeeds; also called a selector.
+
+    SUCCESS as soon as one succeeds, FAILURE when all have failed.
+    """
+
+    goes_on_after = Status.FAILURE
+
+
+Node = str | Condition | Composite
+
+
+def _child(child: Any, where: str) -> Node:
+    if isinstance(child, str | Condition | Composite):
+        return child
+    if callable(child) and not isinstance(child, type):
+        return Condition(child)
+    raise SkillweaveError(
+        f"{where} has the child {short(child)}; give a skill's name, a condition, a Sequence or a "
+        "Fallback"
+    )

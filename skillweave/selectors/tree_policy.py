@@ -1,0 +1,196 @@
+"""A behaviour tree as a policy over skills: all environments walk through it together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+
+from skillweave.collecting.calls import Why
+from skillweave.selectors.base import LastCall, ReadySelector, shown_obs
+from skillweave.selectors.tree import Composite, Condition, Node, Status
+from skillweave.skills.base import answer
+from skillweave.skills.foreign_policy import checksum, made_up
+from skillweave.types import Array, Memory, SkillweaveError, Step
+
+
+class TreeSelector(ReadySelector):
+    """A behaviour tree as a policy over skills.
+
+    Memory rows: ``leaf`` (the leaf whose call was the last, −1: none), ``succeeded`` (bool, whether
+    that call did), ``child`` (n, C) (of each sequence and fallback, the child under way).
+
+    Raises:
+        SkillweaveError: the tree has no skill; when it acts: it comes to its end without one.
+    """
+
+    kind = "tree"
+
+    def __init__(self, root: Composite) -> None:
+        super().__init__("tree")
+        self.root = root
+        self._plan = _Plan()
+        self._top = self._plan.add(root, lambda name: 0)
+        if not self._plan.leaves:
+            raise SkillweaveError(
+                "the tree has no skill: give at least one skill's name as a child"
+            )
+
+    def among(self, skills: tuple[str, ...]) -> Self:
+        """A copy that chooses among the skills of these names."""
+        found = super().among(skills)
+        found._plan = _Plan()
+        found._top = found._plan.add(self.root, lambda name: found._number(name, "tree: a leaf"))
+        return found
+
+    def start(self, n: int) -> Memory:
+        """Nothing is under way."""
+        return {
+            "leaf": np.full(n, -1),
+            "succeeded": np.zeros(n, bool),
+            "child": np.zeros((n, self._plan.composites), np.int64),
+        }
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """The skill of the leaf that each environment's tree comes to, (n,)."""
+        n = len(obs)
+        mask = np.ones((n, len(self.skills)), bool) if mask is None else mask
+        tick = _Tick(obs, mask, memory, self._who)
+        status = self._top.tick(tick, np.arange(n))
+        again = np.flatnonzero(status != Status.RUNNING)
+        if len(again):  # the whole tree is over: it begins anew
+            tick.begin(again)
+            status[again] = self._top.tick(tick, again)
+        if (status != Status.RUNNING).any():
+            row = int(np.flatnonzero(status != Status.RUNNING)[0])
+            raise SkillweaveError(
+                f"{self._who} came to its end ({Status(int(status[row])).name}) in observation "
+                f"{shown_obs(obs[row])} without a skill that may start there: add a Fallback whose "
+                "last child is a skill that may start everywhere"
+            )
+        after = {"leaf": tick.leaf, "succeeded": tick.succeeded, "child": tick.after}
+        return tick.skill, after
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """Keep whether the call under way has succeeded."""
+        over = last.why != Why.RUNNING
+        return memory | {"succeeded": np.where(over, last.succeeded, memory["succeeded"])}
+
+    def try_out(self) -> None:
+        """Ask every condition once about two made-up observations."""
+        tick = _Tick(made_up(self.observation_space, 2), np.ones((2, 1), bool), self.start(2),
+                     self._who)  # fmt: skip
+        for node in self._plan.asked:
+            node.tick(tick, np.arange(2))
+
+    def source(self) -> dict[str, Any]:
+        """The checksum of its nodes; of functions the names alone are in it."""
+        whole = json.dumps(_told(self.root))
+        return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
+
+
+def _told(node: Node) -> Any:
+    """A node as JSON."""
+    if isinstance(node, str):
+        return node
+    if isinstance(node, Condition):
+        return {"condition": node.name}
+    return {type(node).__name__: [_told(c) for c in node.children], "memory": node.memory}
+
+
+class _Tick:
+    """One walk of n environments through the tree, at a decision."""
+
+    def __init__(self, obs: Array, mask: Array, memory: Memory, who: str) -> None:
+        self.obs, self.mask, self.who = obs, mask, who
+        self.leaf, self.succeeded = memory["leaf"].copy(), memory["succeeded"]
+        self.before = memory["child"].copy()
+        # Zeros: what the walk does not come to is no longer under way.
+        self.after = np.zeros_like(self.before)
+        self.skill = np.zeros(len(obs), np.int64)
+
+    def begin(self, rows: Array) -> None:
+        """Environments ``rows`` begin at the root: nothing is under way."""
+        self.leaf[rows] = -1
+        self.before[rows] = self.after[rows] = 0
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    number: int
+    skill: int
+
+    def tick(self, tick: _Tick, rows: Array) -> Array:
+        """How its call ended, where it was the last; else its call begins."""
+        over = tick.leaf[rows] == self.number
+        status = np.where(tick.succeeded[rows], Status.SUCCESS, Status.FAILURE)
+        fresh = ~over
+        starts = tick.mask[rows, self.skill]
+        status[fresh] = np.where(starts[fresh], Status.RUNNING, Status.FAILURE)
+        begins = rows[fresh & starts]
+        tick.leaf[begins], tick.skill[begins] = self.number, self.skill
+        return status
+
+
+@dataclass(frozen=True)
+class _Asked:
+    condition: Condition
+
+    def tick(self, tick: _Tick, rows: Array) -> Array:
+        """What the condition says of the observations."""
+        function, name = self.condition.function, self.condition.name
+        holds = answer(function, tick.obs[rows], len(rows), bool, tick.who, name)
+        return np.where(holds, Status.SUCCESS, Status.FAILURE)
+
+
+@dataclass(frozen=True)
+class _Several:
+    number: int
+    memory: bool
+    goes_on_after: Status
+    children: tuple[_Several | _Asked | _Leaf, ...]
+
+    def tick(self, tick: _Tick, rows: Array) -> Array:
+        """The children in turn, until one of them decides."""
+        status = np.full(len(rows), self.goes_on_after)
+        first = tick.before[rows, self.number] if self.memory else np.zeros(len(rows), np.int64)
+        for i, child in enumerate(self.children):
+            here = np.flatnonzero((status == self.goes_on_after) & (first <= i))
+            if len(here):
+                status[here] = child.tick(tick, rows[here])
+                under_way = here[status[here] == Status.RUNNING]
+                tick.after[rows[under_way], self.number] = i
+        return status
+
+
+@dataclass
+class _Plan:
+    """The nodes of a tree with numbers, so that memories can be arrays."""
+
+    leaves: int = 0
+    composites: int = 0
+    asked: list[_Asked] = field(default_factory=list)
+
+    def add(self, node: Node, number_of: Callable[[str], int]) -> Any:
+        """A node with all below it."""
+        if isinstance(node, Condition):
+            self.asked.append(_Asked(node))
+            return self.asked[-1]
+        if isinstance(node, str):
+            self.leaves += 1
+            return _Leaf(self.leaves - 1, number_of(node))
+        self.composites += 1
+        number = self.composites - 1
+        children = tuple(self.add(child, number_of) for child in node.children)
+        return _Several(number, node.memory, node.goes_on_after, children)

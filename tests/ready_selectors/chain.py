@@ -1,0 +1,142 @@
+"""A corridor in which one thing must be done after another, and skills for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.collecting.calls import SkillSet
+from skillweave.envs.make import EnvSpec
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.selectors import ready_selector
+from skillweave.skills import Skill
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.types import Array, Step
+
+PLACE, KEY, DOOR = range(3)
+LAST = 6
+
+
+class Corridor(gym.Env):
+    """Places 0 to 6: the key lies at 0; with it the door at 6 opens; behind that, at 7, is the end.
+
+    An episode begins at a place from 1 to 5, drawn by its seed, and is cut after 40 steps. The last
+    step pays 1. Actions: to the left, stay, to the right.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.place, self.key, self.door, self.t = int(self.np_random.integers(1, 6)), 0, 0, 0
+        return self._obs(), {}
+
+    def step(self, action: int) -> Any:
+        self.t += 1
+        self.place = max(0, min(self.place + int(action) - 1, LAST + self.door))
+        self.key |= self.place == 0
+        self.door |= self.place == LAST and self.key
+        over = self.place > LAST
+        return self._obs(), float(over), over, self.t == 40, {"door": self.door}
+
+    def _obs(self) -> Array:
+        return np.array([self.place, self.key, self.door], np.float32)
+
+
+SPEC = EnvSpec(Corridor, engine="sync")
+
+
+def always(action: int) -> ScriptedPolicy:
+    return ScriptedPolicy(
+        lambda obs: np.full(len(obs), action), Corridor.observation_space, Corridor.action_space
+    )
+
+
+class GetKey(Skill):
+    """To the left until the key is there."""
+
+    policy = always(0)
+
+    def termination(self, step: Step) -> Array:
+        return step.next_obs[:, KEY] == 1
+
+
+class OpenDoor(Skill):
+    """To the right, at most 12 steps; it may start with the key only."""
+
+    max_steps = 12
+    policy = always(2)
+
+    def initiation(self, obs: Array) -> Array:
+        return obs[:, KEY] == 1
+
+    def success(self, step: Step) -> Array:
+        return step.next_obs[:, DOOR] == 1
+
+    def termination(self, step: Step) -> Array:
+        return step.next_obs[:, PLACE] == LAST
+
+
+class Leave(Skill):
+    """One step to the right."""
+
+    max_steps = 1
+    policy = always(2)
+
+
+class Wait(Skill):
+    """Two steps of nothing."""
+
+    max_steps = 2
+    policy = always(1)
+
+
+NAMES = ("get_key", "open_door", "leave", "wait")
+
+
+def has_key(obs: Array) -> Array:
+    return obs[:, KEY] == 1
+
+
+def got_key(step: Step) -> Array:
+    return step.next_obs[:, KEY] == 1
+
+
+def bound(selector: Any, names: tuple[str, ...] = NAMES) -> Any:
+    """A selector on the corridor's observations."""
+    found = ready_selector(selector, names)
+    assert found is not None
+    return found.bind(Corridor.observation_space, gym.spaces.Discrete(len(names)), "selector")
+
+
+def hierarchy(selector: Any, call_steps: int | None = None, skills: Any = ()) -> HierarchyPolicy:
+    skills = skills or (GetKey(), OpenDoor(), Leave(), Wait())
+    policies = tuple(s.policy for s in skills)
+    names = tuple(s.name for s in skills)
+    return HierarchyPolicy(bound(selector, names), SkillSet(skills, policies, (), call_steps))
+
+
+def story(policy: HierarchyPolicy, seed: int, most: int = 40) -> list[tuple[str, int]]:
+    """The calls of an episode: each skill's name and how many steps it lasted."""
+    env = Corridor()
+    obs, _ = env.reset(seed=seed)
+    memory, calls = policy.start(1), []
+    for t in range(most):
+        here = obs[None]
+        action, memory = policy.act(memory, here)
+        if memory["elapsed"][0] == 0:
+            calls.append([policy.labels[int(policy.acting(memory)[0])], 0])
+        calls[-1][1] += 1
+        obs, reward, terminated, truncated, info = env.step(int(action[0]))
+        step = Step(
+            here, action, obs[None], np.float32([reward]), np.array([terminated]),
+            np.array([truncated]), np.zeros(1, bool), np.array([t + 1]),
+            {"door": np.array([info["door"]])},
+        )  # fmt: skip
+        memory = policy.observe(memory, step)
+        if terminated or truncated:
+            break
+    return [tuple(c) for c in calls]

@@ -1,0 +1,193 @@
+"""Automata as selectors, by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from ready_selectors.chain import NAMES, Corridor, bound, got_key, hierarchy, story
+
+from skillweave import Automaton, SkillweaveError
+from skillweave.collecting.calls import Why
+from skillweave.selectors import LastCall
+from skillweave.types import Step
+
+STATES = {"search": "get_key", "unlock": "open_door", "free": "leave"}
+ARROWS = {("search", "unlock"): got_key, ("unlock", "free"): "success"}
+
+
+def step(numbers: Any) -> Step:
+    """A step of n environments whose next observations begin with these numbers."""
+    n = len(numbers)
+    obs, no = np.zeros((n, 3), np.float32), np.zeros(n, bool)
+    after = obs.copy()
+    after[:, 0] = numbers
+    return Step(obs, np.zeros(n, int), after, np.zeros(n, np.float32), no, no, no, np.ones(n), {})
+
+
+def call(why: Any, succeeded: Any) -> LastCall:
+    n = len(why)
+    return LastCall(np.zeros(n, int), np.array(why, np.int8), np.array(succeeded, bool))
+
+
+def above(limit: float) -> Any:
+    return lambda step: step.next_obs[:, 0] > limit
+
+
+def states(policy: Any, memory: Any) -> list[str]:
+    return [policy.state_names[i] for i in memory["state"]]
+
+
+def test_transitions_by_hand():
+    policy = bound(
+        Automaton(
+            {"low": "wait", "high": "leave", "over": {"wait", "leave"}},
+            {
+                ("low", "high"): above(1),
+                ("low", "over"): above(0),  # only where the one before has not happened
+                ("high", "high"): above(8),  # stays, so the next one is not looked at
+                ("high", "low"): above(7),
+                ("high", "over"): "success",
+                ("over", "low"): "failure",
+            },
+        )
+    )
+    memory = policy.start(5)
+    running = call([Why.RUNNING] * 5, [False] * 5)
+    assert states(policy, memory) == ["low"] * 5
+    memory = policy.watch(memory, step([0, 1, 2, 9, 0.5]), running)
+    # At most one transition in a step: 9 does not go on from high.
+    assert states(policy, memory) == ["low", "over", "high", "high", "over"]
+    memory = policy.watch(memory, step([0, 0, 7.5, 9, 0]), running)
+    assert states(policy, memory) == ["low", "over", "low", "high", "over"]
+    ended = call([Why.OWN, Why.LIMIT, Why.OWN, Why.OWN, Why.LIMIT], [1, 0, 1, 1, 1])
+    memory = policy.watch(memory, step([0] * 5), ended)
+    assert states(policy, memory) == ["low", "low", "low", "over", "over"]
+    # A call that goes on has neither succeeded nor failed.
+    memory = policy.watch(memory, step([0] * 5), running)
+    assert states(policy, memory) == ["low", "low", "low", "over", "over"]
+
+
+def test_the_skills_of_each_state_as_a_mask():
+    policy = bound(Automaton(STATES | {"end": {"wait", "leave"}}, ARROWS))
+    memory = {"state": np.array([0, 3, 2, 1])}
+    wanted = [{"get_key"}, {"leave", "wait"}, {"leave"}, {"open_door"}]
+    assert policy.allowed(memory).tolist() == [[n in some for n in NAMES] for some in wanted]
+
+
+def test_greedy_the_first_is_called_and_else_one_at_random():
+    in_order = bound(Automaton({"x": ["wait", "get_key", "leave"]}, {}))
+    of_a_set = bound(Automaton({"x": {"wait", "get_key", "leave"}}, {}))
+    n, obs = 3000, np.zeros((3000, 3), np.float32)
+    mask = np.ones((n, 4), bool)
+    mask[1::3, 0], mask[2::3, [0, 3]] = False, False
+    for policy, first in ((in_order, [3, 3, 2]), (of_a_set, [0, 2, 2])):
+        skill, _ = policy.act(policy.start(n), obs, mask)
+        assert skill.tolist() == first * 1000
+    skill, _ = in_order.act(
+        in_order.start(n), obs, mask, deterministic=False, rng=np.random.default_rng(0)
+    )
+    assert mask[np.arange(n), skill].all()
+    assert set(skill[::3]) == {0, 2, 3}
+    counts = np.bincount(skill[::3], minlength=4)
+    assert (np.abs(counts[[0, 2, 3]] - 333) < 60).all()  # four standard deviations
+    assert set(skill[1::3]) == {2, 3}
+    assert set(skill[2::3]) == {2}
+
+
+def test_it_solves_a_chain_of_skills():
+    policy = hierarchy(Automaton(STATES, ARROWS))
+    for seed in range(5):
+        place = int(Corridor().reset(seed=seed)[0][0])
+        assert story(policy, seed) == [("get_key", place), ("open_door", 6), ("leave", 1)]
+
+
+def test_a_transition_ends_no_call():
+    # The door opens, and waiting begins, within the call of a skill that goes on to the right.
+    arrows = {("search", "go"): got_key, ("go", "wait"): lambda step: step.info["door"] == 1}
+    automaton = Automaton({"search": "get_key", "go": "open_door", "wait": "wait"}, arrows)
+    place = int(Corridor().reset(seed=0)[0][0])
+    calls = story(hierarchy(automaton), 0, most=place + 6 + 5)
+    assert calls == [("get_key", place), ("open_door", 6), ("wait", 2), ("wait", 2), ("wait", 1)]
+    # Calls of one step: the transition counts at the next decision.
+    arrows = {("search", "go"): got_key, ("go", "wait"): above(2)}
+    automaton = Automaton({"search": "get_key", "go": "leave", "wait": "wait"}, arrows)
+    calls = story(hierarchy(automaton), 0, most=place + 5)
+    assert calls == [("get_key", place), ("leave", 1), ("leave", 1), ("leave", 1), ("wait", 2)]
+
+
+def test_an_automaton_whose_skills_may_not_start_says_so():
+    policy = hierarchy(Automaton({"all": {"open_door"}}, {}))
+    with pytest.raises(
+        SkillweaveError, match=r"state 'all' none of its skills \(open_door\).*init"
+    ):
+        story(policy, 0)
+    # The others of a state are called instead.
+    policy = hierarchy(Automaton({"all": ["open_door", "wait"]}, {}))
+    assert story(policy, 0)[0] == ("wait", 2)
+
+
+WRONG = {
+    "no states": (lambda: Automaton({}, {}), "give at least one"),
+    "no mapping": (lambda: Automaton(["a"], {}), r"states are \['a'\]"),
+    "a state without a skill": (lambda: Automaton({"a": []}, {}), "state 'a' has no skill"),
+    "an empty set": (lambda: Automaton({"a": set()}, {}), "state 'a' has no skill"),
+    "a number as a skill": (lambda: Automaton({"a": 3}, {}), "state 'a' has 3; give a skill's"),
+    "a number among skills": (lambda: Automaton({"a": [3]}, {}), "state 'a' has 3 among its"),
+    "a state's name": (lambda: Automaton({3: "wait"}, {}), "state is named 3"),
+    "the start": (lambda: Automaton(STATES, {}, "begin"), "start names the state 'begin'.*search"),
+    "to an unknown state": (
+        lambda: Automaton(STATES, {("search", "fre"): got_key}),
+        r"\('search', 'fre'\) names the state 'fre', which is not there; there are: search",
+    ),
+    "from an unknown state": (
+        lambda: Automaton(STATES, {("x", "free"): got_key}),
+        "names the state 'x'",
+    ),
+    "no pair": (lambda: Automaton(STATES, {"search": got_key}), "from 'search'; write"),
+    "transitions as a list": (lambda: Automaton(STATES, [got_key]), "transitions are"),
+    "an unknown event": (
+        lambda: Automaton(STATES, {("search", "free"): "won"}),
+        "has the event 'won'; give a function of a Step, 'success' or 'failure'",
+    ),
+    "an unknown skill": (
+        lambda: bound(Automaton({"a": "walk"}, {})),
+        "state 'a' names 'walk'.*there are: get_key, open_door",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_automaton_is_refused(case):
+    make, message = WRONG[case]
+    with pytest.raises(SkillweaveError, match=message):
+        make()
+
+
+def test_an_event_that_answers_wrongly_is_named():
+    def won(step: Step) -> Any:
+        return step.next_obs
+
+    automaton = Automaton(STATES, {("search", "free"): won})
+    with pytest.raises(SkillweaveError, match=r"automaton: won\(\) returned shape \(1, 3\)"):
+        story(hierarchy(automaton), 0)
+    automaton = Automaton(STATES, {("search", "free"): lambda step: step.info["nothing"]})
+    with pytest.raises(SkillweaveError, match="KeyError: 'nothing'"):
+        story(hierarchy(automaton), 0)
+
+
+def test_its_checksum_is_of_its_structure():
+    def source(*arguments: Any) -> str:
+        return Automaton(*arguments).source()["sha256"]
+
+    assert source(STATES, ARROWS) == source(dict(STATES), dict(ARROWS))
+    others = [
+        source(STATES, ARROWS, "free"),
+        source(STATES | {"free": "wait"}, ARROWS),
+        source(STATES | {"free": ["leave", "wait"]}, ARROWS),
+        source(STATES | {"free": {"leave", "wait"}}, ARROWS),
+        source(STATES, ARROWS | {("free", "search"): "failure"}),
+        source(STATES, dict(reversed(ARROWS.items()))),
+    ]
+    assert len({source(STATES, ARROWS), *others}) == len(others) + 1

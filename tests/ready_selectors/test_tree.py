@@ -1,0 +1,241 @@
+"""Behaviour trees: by hand, and against a tree that is walked one environment at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from ready_selectors.chain import Corridor, has_key, hierarchy, story
+
+from skillweave import SkillweaveError, tree
+from skillweave.collecting.calls import Why
+from skillweave.selectors import LastCall
+from skillweave.selectors.ready import ready_selector
+from skillweave.selectors.tree_policy import TreeSelector
+
+ABC = ("a", "b", "c")
+S, F = True, False
+"""How calls end: with success, or with failure."""
+
+
+def flag(i: int) -> Any:
+    """The condition that the i-th number of the observation is not 0."""
+    return tree.Condition(lambda obs: obs[:, i] != 0, f"flag {i}")
+
+
+def made(root: Any, names: tuple[str, ...] = ABC) -> TreeSelector:
+    found = ready_selector(root, names)
+    space = gym.spaces.Box(-9, 9, (3,), np.float32)
+    return found.bind(space, gym.spaces.Discrete(len(names)), "selector")
+
+
+def told(policy: Any, memory: Any, succeeded: Any) -> Any:
+    """The memory after calls that ended so."""
+    n = len(succeeded)
+    why = np.full(n, Why.OWN, np.int8)
+    return policy.watch(memory, None, LastCall(np.zeros(n, int), why, np.array(succeeded)))
+
+
+def chosen(root: Any, ends: list[bool], flags: Any = (), masks: Any = ()) -> str:
+    """The skills that are called one after another, where calls end so; one letter each."""
+    policy, names = made(root), ""
+    memory = policy.start(1)
+    for i in range(len(ends) + 1):
+        obs = np.float32([flags[i] if len(flags) else (0, 0, 0)])
+        mask = np.array([masks[i]], bool) if len(masks) else None
+        skill, memory = policy.act(memory, obs, mask)
+        names += ABC[int(skill[0])]
+        if i < len(ends):
+            memory = told(policy, memory, [ends[i]])
+    return names
+
+
+@pytest.mark.parametrize(
+    ("root", "ends", "calls"),
+    [
+        # A sequence goes on after a success, and begins anew after a failure or its end.
+        (tree.Sequence("a", "b"), [S, S, S, S], "ababa"),
+        (tree.Sequence("a", "b", "c"), [S, F, S, S, S], "ababca"),
+        (tree.Sequence("a"), [S, F, S], "aaaa"),
+        # A fallback goes on after a failure.
+        (tree.Fallback("a", "b"), [F, F, F, S], "ababa"),
+        (tree.Fallback("a", "b", "c"), [F, F, S, S], "abcaa"),
+        # One within the other: (a or b), then c.
+        (tree.Sequence(tree.Fallback("a", "b"), "c"), [S, S], "aca"),
+        (tree.Sequence(tree.Fallback("a", "b"), "c"), [F, S, S], "abca"),
+        (tree.Sequence(tree.Fallback("a", "b"), "c"), [F, F, S], "abac"),
+        (tree.Fallback(tree.Sequence("a", "b"), "c"), [S, F, F], "abca"),
+        # Twice the same skill: two leaves.
+        (tree.Sequence("a", "a", "b"), [S, S, S], "aaba"),
+        # Without memory the first child's turn comes again, so c is never called, and how b ends
+        # is not asked: whoever was passed over is no longer under way.
+        (tree.Sequence("a", "b", "c", memory=False), [S, S, S, S], "ababa"),
+        (tree.Fallback("a", "b", "c", memory=False), [F, F, F, F], "ababa"),
+        (tree.Fallback("a", "b", "c", memory=False), [F, S, S], "abaa"),
+    ],
+)
+def test_the_skills_that_are_called_by_hand(root, ends, calls):
+    assert chosen(root, ends) == calls
+
+
+def test_a_condition_is_asked_again_where_there_is_no_memory():
+    flags = [(0, 0, 0), (1, 0, 0), (1, 0, 0), (0, 0, 0), (0, 0, 0)]
+    # a as long as the flag is not set; then b, then c.
+    goes_on = tree.Sequence(tree.Fallback(flag(0), "a"), "b", "c")
+    assert chosen(goes_on, [S, S, S, S], flags) == "abcab"
+    # Looked at again at every decision: where the flag is gone, a is called instead of c's end.
+    looks = tree.Sequence(tree.Fallback(flag(0), "a"), tree.Sequence("b", "c"), memory=False)
+    assert chosen(looks, [S, S, S, S], flags) == "abcab"
+    flags = [(1, 0, 0), (0, 0, 0), (1, 0, 0), (1, 0, 0), (1, 0, 0)]
+    assert chosen(goes_on, [S, S, S, S], flags) == "bcbcb"
+    # The inner sequence, too, begins anew after it was passed over.
+    assert chosen(looks, [S, S, S, S], flags) == "babcb"
+
+
+def test_a_bare_function_is_a_condition_and_is_named_after_it():
+    node = tree.Sequence(has_key, "a")
+    assert isinstance(node.children[0], tree.Condition)
+    assert node.children[0].name == "has_key"
+
+
+def test_a_skill_that_may_not_start_has_failed_at_once():
+    only_b, all_of_them = (False, True, False), (True, True, True)
+    root = tree.Fallback("a", "b")
+    assert chosen(root, [S, S], masks=[only_b, all_of_them, only_b]) == "bab"
+    root = tree.Fallback(tree.Sequence("a", "c"), "b")
+    assert chosen(root, [S, S], masks=[all_of_them, only_b, all_of_them]) == "aba"
+
+
+def test_a_tree_that_ends_without_a_skill_says_where():
+    with pytest.raises(SkillweaveError, match=r"tree came to its end \(FAILURE\).*\[0. 7. 0.\]"):
+        chosen(tree.Sequence(flag(0), "a"), [], [(0, 7, 0)])
+    with pytest.raises(SkillweaveError, match=r"tree came to its end \(SUCCESS\).*Fallback"):
+        chosen(tree.Fallback(flag(0), "a"), [], [(1, 0, 0)])
+    with pytest.raises(SkillweaveError, match="without a skill that may start"):
+        chosen(tree.Sequence("a", "b"), [], masks=[(False, True, True)])
+
+
+WRONG = {
+    "no children": (lambda: tree.Sequence(), "Sequence has no children"),
+    "a number as a child": (lambda: tree.Fallback("a", 3), "Fallback has the child 3"),
+    "a list as a child": (lambda: tree.Sequence(["a"]), r"has the child \['a'\]"),
+    "a class as a child": (lambda: tree.Sequence(tree.Fallback), "has the child <class"),
+    "memory": (lambda: tree.Sequence("a", memory=1), "memory is 1"),
+    "no skill": (lambda: made(tree.Sequence(flag(0))), "tree has no skill"),
+    "no function": (lambda: tree.Condition("a"), "Condition is 'a'.*function of observations"),
+    "an unknown skill": (
+        lambda: made(tree.Sequence("a", tree.Fallback("d"))),
+        "leaf names 'd'.*there are: a, b, c",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_tree_is_refused(case):
+    make, message = WRONG[case]
+    with pytest.raises(SkillweaveError, match=message):
+        make()
+
+
+def test_a_condition_that_answers_wrongly_is_named():
+    with pytest.raises(SkillweaveError, match=r"selector: tree: tall\(\) returned shape \(3,\)"):
+        chosen(tree.Sequence(tree.Condition(lambda obs: obs[0] > 1, "tall"), "a"), [])
+    with pytest.raises(SkillweaveError, match=r"tall.*yes or no"):
+        made(tree.Sequence(tree.Condition(lambda obs: obs[:, 0] + 0.5, "tall"), "a")).try_out()
+
+
+class Plain:
+    """A tree as it is defined, walked for one environment."""
+
+    def __init__(self, root: Any) -> None:
+        self.root, self.under_way, self.last = root, {}, None
+
+    def choose(self, obs: Any, mask: Any, succeeded: bool) -> int | None:
+        for _ in range(2):
+            self.came_to: dict[tuple[int, ...], int] = {}
+            status, leaf = self.tick(self.root, (), obs, mask, succeeded)
+            self.under_way = self.came_to
+            if status == "running":
+                self.last = leaf
+                return ABC.index(self.name_at(leaf))
+            self.last = None
+        return None
+
+    def name_at(self, path: Any) -> str:
+        node = self.root
+        for i in path:
+            node = node.children[i]
+        return node
+
+    def tick(self, node: Any, path: Any, obs: Any, mask: Any, succeeded: bool) -> Any:
+        if isinstance(node, str):
+            if self.last == path:
+                self.last = None
+                return ("success" if succeeded else "failure"), None
+            return ("running", path) if mask[ABC.index(node)] else ("failure", None)
+        if isinstance(node, tree.Condition):
+            return ("success" if node.function(obs[None])[0] else "failure"), None
+        first = self.under_way.get(path, 0) if node.memory else 0
+        goes_on = "success" if isinstance(node, tree.Sequence) else "failure"
+        for i in range(first, len(node.children)):
+            status, leaf = self.tick(node.children[i], (*path, i), obs, mask, succeeded)
+            if status == "running":
+                self.came_to[path] = i
+            if status != goes_on:
+                return status, leaf
+        return goes_on, None
+
+
+def random_tree(rng: Any, depth: int = 0) -> Any:
+    kind = tree.Sequence if rng.random() < 0.5 else tree.Fallback
+    children = [
+        random_tree(rng, depth + 1) if depth < 3 and rng.random() < 0.4
+        else flag(int(rng.integers(3))) if rng.random() < 0.3
+        else str(rng.choice(ABC))
+        for _ in range(rng.integers(1, 4))
+    ]  # fmt: skip
+    return kind(*children, memory=bool(rng.random() < 0.6))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_many_environments_at_once_are_each_as_the_definition_says(seed):
+    rng = np.random.default_rng(seed)
+    # The last resort lets every tree come to a skill.
+    root = tree.Fallback(random_tree(rng), random_tree(rng), "a", memory=bool(seed % 2))
+    n, policy = 5, made(root)
+    plain, memory = [Plain(root) for _ in range(n)], policy.start(n)
+    assert all(v.dtype.kind in "bi" for v in memory.values())
+    ended = np.zeros(n, bool)
+    for _ in range(30):
+        obs = rng.integers(2, size=(n, 3)).astype(np.float32)
+        mask = rng.random((n, 3)) < 0.8
+        mask[:, 0] = True
+        # Only some decide: their calls are over.
+        rows = np.flatnonzero(rng.random(n) < 0.7) if memory["leaf"].min() >= 0 else np.arange(n)
+        if not len(rows):
+            continue
+        wanted = [plain[i].choose(obs[i], mask[i], ended[i]) for i in rows]
+        own = {k: v[rows] for k, v in memory.items()}
+        if None in wanted:  # conditions that hold can bring a tree to its end without a skill
+            with pytest.raises(SkillweaveError, match="came to its end"):
+                policy.act(own, obs[rows], mask[rows])
+            return
+        skill, own = policy.act(own, obs[rows], mask[rows])
+        assert skill.tolist() == wanted
+        for k, v in own.items():
+            memory[k][rows] = v
+        ended = rng.random(n) < 0.5
+        memory = told(policy, memory, ended)
+
+
+def test_a_chain_of_skills_on_the_corridor():
+    seed = 3
+    place = int(Corridor().reset(seed=seed)[0][0])
+    root = tree.Sequence(tree.Fallback(has_key, "get_key"), "open_door", "leave")
+    assert story(hierarchy(root), seed) == [("get_key", place), ("open_door", 6), ("leave", 1)]
+    # In calls of 4: whoever is cut has failed, and the tree begins anew.
+    calls = [("get_key", 4), ("get_key", 1)] if place == 5 else [("get_key", place)]
+    calls += [("open_door", 4), ("open_door", 2), ("leave", 1)]
+    assert story(hierarchy(root, call_steps=4), seed) == calls
