@@ -174,7 +174,7 @@ class SkillSet:
             mine = np.flatnonzero(running == i)
             if not len(mine):
                 continue
-            part = _rows(step, mine, elapsed[mine], skill.max_steps)
+            part = skill_step(step, mine, elapsed[mine], skill.max_steps)
             own = self._own(memory, i, rows[mine])
             self._put(memory, i, rows[mine], policy.observe(own, part))
             if skill.defines("termination"):
@@ -191,8 +191,8 @@ class SkillSet:
             memory[f"{i}.{k}"][rows] = v
 
 
-def _rows(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
-    """Some rows of a step, with the time as the running skill counts it."""
+def skill_step(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
+    """Rows (m,) of a step, with the time as the running skill counts it: ``elapsed`` (m,) steps."""
     timed_out = np.zeros(len(rows), bool)
     if max_steps is not None:
         timed_out = (elapsed >= max_steps) & ~step.terminated[rows]
