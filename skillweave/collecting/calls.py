@@ -192,12 +192,18 @@ class SkillSet:
 
 
 def skill_step(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
-    """Rows (m,) of a step, with the time as the running skill counts it: ``elapsed`` (m,) steps."""
+    """Rows (m,) of a step, ascending, with the time as the running skill counts it.
+
+    ``elapsed`` (m,) are the steps of its calls so far.
+    """
+    every = len(rows) == len(step.reward)  # then there is nothing to copy
+    at = slice(None) if every else rows
+    terminated = step.terminated[at]
     timed_out = np.zeros(len(rows), bool)
     if max_steps is not None:
-        timed_out = (elapsed >= max_steps) & ~step.terminated[rows]
-    info = info_rows(step.info, rows, len(step.reward))
+        timed_out = (elapsed >= max_steps) & ~terminated
+    info = step.info if every else info_rows(step.info, rows, len(step.reward))
     return Step(
-        step.obs[rows], step.action[rows], step.next_obs[rows], step.reward[rows],
-        step.terminated[rows], step.truncated[rows], timed_out, elapsed, info,
+        step.obs[at], step.action[at], step.next_obs[at], step.reward[at],
+        terminated, step.truncated[at], timed_out, elapsed, info,
     )  # fmt: skip

@@ -101,7 +101,8 @@ class SkillTally:
         why = played.why.copy()
         why[(why == Why.RUNNING) & played.over] = Why.EPISODE
         ended = np.flatnonzero(why != Why.RUNNING)
-        np.add.at(self._ended, (acting[ended], why[ended]), 1)
+        pairs = acting[ended] * len(Why) + why[ended]
+        self._ended += np.bincount(pairs, minlength=self._ended.size).reshape(self._ended.shape)
         own = played.reward
         for i, skill in enumerate(skills.skills):
             if skill.defines("reward"):
@@ -150,7 +151,7 @@ def _ask(
 def skill_table(skills: Mapping[str, SkillReport]) -> str:
     """The reports as an aligned table for people, a line for each skill."""
     total = sum(report.steps for report in skills.values())
-    head = ["skill", "share", "calls", "length", *(f"{name}" for name in ENDS.values())]
+    head = ["skill", "share", "calls", "length", *ENDS.values()]
     rows = [[*head, "success", "return"]]
     for name, report in skills.items():
         ends = [
