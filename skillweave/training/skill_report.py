@@ -11,6 +11,7 @@ import numpy as np
 from skillweave.collecting.calls import SkillSet, Why, skill_step
 from skillweave.reading import Count
 from skillweave.skills import asked
+from skillweave.skills.base import RecordedSkill
 from skillweave.training.play import Played
 from skillweave.types import Array, Policy
 
@@ -23,7 +24,8 @@ class SkillReport:
     """What one skill did in all episodes of an evaluation.
 
     Calls are those of the policy's own selector: a hierarchy that is a skill of another counts as
-    one skill. What needs the skill's declaration is not known of a policy that is no hierarchy.
+    one skill. What needs the skills' declarations is not known of a policy that is no hierarchy,
+    and its reward and success not of a run that was loaded without its code.
     """
 
     steps: Count
@@ -36,9 +38,9 @@ class SkillReport:
     known."""
     succeeded: Count | None
     """Calls whose last step ``success`` says yes to; None: the skill does not define it."""
-    return_sum: float
+    return_sum: float | None
     """Sum of its own reward over its steps, not discounted; of the environment's reward where the
-    skill defines none."""
+    skill defines none. None: not known."""
 
     @property
     def length_mean(self) -> float | None:
@@ -52,8 +54,8 @@ class SkillReport:
 
     @property
     def return_mean(self) -> float | None:
-        """Mean sum of its own reward over a call; None: there was none."""
-        return self.return_sum / self.calls if self.calls else None
+        """Mean sum of its own reward over a call; None: no calls, or not known."""
+        return None if self.return_sum is None or not self.calls else self.return_sum / self.calls
 
     def to_json(self, total: int) -> dict[str, Any]:
         """The report as plain JSON; ``total`` are the steps of all skills."""
@@ -123,10 +125,14 @@ class SkillTally:
         return {
             name: SkillReport(
                 int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
-                float(returns[i]),
+                float(returns[i]) if self._known(i) else None,
             )
             for i, name in enumerate(self.labels)
         }  # fmt: skip
+
+    def _known(self, i: int) -> bool:
+        """Whether the reward of skill ``i`` is."""
+        return self.skills is not None and not isinstance(self.skills.skills[i], RecordedSkill)
 
     def _ends(self, i: int) -> dict[str, int]:
         if self.skills is None:
