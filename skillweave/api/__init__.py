@@ -24,7 +24,7 @@ from skillweave.messages import short, whole_number
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
-from skillweave.skills import Skill
+from skillweave.skills.base import RecordedSkill
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
 from skillweave.types import SkillweaveError
@@ -152,7 +152,7 @@ class Hierarchy(Declaration):
         """The hierarchy of a run that needs none of the user's code (plain data says it all)."""
         told = ("name", "max_steps", "call_steps")
         skills = [
-            type(s["name"], (Skill,), {k: s[k] for k in told if k in s})()
+            type(s["name"], (RecordedSkill,), {k: s[k] for k in told if k in s})()
             for s in manifest["skills"]
         ]
         calls = calls_from_json(manifest)

@@ -14,6 +14,7 @@ from skillweave.reporting.video import color_of, render_policy
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
+from skillweave.training.evaluation_file import load_evaluation, save_evaluation
 from skillweave.training.plain_agent import AGENT, PlainAgent
 from skillweave.types import Memory, Policy, SkillweaveError
 
@@ -46,6 +47,7 @@ class Run:
         deterministic: bool = True,
         skill: str | None = None,
         max_steps: int | None = None,
+        save: bool = False,
     ) -> Evaluation:
         """Score it on Gymnasium's environment.
 
@@ -59,8 +61,12 @@ class Run:
                 (``reflexes_in_training=False``).
             max_steps: an episode that nothing has ended by then is cut, and the result says so;
                 None: the environment's own time limit, or 100,000 steps.
+            save: keep the result in the run's directory, where ``info`` finds it; it takes the
+                place of the one before. Of the whole policy only.
         """
-        return evaluate(
+        if save and skill is not None:
+            raise SkillweaveError("save keeps an evaluation of the whole policy: leave out skill")
+        found = evaluate(
             self._policy(skill),
             self.declaration.spec,
             episodes=episodes,
@@ -68,6 +74,9 @@ class Run:
             deterministic=deterministic,
             max_steps=max_steps,
         )
+        if save:
+            save_evaluation(RunDirectory.open(self.path), found, seed, deterministic)
+        return found
 
     def render(
         self,
@@ -120,8 +129,10 @@ class Run:
         return skill
 
     def info(self) -> dict[str, Any]:
-        """The manifest of its run."""
-        return RunDirectory.open(self.path).manifest
+        """The manifest of its run, and under ``evaluation`` the latest one that was saved."""
+        run = RunDirectory.open(self.path)
+        saved = load_evaluation(run)
+        return run.manifest | ({} if saved is None else {"evaluation": saved.to_json()})
 
     def _policy(self, skill: str | None) -> Policy:
         if skill is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ from skillweave.api import Agent, Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides, list_settings
+from skillweave.cli.run_lines import run_lines
 from skillweave.compat.agilerl_files import convert
 from skillweave.hierarchy.weights import open_weights
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
+from skillweave.training.evaluation import Evaluation
+from skillweave.training.evaluation_file import load_evaluation, save_evaluation
 from skillweave.types import SkillweaveError
 
 
@@ -86,7 +90,9 @@ def _evaluate(command: commands.Evaluate) -> None:
     )
     result = {"target": command.target, "env": target.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}
-    _tell(command, result | score.to_json(), str(score))
+    if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
+        _save(target, score, command.seed, command.deterministic)
+    _tell(command, result | score.to_json(), score.for_people())
 
 
 def _render(command: commands.Render) -> None:
@@ -132,32 +138,9 @@ def _info(command: commands.Info) -> None:
         return
     found = RunDirectory.open(command.target)
     m = found.manifest
-    lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
-    calls = f", call_steps {m['call_steps']}" if m["kind"] == "hierarchy" else ""
-    calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
-    lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}{calls}"]
-    lines += [
-        f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
-    ]
-    for p in m["stages"]:
-        final = p.get("final", {}).get("return")
-        lines.append(
-            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
-            f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
-            f"{'' if final is None else f'{final:.1f}':>8}"
-        )
-        if reached := p.get("reached"):
-            lines.append(
-                f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "
-                f"{p['target']['of']} {reached['value']:g}"
-            )
-        if winner := p.get("winner"):
-            lines.append(
-                f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
-                f"fitness {winner['fitness']:.1f} (skillweave plot {command.target})"
-            )
-    lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
-    _tell(command, m, "\n".join(lines))
+    saved = load_evaluation(found)
+    told = {} if saved is None else {"evaluation": saved.to_json()}
+    _tell(command, m | told, "\n".join(run_lines(m, saved, command.target)))
 
 
 def _weights(command: commands.Weights) -> None:
@@ -232,7 +215,8 @@ def _tell_trained(
     if episodes:
         score = trained.evaluate(episodes)
         result["evaluation"] = score.to_json()
-        lines.append(f"score   {score}")
+        _save(trained, score)
+        lines.append(f"score   {score.for_people()}")
     if render:
         film = trained.render(trained.path / f"{manifest['kind']}.gif")
         result["film"] = film
@@ -243,6 +227,14 @@ def _tell_trained(
 
 def _tell(command: commands.Output, data: dict[str, Any], text: str) -> None:
     print(json.dumps(data, default=str) if command.json else text)
+
+
+def _save(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = True) -> None:
+    """Keep a score in its run for ``info``; one that cannot be written is told all the same."""
+    try:
+        save_evaluation(RunDirectory.open(trained.path), score, seed, deterministic)
+    except SkillweaveError as error:
+        print(f"the evaluation is not kept in the run: {error}", file=sys.stderr)
 
 
 def _interrupted(path: Path) -> KeyboardInterrupt:

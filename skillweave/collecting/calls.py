@@ -292,7 +292,7 @@ class SkillSet:
             mine = np.flatnonzero(running == i)
             if not len(mine):
                 continue
-            part = rows_of(step, mine, elapsed[mine], skill.max_steps)
+            part = skill_step(step, mine, elapsed[mine], skill.max_steps)
             own = self._own(memory, i, rows[mine])
             self._put(memory, i, rows[mine], policy.observe(own, part))
             if skill.defines("termination"):
@@ -329,7 +329,7 @@ class SkillSet:
                 continue
             over = np.flatnonzero((running == i) & (why != Why.RUNNING))
             if len(over):
-                part = rows_of(step, over, elapsed[over], skill.max_steps)
+                part = skill_step(step, over, elapsed[over], skill.max_steps)
                 found[over] = asked(skill, "success", part, len(over), elapsed[over], rows[over])
         return found
 
@@ -342,13 +342,19 @@ class SkillSet:
             memory[f"{i}.{k}"][rows] = v
 
 
-def rows_of(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
-    """Some rows of a step, with the time as the running skill counts it."""
+def skill_step(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
+    """Rows (m,) of a step, ascending, with the time as the running skill counts it.
+
+    ``elapsed`` (m,) are the steps of its calls so far.
+    """
+    every = len(rows) == len(step.reward)  # then there is nothing to copy
+    at = slice(None) if every else rows
+    terminated = step.terminated[at]
     timed_out = np.zeros(len(rows), bool)
     if max_steps is not None:
-        timed_out = (elapsed >= max_steps) & ~step.terminated[rows]
-    info = info_rows(step.info, rows, len(step.reward))
+        timed_out = (elapsed >= max_steps) & ~terminated
+    info = step.info if every else info_rows(step.info, rows, len(step.reward))
     return Step(
-        step.obs[rows], step.action[rows], step.next_obs[rows], step.reward[rows],
-        step.terminated[rows], step.truncated[rows], timed_out, elapsed, info,
+        step.obs[at], step.action[at], step.next_obs[at], step.reward[at],
+        terminated, step.truncated[at], timed_out, elapsed, info,
     )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acted, Acting, Request
-from skillweave.collecting.calls import Interruption, SkillSet, Why, rows_of
+from skillweave.collecting.calls import Interruption, SkillSet, Why, skill_step
 from skillweave.collecting.columns import stacked
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.envs.engine import Engine, RawStep
@@ -150,14 +150,14 @@ class WovenCollector(DecisionCollector):
         """What a step was to skill ``i``, in environments ``mine`` (k,)."""
         assert self._rows is not None
         skill, elapsed = self.skills.skills[i], self._calls["elapsed"][mine]
-        part = rows_of(step, mine, elapsed, skill.max_steps)
+        part = skill_step(step, mine, elapsed, skill.max_steps)
         reward = asked(skill, "reward", part, len(mine), elapsed, mine)
         terminated = part.terminated.copy()
         terminated[why == Why.OWN] = True
         if skill.defines("termination"):  # an episode's last step may be its own end, too
             last = np.flatnonzero((why == Why.EPISODE) & ~terminated)
             if len(last):
-                own = rows_of(step, mine[last], elapsed[last], skill.max_steps)
+                own = skill_step(step, mine[last], elapsed[last], skill.max_steps)
                 ends = asked(skill, "termination", own, len(last), elapsed[last], mine[last])
                 terminated[last] |= ends
         over = (why != Why.RUNNING) & ~terminated

@@ -120,6 +120,7 @@ class SkillAlone:
         self.observation_space = self.policy.observation_space
         self.action_space = self.policy.action_space
         self.labels = self.policy.labels
+        self.skills = getattr(self.policy, "skills", None)  # of a skill that is a hierarchy
         self.start, self.observe = self.policy.start, self.policy.observe
         self.acting = self.policy.acting
 

@@ -3,6 +3,7 @@
 run.json                     what is trained, with which settings, seeds and versions; stages
 metrics.jsonl                a line for every update
 lineage.jsonl                a line for every member of every generation, where populations evolve
+evaluation.json              the latest evaluation (``training/evaluation_file.py``)
 checkpoint.safetensors       the stage under way, at its latest clean cut (and the one before)
 policies/<stage>.safetensors finished stages
 policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights

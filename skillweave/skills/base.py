@@ -106,6 +106,10 @@ class Skill:
                 )
 
 
+class RecordedSkill(Skill):
+    """A skill of a run that was loaded without its code: its reward and success are not known."""
+
+
 class Reflex:
     """A rule that overrides the running skill's action while its condition holds.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 from typing import Any
 
@@ -12,8 +12,10 @@ import numpy as np
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.messages import whole_number
+from skillweave.reading import Count, Positive
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
+from skillweave.training.skill_report import SkillReport, SkillTally, skill_table
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
@@ -25,16 +27,32 @@ class Evaluation:
     """Scores of whole episodes; ``str()`` is a line for people."""
 
     returns: tuple[float, ...]
-    lengths: tuple[int, ...]
+    lengths: tuple[Positive, ...]
     threshold: float | None  # the environment's reward_threshold
-    skill_steps: dict[str, int]  # steps of each skill
-    skill_calls: dict[str, int]  # calls of each skill
-    cut: int = 0  # episodes that nothing had ended when they were cut
+    skills: dict[str, SkillReport] = field(default_factory=dict)  # none: a plain agent
+    cut: Count = 0  # episodes that nothing had ended when they were cut
+
+    def __post_init__(self) -> None:
+        if not self.returns or len(self.returns) != len(self.lengths):
+            raise SkillweaveError(
+                f"{len(self.returns)} returns and {len(self.lengths)} lengths; every episode has "
+                "one of each, and there is at least one episode"
+            )
 
     @property
     def mean(self) -> float:
         """Mean return."""
         return float(np.mean(self.returns))
+
+    @property
+    def skill_steps(self) -> dict[str, int]:
+        """Steps of each skill."""
+        return {name: report.steps for name, report in self.skills.items()}
+
+    @property
+    def skill_calls(self) -> dict[str, int]:
+        """Calls of each skill."""
+        return {name: report.calls for name, report in self.skills.items()}
 
     @property
     def solved_fraction(self) -> float | None:
@@ -50,6 +68,7 @@ class Evaluation:
         std = float(returns.std(ddof=1)) if n > 1 else 0.0
         half = 1.96 * std / np.sqrt(n)
         total = sum(self.skill_steps.values())
+        skills = {name: report.to_json(total) for name, report in self.skills.items()}
         return {
             "episodes": n,
             "mean": self.mean,
@@ -63,13 +82,14 @@ class Evaluation:
             "solved_fraction": self.solved_fraction,
             "length_mean": float(np.mean(self.lengths)),
             "cut": self.cut,
-            "skill_usage": {k: v / total for k, v in self.skill_steps.items()},
-            "call_length_mean": {
-                k: v / self.skill_calls[k]
-                for k, v in self.skill_steps.items()
-                if self.skill_calls[k]
-            },
+            "skill_usage": {k: v["share"] for k, v in skills.items()},
+            "call_length_mean": {k: v["length_mean"] for k, v in skills.items() if v["calls"]},
+            "skills": skills,
         }
+
+    def for_people(self) -> str:
+        """``str()``, and for a hierarchy a table with a line for each skill."""
+        return "\n".join([str(self), *([skill_table(self.skills)] if self.skills else [])])
 
     def __str__(self) -> str:
         j = self.to_json()
@@ -82,7 +102,7 @@ class Evaluation:
         line += f", {j['length_mean']:.0f} steps an episode"
         if self.cut:
             line += f"; {self.cut} never ended and were cut after {max(self.lengths):,} steps"
-        if self.skill_steps:
+        if self.skills:
             shares = ", ".join(f"{k} {v:.0%}" for k, v in j["skill_usage"].items())
             line += f"; skills: {shares}"
         return line
@@ -147,23 +167,13 @@ def evaluate(
 def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluation:
     """The scores of episodes as they are played."""
     returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
-    used = np.zeros(len(policy.labels), np.int64)
-    calls = np.zeros(len(policy.labels), np.int64)
+    tally = SkillTally(policy, episodes)
     for played in moments:
         returns[played.episode] += played.reward
         lengths[played.episode] += played.lasted
         cut += int(played.cut.sum())
-        if played.acting is not None:
-            used += np.bincount(played.acting, minlength=len(used))
-            calls += np.bincount(played.acting[played.begun], minlength=len(calls))
-    return Evaluation(
-        tuple(returns.tolist()),
-        tuple(lengths.tolist()),
-        None,
-        dict(zip(policy.labels, used.tolist(), strict=True)),
-        dict(zip(policy.labels, calls.tolist(), strict=True)),
-        cut,
-    )
+        tally.add(played)
+    return Evaluation(tuple(returns.tolist()), tuple(lengths.tolist()), None, tally.reports(), cut)
 
 
 def _check_spaces(policy: Policy, observation: Any, action: Any, name: str) -> None:

@@ -25,6 +25,8 @@ class Played:
     cut: Array  # (k,) bool: nothing had ended the episode when it became too long
     acting: Array | None = None  # (k,) int64, the skill that acted; None: no skills below
     begun: Array | None = None  # (k,) bool: a call of that skill began
+    elapsed: Array | None = None  # (k,) int64, steps of its call so far; None: not told
+    why: Array | None = None  # (k,) int8, the policy's ``Why`` its call has ended; None: not told
 
     @property
     def over(self) -> Array:
@@ -82,7 +84,9 @@ def play(
         begun = own["elapsed"] == 0 if "elapsed" in own else np.zeros(len(rows), bool)
         played = episodes.step(action)
         played.acting, played.begun = acting, begun
-        for k, v in policy.observe(own, played.step).items():
+        after = policy.observe(own, played.step)
+        played.elapsed, played.why = after.get("elapsed"), after.get("why")
+        for k, v in after.items():
             memory[k][rows] = v
         yield played
         fresh = episodes.go_on(played)

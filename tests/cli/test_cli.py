@@ -16,6 +16,7 @@ import pytest
 from skillweave import recipes
 from skillweave.cli import main
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
+from skillweave.types import SkillweaveError
 
 COMMANDS = ("train", "resume", "evaluate", "render", "list", "info", "weights", "import-agilerl")
 
@@ -309,8 +310,14 @@ def test_evaluate_tells_people_a_line_and_programs_every_number(
 ) -> None:
     answer = call("evaluate", trained.plain_run, "--episodes", 4)
     assert answer.code == 0
-    assert answer.out.count("\n") == 1
-    assert "over 4 episodes" in answer.out
+    line, head, left, balance = answer.out.splitlines()
+    assert "over 4 episodes" in line
+    assert head.split() == [
+        "skill", "share", "calls", "length", "own", "limit", "interrupted", "episode", "success",
+        "return",
+    ]  # fmt: skip
+    assert (left.split()[0], balance.split()[0]) == ("left", "balance")
+    assert len({len(row) for row in (head, left, balance)}) == 1, "aligned"
     found = call("evaluate", trained.plain_run, "--episodes", 4, "--json").json
     assert set(found) >= KEYS | {"target", "env", "seed", "deterministic", "skill"}
     assert found["episodes"] == 4
@@ -393,7 +400,75 @@ def test_info_of_a_run_shows_its_stages_and_what_made_it(call: Call, trained: Tr
     assert f"recipe: {trained.coded}" in answer.out
     assert all(name in answer.out for name in ("left", "balance", "selector", "torch"))
     found = call("info", trained.coded_run, "--json").json
+    found.pop("evaluation", None)
     assert found == read_json(trained.coded_run / "run.json")
+
+
+def test_info_tells_the_latest_evaluation_as_evaluate_did(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained.plain_run, run, ignore=shutil.ignore_patterns("evaluation.json"))
+    assert "evaluation" not in call("info", run, "--json").json
+    call("evaluate", run, "--episodes", 2)
+    arguments = ("evaluate", run, "--recipe", trained.plain, "--episodes", 3, "--seed", 2)
+    people, told = call(*arguments).out, call(*arguments, "--json").json
+    call("evaluate", run, "--skill", "left", "--episodes", 2)  # is no score of the whole
+    lines = [line.strip() for line in call("info", run).out.splitlines()]
+    assert lines[-len(people.splitlines()) :] == [line.strip() for line in people.splitlines()]
+    assert any(x.startswith("evaluated 20") and "seed 2, greedy" in x for x in lines)
+    kept = call("info", run, "--json").json["evaluation"]
+    assert kept.pop("made").startswith("20")
+    assert kept == {k: v for k, v in told.items() if k not in ("target", "env", "skill")}
+
+
+def test_an_evaluation_that_cannot_be_kept_is_told_all_the_same(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained.plain_run, run, ignore=shutil.ignore_patterns("evaluation.json"))
+    (run / "evaluation.json").mkdir()  # so that no file can have that name
+    answer = call("evaluate", run, "--episodes", 2, "--json")
+    assert (answer.code, answer.json["episodes"]) == (0, 2)
+    assert "the evaluation is not kept in the run: could not write" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"run": "another"}, "belongs to another run"),
+        ({"seed": -1}, "seed is -1"),
+        ({"evaluation": {"returns": [1.0]}}, "has no field 'lengths'"),
+        (
+            {"evaluation": {"returns": [1.0], "lengths": [], "threshold": None}},
+            "1 returns and 0 lengths",
+        ),
+    ],
+)
+def test_a_wrong_evaluation_file_is_told_by_file_and_field(
+    call: Call, trained: Trained, tmp_path: Path, change: dict[str, Any], says: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained.plain_run, run)
+    call("evaluate", run, "--episodes", 2)
+    file = run / "evaluation.json"
+    write_json(file, read_json(file) | change)
+    answer = call("info", run)
+    assert (answer.code, answer.out) == (1, "")
+    assert says in answer.err
+    assert "evaluation.json" in answer.err
+
+
+def test_a_python_user_may_keep_an_evaluation_too(trained: Trained, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained.plain_run, run, ignore=shutil.ignore_patterns("evaluation.json"))
+    loaded = recipes.load(trained.plain).load(run)
+    loaded.evaluate(2)
+    assert "evaluation" not in loaded.info()
+    found = loaded.evaluate(2, save=True)
+    assert loaded.info()["evaluation"].items() >= found.to_json().items()
+    with pytest.raises(SkillweaveError, match="leave out skill"):
+        loaded.evaluate(2, skill="left", save=True)
 
 
 def test_info_of_a_recipe_shows_settings_that_can_be_set(
@@ -522,7 +597,11 @@ def test_a_run_of_a_users_file_is_not_loaded_without_pointing_to_the_file(
 def test_a_run_that_needs_no_recipe_is_evaluated_without_one(call: Call, trained: Trained) -> None:
     assert score(call, trained.flat_run)["skill_usage"] == {}
     without = score(call, trained.plain_run)
-    assert without == score(call, trained.plain_run, "--recipe", trained.plain)
+    coded = score(call, trained.plain_run, "--recipe", trained.plain)
+    returns = [x.pop("return_mean") for x in without["skills"].values()]
+    assert returns == [None, None], "what the skills maximise is in the code alone"
+    assert None not in [x.pop("return_mean") for x in coded["skills"].values()]
+    assert without == coded
 
 
 def test_a_flat_run_needs_nothing_of_the_skills_that_it_was_not_trained_with(

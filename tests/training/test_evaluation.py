@@ -239,7 +239,7 @@ def test_the_interquartile_mean_by_hand():
 
 
 def evaluation(returns, lengths=None, threshold=None) -> Evaluation:
-    return Evaluation(tuple(returns), tuple(lengths or [1] * len(returns)), threshold, {}, {})
+    return Evaluation(tuple(returns), tuple(lengths or [1] * len(returns)), threshold)
 
 
 def test_the_summary_by_hand():

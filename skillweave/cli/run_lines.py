@@ -1,0 +1,48 @@
+"""What ``skillweave info`` tells people about a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skillweave.collecting.calls import calls_from_json
+from skillweave.training.evaluation_file import SavedEvaluation
+
+
+def run_lines(m: Mapping[str, Any], saved: SavedEvaluation | None, target: object) -> list[str]:
+    """A run's manifest and its latest evaluation, as lines."""
+    lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
+    calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
+    calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
+    lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}{calls}"]
+    lines += [
+        f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
+    ]
+    for p in m["stages"]:
+        final = p.get("final", {}).get("return")
+        lines.append(
+            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
+            f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
+            f"{'' if final is None else f'{final:.1f}':>8}"
+        )
+        if reached := p.get("reached"):
+            lines.append(
+                f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "
+                f"{p['target']['of']} {reached['value']:g}"
+            )
+        if winner := p.get("winner"):
+            lines.append(
+                f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
+                f"fitness {winner['fitness']:.1f} (skillweave plot {target})"
+            )
+        if kept := p.get("kept"):
+            lines.append(
+                f"    return before learning together {kept['before']:.1f}, after "
+                f"{kept['after']:.1f}: kept what was {kept['kept']}"
+            )
+    lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
+    if saved is not None:
+        how = "greedy" if saved.deterministic else "sampled"
+        lines.append(f"  evaluated {saved.made}, seed {saved.seed}, {how}:")
+        lines += [f"    {line}" for line in saved.evaluation.for_people().splitlines()]
+    return lines

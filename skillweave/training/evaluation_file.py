@@ -1,0 +1,78 @@
+"""``evaluation.json`` in a run: the latest evaluation of the whole policy, for ``info``."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any, NotRequired, TypedDict
+
+from skillweave.reading import Count, fit
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_json, write_json
+from skillweave.training.evaluation import Evaluation
+from skillweave.types import SkillweaveError
+
+
+class EvaluationFile(TypedDict):
+    """What the file holds."""
+
+    run: NotRequired[str]
+    made: str
+    seed: Count
+    deterministic: bool
+    evaluation: Evaluation
+
+
+@dataclass(frozen=True)
+class SavedEvaluation:
+    """An evaluation that was saved in a run."""
+
+    made: str
+    seed: int
+    deterministic: bool
+    evaluation: Evaluation
+
+    def to_json(self) -> dict[str, Any]:
+        """The summary as plain JSON, with how it was made."""
+        how = {"made": self.made, "seed": self.seed, "deterministic": self.deterministic}
+        return how | self.evaluation.to_json()
+
+
+def save_evaluation(
+    run: RunDirectory, evaluation: Evaluation, seed: int, deterministic: bool
+) -> None:
+    """Write it into the run, in place of the one before.
+
+    Raises:
+        SkillweaveError: the disk is full or cannot be written; what was there is intact.
+    """
+    found = EvaluationFile(
+        made=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        seed=seed,
+        deterministic=deterministic,
+        evaluation=evaluation,
+    )
+    if "id" in run.manifest:  # runs of older versions have none
+        found["run"] = run.manifest["id"]
+    plain = {**found, "evaluation": asdict(evaluation)}
+    write_json(run.path / "evaluation.json", plain, make_directories=False)
+
+
+def load_evaluation(run: RunDirectory) -> SavedEvaluation | None:
+    """The latest evaluation that was saved in the run; None: there is none.
+
+    Raises:
+        SkillweaveError: the file is damaged, or belongs to another run.
+    """
+    path = run.path / "evaluation.json"
+    if not path.exists():
+        return None
+    data = read_json(path, lambda data: fit(EvaluationFile, data, str(path)))
+    found: EvaluationFile = fit(EvaluationFile, data, str(path))
+    names = {entry["name"] for entry in run.manifest.get("skills", [])}
+    ours = found.get("run") == run.manifest.get("id")
+    if not ours or not set(found["evaluation"].skills) <= names:
+        raise SkillweaveError(f"{path} belongs to another run; delete it, and evaluate again")
+    return SavedEvaluation(
+        found["made"], found["seed"], found["deterministic"], found["evaluation"]
+    )

@@ -1,0 +1,191 @@
+"""What the skills of a policy did in an evaluation: their steps, calls, ends and rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from skillweave.collecting.calls import SkillSet, Why, skill_step
+from skillweave.reading import Count
+from skillweave.skills import asked
+from skillweave.skills.base import RecordedSkill
+from skillweave.training.play import Played
+from skillweave.types import Array, Policy
+
+ENDS = {Why.OWN: "own", Why.LIMIT: "limit", Why.INTERRUPTED: "interrupted", Why.EPISODE: "episode"}
+"""Why a call ended, as reports name it."""
+
+
+@dataclass(frozen=True)
+class SkillReport:
+    """What one skill did in all episodes of an evaluation.
+
+    Calls are those of the policy's own selector: a hierarchy that is a skill of another counts as
+    one skill. What needs the skills' declarations is not known of a policy that is no hierarchy,
+    and its reward and success not of a run that was loaded without its code.
+    """
+
+    steps: Count
+    """Environment steps in which it acted."""
+    calls: Count
+    """How often it was called."""
+    ended: dict[str, Count]
+    """How many calls ended for each reason: ``own``, ``limit``, ``interrupted``, ``episode`` (the
+    episode ended, or the evaluation's step limit cut it). They add up to ``calls``; empty: not
+    known."""
+    succeeded: Count | None
+    """Calls whose last step ``success`` says yes to; None: the skill does not define it."""
+    return_sum: float | None
+    """Sum of its own reward over its steps, not discounted; of the environment's reward where the
+    skill defines none. None: not known."""
+
+    @property
+    def length_mean(self) -> float | None:
+        """Mean steps of a call; None: there was none."""
+        return self.steps / self.calls if self.calls else None
+
+    @property
+    def success_rate(self) -> float | None:
+        """Share of its calls that succeeded; None: no calls, or the skill defines no success."""
+        return None if self.succeeded is None or not self.calls else self.succeeded / self.calls
+
+    @property
+    def return_mean(self) -> float | None:
+        """Mean sum of its own reward over a call; None: no calls, or not known."""
+        return None if self.return_sum is None or not self.calls else self.return_sum / self.calls
+
+    def to_json(self, total: int) -> dict[str, Any]:
+        """The report as plain JSON; ``total`` are the steps of all skills."""
+        return {
+            "share": self.steps / total if total else 0.0,
+            "steps": self.steps,
+            "calls": self.calls,
+            "length_mean": self.length_mean,
+            "ended": dict(self.ended),
+            "success_rate": self.success_rate,
+            "return_mean": self.return_mean,
+        }
+
+
+class SkillTally:
+    """Counts what each skill of a policy does, as episodes are played."""
+
+    def __init__(self, policy: Policy, episodes: int) -> None:
+        self.labels = policy.labels
+        found = getattr(policy, "skills", None)
+        self.skills = found if isinstance(found, SkillSet) else None
+        count = len(self.labels)
+        self._steps, self._calls = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        self._ended = np.zeros((count, len(Why)), np.int64)
+        self._succeeded = np.zeros(count, np.int64)
+        # One sum for each episode, so the result does not depend on which are played together.
+        self._returns = np.zeros((episodes, count))
+
+    def add(self, played: Played) -> None:
+        """Count one step of each environment."""
+        acting, count = played.acting, len(self.labels)
+        if acting is None:
+            return
+        self._steps += np.bincount(acting, minlength=count)
+        self._calls += np.bincount(acting[played.begun], minlength=count)
+        own = played.reward
+        if self.skills is not None:
+            own = self._judge(self.skills, played, acting)
+        self._returns[played.episode, acting] += own
+
+    def _judge(self, skills: SkillSet, played: Played, acting: Array) -> Array:
+        """Count the calls that end here; the reward of each running skill, (k,)."""
+        assert played.elapsed is not None
+        assert played.why is not None
+        why = played.why.copy()
+        why[(why == Why.RUNNING) & played.over] = Why.EPISODE
+        ended = np.flatnonzero(why != Why.RUNNING)
+        pairs = acting[ended] * len(Why) + why[ended]
+        self._ended += np.bincount(pairs, minlength=self._ended.size).reshape(self._ended.shape)
+        own = played.reward
+        for i, skill in enumerate(skills.skills):
+            if skill.defines("reward"):
+                rows = np.flatnonzero(acting == i)
+                if len(rows):
+                    own = own.copy() if own is played.reward else own
+                    own[rows] = _ask(skills, i, "reward", played, played.elapsed, rows)
+            if skill.defines("success"):
+                rows = ended[acting[ended] == i]
+                if len(rows):
+                    found = _ask(skills, i, "success", played, played.elapsed, rows)
+                    self._succeeded[i] += int(found.sum())
+        return own
+
+    def reports(self) -> dict[str, SkillReport]:
+        """The report of each skill, by its name."""
+        returns = self._returns.sum(axis=0)
+        return {
+            name: SkillReport(
+                int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
+                float(returns[i]) if self._known(i) else None,
+            )
+            for i, name in enumerate(self.labels)
+        }  # fmt: skip
+
+    def _known(self, i: int) -> bool:
+        """Whether the reward of skill ``i`` is."""
+        return self.skills is not None and not isinstance(self.skills.skills[i], RecordedSkill)
+
+    def _ends(self, i: int) -> dict[str, int]:
+        if self.skills is None:
+            return {}
+        return {name: int(self._ended[i, why]) for why, name in ENDS.items()}
+
+    def _successes(self, i: int) -> int | None:
+        if self.skills is None or not self.skills.skills[i].defines("success"):
+            return None
+        return int(self._succeeded[i])
+
+
+def _ask(
+    skills: SkillSet, i: int, method: str, played: Played, elapsed: Array, rows: Array
+) -> Array:
+    """What a method of skill ``i`` says about a step of ``rows`` (m,) of those that act."""
+    skill = skills.skills[i]
+    step = skill_step(played.step, rows, elapsed[rows], skill.max_steps)
+    return asked(skill, method, step, len(rows), elapsed[rows], played.rows[rows])
+
+
+def skill_table(skills: Mapping[str, SkillReport]) -> str:
+    """The reports as an aligned table for people, a line for each skill."""
+    total = sum(report.steps for report in skills.values())
+    head = ["skill", "share", "calls", "length", *ENDS.values()]
+    rows = [[*head, "success", "return"]]
+    for name, report in skills.items():
+        ends = [
+            _percent(report.ended[end] / report.calls) if report.ended and report.calls else "–"
+            for end in ENDS.values()
+        ]
+        rows.append(
+            [
+                name, _percent(report.steps / total if total else 0.0), f"{report.calls:,}",
+                _number(report.length_mean), *ends, _percent(report.success_rate),
+                _number(report.return_mean),
+            ]
+        )  # fmt: skip
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(
+            [
+                row[0].ljust(widths[0]),
+                *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
+            ]
+        )
+        for row in rows
+    )
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{value:.0%}"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:,.1f}"

@@ -1,0 +1,263 @@
+"""What evaluation reports of each skill: by hand, and against one environment in plain Python."""
+
+from __future__ import annotations
+
+from collections import Counter as Tally
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Discrete
+from reference_calls import (
+    POSITION,
+    TAG,
+    Counter,
+    Left,
+    Right,
+    Scalar,
+    T,
+    Walk,
+    Zigzag,
+    one_step,
+    scripted,
+    shy,
+)
+
+from skillweave import EnvSpec, Skill, evaluate
+from skillweave.collecting.calls import SkillSet
+from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.training.evaluation import FIRST_SEED
+from skillweave.training.skill_report import SkillReport, skill_table
+
+NONE = {"own": 0, "limit": 0, "interrupted": 0, "episode": 0}
+
+
+class Paid(Left):
+    """Three steps; its reward tells the time that it counts, and whether its limit is reached."""
+
+    name = "paid"
+
+    def reward(self, step):
+        return step.elapsed + 100.0 * step.timed_out
+
+    def success(self, step):
+        return step.next_obs[:, POSITION] < -2
+
+
+class Lucky(Counter):
+    """Stops by its own; the last step counts."""
+
+    name = "lucky"
+
+    def success(self, step):
+        return step.reward > 0
+
+
+def wish(obs, count):
+    return (obs[:, TAG] + 5 * obs[:, T] + 7 * obs[:, POSITION]).astype(np.int64) % count
+
+
+def chooser(count):
+    return ScriptedPolicy(lambda obs: wish(obs, count), Walk.observation_space, Discrete(count))
+
+
+def woven(*kinds, call_steps=4, **more):
+    skills = tuple(k() for k in kinds)
+    policies = tuple(s.policy for s in skills)
+    whole = SkillSet(skills, policies, call_steps=call_steps, **more)
+    return HierarchyPolicy(chooser(len(skills)), whole)
+
+
+class Steady(Skill):
+    """Only its own termination ends it."""
+
+    policy = scripted(2)
+
+    def termination(self, step):
+        return step.next_obs[:, POSITION] >= 2
+
+    def success(self, step):
+        return step.reward > 0
+
+
+KINDS = (Paid, Lucky, Zigzag, Steady)
+
+
+def reference(kinds, episodes, call_steps, reflexes):
+    """The same, one environment and one call after the other, from what a call means."""
+    skills = tuple(k() for k in kinds)
+    found = {s.name: defaultdict(list) for s in skills}
+    for e in range(episodes):
+        env = Recorded()
+        one = Scalar(env, skills, call_steps, 1.0, reflexes)
+        one.reset(iter([FIRST_SEED + e, 0]))
+        over = False
+        while not over:
+            i = int(wish(one.obs[None], len(skills))[0])
+            env.steps_of_call = []
+            out = one.call(i)
+            over = out.terminated or out.truncated
+            skill, told = skills[i], found[skills[i].name]
+            steps = [one_step(*s[:6], k + 1, skill, {}) for k, s in enumerate(env.steps_of_call)]
+            last = steps[-1]
+            own = bool(skill.termination(last)[0])
+            told["ended"].append("episode" if over else "own" if own else "limit")
+            told["steps"].append(len(steps))
+            told["success"].append(bool(skill.success(last)[0]))
+            told["return"].append(sum(float(np.float32(skill.reward(s)[0])) for s in steps))
+    return found
+
+
+class Recorded(Walk):
+    """Keeps the steps of a call."""
+
+    def reset(self, **how):
+        self.now, info = super().reset(**how)
+        return self.now, info
+
+    def step(self, action):
+        before = self.now
+        self.now, reward, terminated, truncated, info = super().step(action)
+        self.steps_of_call.append((before, action, self.now, reward, terminated, truncated))
+        return self.now, reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize("reflexes", [(), (shy(),)], ids=["", "reflex"])
+@pytest.mark.parametrize("call_steps", [4, None])
+def test_reports_are_those_of_calls_played_one_after_another(call_steps, reflexes):
+    kinds = KINDS if call_steps else (Paid, Lucky, Steady)
+    policy = woven(*kinds, call_steps=call_steps, reflexes=reflexes)
+    found = evaluate(policy, EnvSpec(Walk), episodes=40, num_envs=7)
+    wanted = reference(kinds, 40, call_steps, reflexes)
+    seen = Tally()
+    for name, report in found.skills.items():
+        told = wanted[name]
+        assert (report.steps, report.calls) == (sum(told["steps"]), len(told["steps"]))
+        assert report.ended == NONE | Tally(told["ended"])
+        defines = name in ("paid", "lucky", "steady")
+        assert report.succeeded == (sum(told["success"]) if defines else None)
+        assert report.return_sum == pytest.approx(sum(told["return"]), rel=1e-6, abs=1e-4)
+        seen.update(told["ended"])
+    assert min(seen[end] for end in ("own", "limit", "episode")) > 5, "the case is too tame"
+
+
+@pytest.mark.parametrize("num_envs", [1, 2, 5, 30])
+def test_sums_add_up_and_do_not_depend_on_how_many_stand_side_by_side(num_envs):
+    policy, spec = woven(*KINDS), EnvSpec(Walk)
+    found = evaluate(policy, spec, episodes=30, num_envs=num_envs)
+    assert found == evaluate(policy, spec, episodes=30, num_envs=3)
+    assert sum(r.steps for r in found.skills.values()) == sum(found.lengths)
+    assert all(sum(r.ended.values()) == r.calls > 0 for r in found.skills.values())
+    assert sum(r.ended["episode"] for r in found.skills.values()) == 30
+    shares = [r["share"] for r in found.to_json()["skills"].values()]
+    assert sum(shares) == pytest.approx(1.0)
+
+
+class Endless(Walk):
+    """Pays 1, and nothing ends it."""
+
+    def reset(self, **how):
+        obs, info = super().reset(**how)
+        self.length = 10**9
+        return obs, info
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, 1.0, *rest
+
+
+@pytest.mark.parametrize(("limit", "cut"), [(7, 1), (6, 0)])
+def test_by_hand_a_call_that_the_step_limit_cuts_ends_with_the_episode(limit, cut):
+    # calls of 3 steps pay 1 + 2 + (3 + 100); a call of one step pays 1
+    skills = (Paid(), Zigzag())
+    always = ScriptedPolicy(
+        lambda obs: np.zeros(len(obs), int), Walk.observation_space, Discrete(2)
+    )
+    policy = HierarchyPolicy(always, SkillSet(skills, tuple(s.policy for s in skills)))
+    found = evaluate(policy, EnvSpec(Endless), episodes=2, max_steps=limit)
+    calls = 2 * (2 + cut)
+    ended = NONE | {"limit": 4, "episode": 2 * cut}
+    # it is 3 left of the start after the first call, and ever further
+    paid = SkillReport(2 * limit, calls, ended, calls, 2 * (2 * 106.0 + cut))
+    assert found.skills == {"paid": paid, "zigzag": SkillReport(0, 0, NONE, None, 0.0)}
+    assert found.to_json()["skills"] == {
+        "paid": {
+            "share": 1.0, "steps": 2 * limit, "calls": calls, "length_mean": 2 * limit / calls,
+            "ended": ended, "success_rate": 1.0, "return_mean": paid.return_sum / calls,
+        },
+        "zigzag": {
+            "share": 0.0, "steps": 0, "calls": 0, "length_mean": None, "ended": NONE,
+            "success_rate": None, "return_mean": None,
+        },
+    }  # fmt: skip
+    assert found.cut == 2
+
+
+def test_the_table_for_people():
+    ended = NONE | {"own": 1, "limit": 3}
+    some = {
+        "go": SkillReport(3_000, 1_200, ended | {"own": 300, "limit": 900}, 600, -1_800.0),
+        "stand": SkillReport(1_000, 0, NONE, None, 0.0),
+    }
+    assert skill_table(some).splitlines() == [
+        "skill  share  calls  length  own  limit  interrupted  episode  success  return",
+        "go       75%  1,200     2.5  25%    75%           0%       0%      50%    -1.5",
+        "stand    25%      0       –    –      –            –        –        –       –",
+    ]
+
+
+def test_a_hierarchy_as_a_skill_counts_as_one_and_alone_reports_its_own():
+    inner = woven(Paid, Zigzag)
+
+    class Nested(Skill):
+        max_steps = 5
+        policy = inner
+
+        def reward(self, step):
+            return np.full(len(step.reward), 2.0)
+
+    outer = woven(Nested, Right, call_steps=None)
+    found = evaluate(outer, EnvSpec(Walk), episodes=20).skills
+    assert set(found) == {"nested", "right"}
+    assert found["nested"].return_sum == 2.0 * found["nested"].steps > 0
+    assert sum(found["nested"].ended.values()) == found["nested"].calls
+    alone = evaluate(SkillAlone(outer.skills, "nested"), EnvSpec(Walk), episodes=20)
+    assert alone == evaluate(inner, EnvSpec(Walk), episodes=20)
+    assert set(alone.skills) == {"paid", "zigzag"}
+
+
+def test_where_no_reward_is_defined_it_is_the_environments():
+    found = evaluate(woven(Zigzag), EnvSpec(Walk), episodes=9)
+    assert found.skills["zigzag"].return_sum == pytest.approx(sum(found.returns))
+
+
+class Labelled(ScriptedPolicy):
+    """Names skills, but has no declarations of them."""
+
+    labels = ("low", "high")
+
+    def acting(self, memory):
+        return np.ones(len(next(iter(memory.values()))), np.int64)
+
+    def start(self, n):
+        return {"elapsed": np.zeros(n, np.int64)}
+
+    def observe(self, memory, step):
+        return {"elapsed": (memory["elapsed"] + 1) % 2}
+
+
+def test_of_a_policy_that_is_no_hierarchy_only_steps_and_calls_are_known():
+    policy = Labelled(scripted(1).function, Walk.observation_space, Walk.action_space)
+    found = evaluate(policy, EnvSpec(Walk), episodes=3)
+    calls = sum((n + 1) // 2 for n in found.lengths)
+    high = SkillReport(sum(found.lengths), calls, {}, None, None)
+    assert found.skills == {"low": SkillReport(0, 0, {}, None, None), "high": high}
+    assert (high.success_rate, high.return_mean) == (None, None)
+    assert "–" in found.for_people()
+
+
+def test_a_plain_policy_has_no_table():
+    found = evaluate(scripted(1), EnvSpec(Walk), episodes=3)
+    assert (found.skills, found.to_json()["skills"]) == ({}, {})
+    assert found.for_people() == str(found)
