@@ -70,7 +70,7 @@ def optimal(model: Model) -> Array:
     value = np.zeros(len(model.reward))
     while True:
         q = np.where(model.allowed, model.reward + model.after @ value, -np.inf)
-        before, value = value, q.max(1)
+        before, value = value, np.where(model.allowed.any(1), q.max(1), 0.0)
         if np.abs(value - before).max() < 1e-14:
             return q
 
