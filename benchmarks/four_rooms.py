@@ -1,6 +1,7 @@
 """Four rooms: what selectors learn against exact semi-MDP values, and curves against flat.
 
     python -m benchmarks.four_rooms [--seeds 0 1 2 3 4] [--processes 1] [--only values|curves]
+        [--goals G1 G2] [--steps 10000]
 
 After Sutton, Precup & Singh 1999, sec. 2 and 3: skills are the eight hallway skills (H), the four
 moves (A), or both (A+H). Errors are shares of the range of the exact values. Exact values come
@@ -73,7 +74,7 @@ JUDGED = PPO(
 CURVE: dict[str, Any] = {
     "num_envs": 1, "gamma": GAMMA, "network": Network(()), "learning_rate": 0.01, "loss": "mse",
     "learning_starts": 500, "exploration_fraction": 0.02, "exploration_final_eps": 0.1,
-    "batch_size": 32, "buffer_size": 100_000,
+    "batch_size": 128, "update_ratio": 0.25, "buffer_size": 100_000,
 }  # fmt: skip
 HALLWAYS = (NORTH, WEST, EAST, SOUTH)
 SHOWN = (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1_000)
@@ -359,9 +360,9 @@ def run_values(pool: Any, seeds: list[int]) -> list[dict[str, Any]]:
     return found
 
 
-def run_curves(pool: Any, seeds: list[int], steps: int) -> dict[str, Any]:
+def run_curves(pool: Any, seeds: list[int], goals: list[str], steps: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for goal in GOALS:
+    for goal in goals:
         asked = {f"DQN, {w}": partial(curve, w, goal, steps) for w in ("H", "A+H", "flat")}
         if goal == "G2":  # with hallway skills alone, this goal is met by chance
             asked.pop("DQN, H")
@@ -381,14 +382,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--only", choices=["values", "curves"])
-    parser.add_argument("--steps", type=int, default=60_000, help="of each learning curve")
+    parser.add_argument("--goals", nargs="+", choices=list(GOALS), default=list(GOALS))
+    parser.add_argument("--steps", type=int, default=10_000, help="of each learning curve")
     given = parser.parse_args()
     result: dict[str, Any] = {"seeds": given.seeds}
     with workers(given.processes) as pool:
         if given.only != "curves":
             result["values"] = run_values(pool, given.seeds)
         if given.only != "values":
-            result["curves"] = run_curves(pool, given.seeds, given.steps)
+            result["curves"] = run_curves(pool, given.seeds, given.goals, given.steps)
     report("four_rooms", result)
 
 
