@@ -31,6 +31,7 @@ ALL = (
     ["collecting"],
     ["reading"],
     ["search"],
+    ["four_rooms"],
 )
 
 

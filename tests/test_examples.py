@@ -13,6 +13,7 @@ COUNT = 5
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
     "foreign_skills.py": ("--steps", "3000"),
+    "four_rooms.py": ("--steps", "3000"),
     "own_algorithm.py": ("--steps", "2000", "--out", "{folder}/run"),
     "sb3_selector.py": ("--steps", "3000", "--episodes", "2"),
     "tutorial.py": ("--scale", "0.01", "--episodes", "2", "--out", "{folder}/run"),
@@ -25,6 +26,7 @@ NEEDS = {
 }
 SAYS = {
     "foreign_skills.py": "woven by the selector: ",
+    "four_rooms.py": "steps from the corner to the goal: ",
     "own_algorithm.py": "mean return: ",
     "ready_selectors.py": "automaton  return 1.00",
     "sb3_selector.py": "woven by the selector: ",
