@@ -57,7 +57,8 @@ class Rollout:
     """Trajectories for an on-policy learner: P members, T rows of B columns each.
 
     ``discount`` is 0 where the trajectory terminated, else γ^τ; ``last`` says that it is cut here
-    (terminated, truncated, or the rollout's end). Rows that are not ``valid`` hold anything.
+    (terminated, truncated, or the rollout's end). The ``valid`` rows of a column come first; the
+    others repeat valid ones.
     """
 
     obs: Tensor  # (P, T, B, *obs_shape)

@@ -23,7 +23,6 @@ from skillweave.algorithms.rollouts import (
     Samples,
     minibatches,
     rows_where,
-    without_gaps,
 )
 from skillweave.experience import Report, Rollout
 from skillweave.networks.encoders import Inputs
@@ -137,7 +136,7 @@ class PPOAlgorithm(Algorithm):
     ) -> tuple[State, Report]:
         """Learn from the valid rows of a rollout, in place; ``rng`` orders the minibatches."""
         cfg = self.config
-        samples, metrics = self._prepare(state, without_gaps(batch))
+        samples, metrics = self._prepare(state, batch)
         leaves = self.layout.leaves(state.params)
         rate, ent_coef = self._scheduled(state, batch.progress)
         limit = None if cfg.learning_rate_schedule == "kl" else cfg.target_kl
@@ -198,7 +197,7 @@ class PPOAlgorithm(Algorithm):
 
     @torch.no_grad()
     def _prepare(self, state: State, rollout: Rollout) -> tuple[Samples, dict[str, Tensor]]:
-        """What ``loss`` needs of a rollout without gaps, and metrics (P,)."""
+        """What ``loss`` needs of a rollout, and metrics (P,)."""
         cfg, memory, starts = self.config, rollout.memory, rollout.starts
         if not self.memory_size:
             memory = starts = None
