@@ -17,7 +17,6 @@ from skillweave import ActingParams, Algorithm, Report, Rollout, register_algori
 from skillweave.algorithms.base import AgentState
 from skillweave.algorithms.config import OnPolicy
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.rollouts import without_gaps
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout
@@ -94,10 +93,9 @@ class A2CAlgorithm(Algorithm):
         return self.critic(params.views, self.inputs(params, obs)).squeeze(-1)
 
     def update(
-        self, state: State, batch: Rollout, rng: Sequence[torch.Generator]
+        self, state: State, rollout: Rollout, rng: Sequence[torch.Generator]
     ) -> tuple[State, Report]:
         """One gradient step on all rows of the rollout that are this learner's own."""
-        rollout = without_gaps(batch)
         lead, valid = rollout.reward.shape[1:], rollout.valid
         obs, next_obs = rollout.obs.flatten(1, 2), rollout.next_obs.flatten(1, 2)
         flat_valid = None if valid is None else valid.flatten(1, 2)
@@ -122,7 +120,7 @@ class A2CAlgorithm(Algorithm):
         loss = policy_loss + 0.5 * value_loss - state.ent_coef * bonus
         grad = self.layout.gradient(loss, leaves)
         clip_grad_norm_(grad, torch.full_like(state.gamma, self.config.max_grad_norm))
-        rate = state.learning_rate * (1.0 - batch.progress)
+        rate = state.learning_rate * (1.0 - rollout.progress)
         adam_(state.params, grad, state.mu, state.nu, state.count, rate)
         metrics = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": bonus}
         return state, Report({name: x.detach() for name, x in metrics.items()})

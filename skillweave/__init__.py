@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3
     from skillweave.algorithms.registry import register_algorithm
     from skillweave.api import Agent, Hierarchy, Run, train_agent
-    from skillweave.collecting.calls import Lengths
+    from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, Selection
@@ -40,7 +40,7 @@ _HOME = {
     "Evolution": "evolution.config",
     "Heir": "evolution.selection",
     "Hierarchy": "api",
-    "Lengths": "collecting.calls",
+    "Lengths": "collecting.lengths",
     "Mutations": "evolution.config",
     "LastCall": "selectors",
     "Network": "networks.config",

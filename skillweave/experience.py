@@ -15,8 +15,6 @@ from skillweave.types import Array
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from skillweave.algorithms.base import ActingParams
-
 
 @dataclass(slots=True)
 class Experience:
@@ -62,7 +60,8 @@ class Rollout:
     """Trajectories for an on-policy learner: P members, T rows of B columns each.
 
     ``discount`` is 0 where the trajectory terminated, else γ^τ; ``last`` says that it is cut here
-    (terminated, truncated, or the rollout's end). Rows that are not ``valid`` hold anything.
+    (terminated, truncated, or the rollout's end). The ``valid`` rows of a column come first; the
+    others repeat valid ones.
     """
 
     obs: Tensor  # (P, T, B, *obs_shape)
@@ -86,7 +85,7 @@ class Rollout:
 class Anchor:
     """The policy that a learner is to stay near."""
 
-    params: ActingParams  # of P members
+    params: Any  # ``ActingParams`` of P members
     coef: Tensor  # (P,), what a nat of KL from it costs
 
 

@@ -113,7 +113,7 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
         SkillweaveError: it is damaged; the message begins with ``where``.
     """
     try:
-        data = json.loads(text, parse_constant=_finite, parse_float=_finite)
+        data = load_json(text, parse_constant=_finite, parse_float=_finite)
     except RecursionError as error:
         raise SkillweaveError(f"{where} is damaged: it is nested too deep") from error
     except ValueError as error:
@@ -123,6 +123,22 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
         if depth > DEEPEST:
             raise SkillweaveError(f"{where} is damaged: it is nested too deep")
         layer, depth = [x for part in layer for x in _inside(part)], depth + 1
+    return data
+
+
+def load_json(text: str | bytes, **how: Any) -> Any:
+    """As ``json.loads``, but texts are of whole characters, as nothing else can be shown or saved.
+
+    Raises:
+        ValueError: it is no JSON, or holds a lone surrogate.
+    """
+    data = json.loads(text, **how)
+    escape: Any = "\\" if isinstance(text, str) else b"\\"
+    if escape in text or not text.isascii():
+        try:
+            json.dumps(data, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            raise ValueError("a text in it holds half of a character") from error
     return data
 
 

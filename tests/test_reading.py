@@ -152,6 +152,21 @@ def test_json_that_could_not_be_written_is_damaged(text: str | bytes) -> None:
         parse_json(text, "x.json")
 
 
+@pytest.mark.parametrize(
+    "text",
+    ['["\\ud800"]', '{"a": {"\\udc00": 1}}', '["\ud800"]', b'["\xed\xa0\x80"]',
+     '["\\ud800"]'.encode("utf-16-le")],
+)  # fmt: skip
+def test_half_a_character_in_json_is_damage(text: str | bytes) -> None:
+    with pytest.raises(SkillweaveError, match=r"x\.json is damaged: .* half of a character"):
+        parse_json(text, "x.json")
+
+
+@pytest.mark.parametrize("text", ['["\\ud83d\\ude00"]', '["😀"]', '["😀"]'.encode()])
+def test_whole_characters_in_json_are_read_however_they_are_written(text: str | bytes) -> None:
+    assert parse_json(text, "x.json") == ["😀"]
+
+
 def test_json_may_be_nested_up_to_a_limit() -> None:
     depth = DEEPEST - 1
     assert str(parse_json("[" * depth + "1" + "]" * depth, "x")).count("[") == depth

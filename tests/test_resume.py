@@ -291,7 +291,7 @@ def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
     def stop(*_: Any) -> None:
         raise Stopped
 
-    monkeypatch.setattr(RunDirectory, "save_policy", stop)
+    monkeypatch.setattr(RunDirectory, "save_policies", stop)
     with pytest.raises(Stopped):
         recipes.load(str(recipe)).train(path, seed=3, quiet=True)
     monkeypatch.undo()

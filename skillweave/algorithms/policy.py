@@ -167,7 +167,7 @@ def state_from(
 
     Args:
         groups: of the algorithm, where networks may have grown.
-        may_diverge: numbers need not be finite, as of a member that is to be replaced.
+        may_diverge: numbers need not be finite, as of a member that trains no more.
 
     Raises:
         SkillweaveError: it is not, or holds a number that is not finite; the tensor is named.

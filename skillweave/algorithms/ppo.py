@@ -19,7 +19,7 @@ from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Devi
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.ppo_samples import Terms, floor_now, samples_of
-from skillweave.algorithms.rollouts import Samples, minibatches, without_gaps
+from skillweave.algorithms.rollouts import Samples, minibatches
 from skillweave.experience import Report, Rollout
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -146,7 +146,7 @@ class PPOAlgorithm(Algorithm):
         """Learn from the valid rows of a rollout, in place; ``rng`` orders the minibatches."""
         cfg = self.config
         now = Terms.of(cfg, state, batch)
-        samples, metrics = samples_of(self, state, without_gaps(batch), now)
+        samples, metrics = samples_of(self, state, batch, now)
         leaves, rate = self.layout.leaves(state.params), now.rate
         limit = None if cfg.learning_rate_schedule == "kl" else cfg.target_kl
         count = samples.count

@@ -72,7 +72,7 @@ def samples_of(
         inputs = {k: cells.unflat(v) for k, v in inputs.items()}
     raw, after = agent.run(agent.critic_net, params.views, inputs, memory, starts)
     value = agent.in_rewards(state, raw)
-    following = _next_values(agent, state, params, rollout, cells.grid(value), after)
+    following = next_values(agent, state, params, rollout, cells.grid(value), after)
     reward, discount, last = rollout.reward, rollout.discount, rollout.last
     grid = gae(reward, discount, cells.grid(value), following, last, state.gae_lambda)
     advantage = cells.flat(grid)
@@ -131,7 +131,7 @@ def _acted(
     return agent.head.stats(cells.flat(rollout.head), log_std, mask, action)[0]
 
 
-def _next_values(
+def next_values(
     agent: PPOAlgorithm,
     state: State,
     params: ActingParams,

@@ -1,4 +1,4 @@
-"""Rollouts as PPO learns from them: without gaps, and in random pieces."""
+"""Rollouts as PPO learns from them: their valid cells, and random pieces of these."""
 
 from __future__ import annotations
 
@@ -15,44 +15,6 @@ from skillweave.networks.encoders import Inputs
 from skillweave.networks.stacked import take_rows
 from skillweave.ops.device import on_host
 
-_CELLS = (
-    "obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts",
-    "advantage",
-)  # fmt: skip
-"""Fields of a rollout that have a value for each cell."""
-
-
-def without_gaps(rollout: Rollout) -> Rollout:
-    """The same trajectories, with the valid rows of each column first.
-
-    Columns without a valid row are left out; what is not valid is 0. Where no cell is empty, the
-    result has no ``valid``: it is a full rollout.
-    """
-    if (valid := rollout.valid) is None:
-        return rollout
-    width = valid.shape[2]
-    steps, columns, fewest = on_host(
-        valid.sum(1).max(), valid.any(1).sum(1).max(), valid.flatten(1).sum(1).min()
-    )
-    time = _first_true(valid, max(1, steps))  # (P, T′, B), which row stands where
-    column = _first_true(valid.any(1), max(1, columns))  # (P, B′)
-    time = time.gather(2, column[:, None].expand(-1, time.shape[1], -1))
-    rows, lead = (time * width + column[:, None]).flatten(1), time.shape[1:]
-    kept: Tensor = valid.flatten(1).gather(1, rows).unflatten(1, lead)
-
-    def take(x: Tensor) -> Tensor:
-        found: Tensor = take_rows(x.flatten(1, 2), rows).unflatten(1, lead)
-        return found.masked_fill(~kept.view(*kept.shape, *[1] * (x.ndim - 3)), 0)
-
-    parts: dict[str, Any] = {name: getattr(rollout, name) for name in _CELLS}
-    parts = {name: None if x is None else take(x) for name, x in parts.items()}
-    following = torch.nn.functional.pad(kept[:, 1:], (0, 0, 0, 1))
-    parts["last"] = parts["last"] | (kept & ~following)  # nothing follows the last valid row
-    parts["valid"] = None if fewest == kept[0].numel() else kept
-    if rollout.memory is not None:
-        parts["memory"] = take_rows(rollout.memory, column)
-    return replace(rollout, **parts)
-
 
 def rows_where(flags: Tensor) -> Tensor:
     """Rows of each member that are True, in order; (P, N) bool to (P, K).
@@ -63,7 +25,7 @@ def rows_where(flags: Tensor) -> Tensor:
 
 
 class Cells:
-    """The cells of a rollout without gaps that networks run on: the valid ones, or all.
+    """The cells of a rollout that networks run on: the valid ones, or all.
 
     Members with fewer valid cells than others get some that are not valid, too.
     """

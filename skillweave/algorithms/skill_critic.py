@@ -17,7 +17,7 @@ from torch import Tensor
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.rollouts import rows_where, without_gaps
+from skillweave.algorithms.rollouts import rows_where
 from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, take_rows
@@ -84,7 +84,7 @@ class SkillCriticAlgorithm(Algorithm):
         self, state: AgentState, batch: Rollout, rng: Sequence[torch.Generator]
     ) -> tuple[AgentState, Report]:
         """Learn λ-returns of the skills that acted, in place; ``rng`` orders the minibatches."""
-        rollout, cfg = without_gaps(batch), self.config
+        rollout, cfg = batch, self.config
         self.update_obs_stats(state, rollout.obs.flatten(1, 2))
         advantage, value = self._judged(state, rollout)
         returns = (advantage + value).flatten(1)

@@ -14,7 +14,7 @@ from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.run import Run, as_path
-from skillweave.collecting.calls import calls_from_json
+from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training

@@ -18,7 +18,8 @@ class RolloutStore:
 
     N = P·B columns as in ``Experience``. In a rollout the valid rows of a column come first, one
     after another. Where several experiences are collected, they lie side by side, as further
-    columns. Rows that are not valid repeat some valid row, so nothing there is out of range.
+    columns. Columns without a valid row are left out. Rows that are not valid repeat a valid one of
+    their member, so nothing there is out of range, and no NaN of a member that has diverged.
 
     Args:
         members: P.
@@ -50,7 +51,7 @@ class RolloutStore:
         if valid.all():
             last[-1] = True
         else:
-            cells, valid = _valid_first(valid)
+            cells, valid = _valid_first(valid, self._members)
             rows = {k: x.reshape(-1, *x.shape[2:])[cells] for k, x in rows.items()}
             column = np.flatnonzero(valid[0])
             rows["last"][valid.sum(0)[column] - 1, column] = True
@@ -79,6 +80,7 @@ class RolloutStore:
         self._held, steps, factor = [], named.pop("steps"), gamma.cpu()[:, None, None]
         factor = factor if (steps == 1).all() else factor**steps
         named["discount"] = factor * ~named.pop("terminated")
+        named = _filled_columns(named)
         if named["valid"].all():
             del named["valid"]
         if log_std is not None:
@@ -109,17 +111,35 @@ class RolloutStore:
         return found.transpose(0, 1).contiguous()
 
 
-def _valid_first(valid: Array) -> tuple[Array, Array]:
+def _valid_first(valid: Array, members: int) -> tuple[Array, Array]:
     """Which rows (T, N) to take so that the valid ones of each column come first.
 
     Returns:
         (D, N) int64, rows and columns as one number, where the fullest column has D valid rows;
-        and (D, N) bool, which of them are valid: the others repeat a valid one.
+        and (D, N) bool, which of them are valid: the others repeat a valid one of their member,
+        or of any member if theirs has none.
     """
     count = valid.sum(0)
     kept: Array = np.arange(count.max())[:, None] < count
     row = np.argsort(~valid, axis=0, kind="stable")[: len(kept)]
-    return np.where(kept, row * len(count) + np.arange(len(count)), valid.argmax()), kept
+    cells = row * len(count) + np.arange(len(count))
+    first = np.where(kept[0], cells[0], valid.size).reshape(members, -1).min(1)
+    first = np.where(first < valid.size, first, first.min())
+    return np.where(kept, cells, first.repeat(len(count) // members)), kept
+
+
+def _filled_columns(named: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Fields (P, T, B, …) without the columns that hold no valid row.
+
+    Members that have fewer others than the member with most keep some.
+    """
+    filled = named["valid"].any(1)
+    if filled.all():
+        return named
+    order = filled.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+    order = order[:, : int(filled.sum(1).max())]
+    member = torch.arange(len(order))[:, None]
+    return {k: x.transpose(1, 2)[member, order].transpose(1, 2) for k, x in named.items()}
 
 
 def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from skillweave.algorithms.config import named_config
-from skillweave.collecting.calls import Lengths
+from skillweave.collecting.lengths import Lengths
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.types import SkillweaveError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from skillweave.collecting.calls import calls_from_json
+from skillweave.collecting.lengths import calls_from_json
 from skillweave.training.evaluation_file import SavedEvaluation
 
 

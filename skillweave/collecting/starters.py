@@ -39,16 +39,18 @@ class Starters:
 
     def act(self, ids: Array, obs: Array, mask: Array | None, rng: np.random.Generator) -> Array:
         """Actions (k, …) in environments ``ids`` (k,); obs and mask are of all N."""
-        allowed = allowed_rows(mask, ids)
-        action = random_actions(self._space, len(ids), rng, allowed)
         if self.skills is None:
-            return action
+            return random_actions(self._space, len(ids), rng, allowed_rows(mask, ids))
         called = self.kept["starters.called"]
         self._call(ids[~called[ids]], obs, rng)
-        rows = np.flatnonzero(called[ids])
-        if len(rows):
-            own = ids[rows]
-            action[rows] = self.skills.act(self._calls, own, obs[own], rng, allowed_rows(mask, own))
+        led = called[ids]
+        own, free = ids[led], ids[~led]
+        action: Array = np.empty((len(ids), *self._space.shape), self._space.dtype)  # type: ignore[misc]
+        if len(own):
+            action[led] = self.skills.act(self._calls, own, obs[own], rng, allowed_rows(mask, own))
+        if len(free):
+            allowed = allowed_rows(mask, free)
+            action[~led] = random_actions(self._space, len(free), rng, allowed)
         return action
 
     def observe(self, ids: Array, obs: Array, action: Array, raw: RawStep) -> None:

@@ -24,7 +24,9 @@ MOST = 65_536
 SLOW = 50e-6
 """Seconds of a step above which environments are stepped in several processes."""
 PIECES, STEPS = 5, 50
-"""Steps that are timed to find out."""
+"""Steps that are timed to find out: so many pieces, of at most so many steps each."""
+PIECE_SECONDS = 0.1
+"""A piece that takes longer ends."""
 EngineName = Literal["auto", "envpool", "sync"]
 
 
@@ -165,8 +167,8 @@ def cores() -> int:
 def workers_for(spec: EnvSpec) -> int:
     """How many processes are to step the environments: as the spec says, else by measuring.
 
-    A step of one environment is timed, some hundred times. If it is slow, there is one for each
-    core, else all stay in this process.
+    A step of one environment is timed, some hundred times where it is fast. If it is slow, there
+    is one process for each core, else all stay in this one.
     """
     if spec.workers is not None:
         return spec.workers
@@ -198,14 +200,14 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
 
     seen(env.reset(seed=0)[1])
     for _ in range(PIECES):
-        spent = 0.0
-        for _ in range(STEPS):
+        spent, steps, until = 0.0, 0, time.perf_counter() + PIECE_SECONDS
+        while steps == 0 or (steps < STEPS and time.perf_counter() < until):
             action = random_actions(env.action_space, 1, rng, masks.now)[0]
             began = time.perf_counter()
             _, _, terminated, truncated, info = env.step(int(action) if discrete else action)
-            spent += time.perf_counter() - began
+            spent, steps = spent + time.perf_counter() - began, steps + 1
             seen(info, terminated or truncated)
             if terminated or truncated:
                 seen(env.reset()[1])
-        means.append(spent / STEPS)
+        means.append(spent / steps)
     return min(means)

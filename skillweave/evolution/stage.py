@@ -26,7 +26,7 @@ from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.trainer import StageRun
-from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
+from skillweave.types import Array, prefixed, unprefixed
 
 
 @dataclass
@@ -227,30 +227,28 @@ class EvolvingPopulation:
 
     def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
         """Stand where a checkpoint says."""
-        members = []
-        for i, told in enumerate(at["members"]):
-            member = _member_from_json(told)
-            algorithm, own = (
-                make_algorithm(member.config, *self.spaces),
-                unprefixed(str(i), tensors),
-            )
-            fresh, where = algorithm.init([self.seeds]), f"{self.run.path}: member {i}"
-            member.state = state_from(
-                own, fresh, where, algorithm.parameter_groups(), may_diverge=True
-            )
-            for name in algorithm.member_hyperparameters:  # they never diverge
-                if not bool(getattr(member.state, name).isfinite().all()):
-                    raise SkillweaveError(
-                        f"{where}: tensor {name} holds NaN or infinity: the file was altered"
-                    )
-            members.append(member)
-        self.population = Population(members, self.evolution, self.stage.scene, self.seeds)
-        self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
+        where = str(self.run.path)
         self.done, self.fitness_steps = at["generation"], at["fitness_steps"]
         if best := at.get("best"):
-            weights, where = unprefixed("best", tensors), str(self.run.path)
-            policy = AgentPolicy.from_file(weights, best["policy"], where)
+            policy = AgentPolicy.from_file(unprefixed("best", tensors), best["policy"], where)
             self.best = Best(best["fitness"], best["number"], best["generation"], policy)
+        members = [
+            self._restored(told, unprefixed(str(i), tensors), f"{where}: member {i}")
+            for i, told in enumerate(at["members"])
+        ]
+        self.population = Population(members, self.evolution, self.stage.scene, self.seeds)
+        self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
+
+    def _restored(self, told: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Member:
+        """A member of a checkpoint.
+
+        Heirs have parents that had not diverged. The last generation has no heirs.
+        """
+        member = _member_from_json(told)
+        algorithm = make_algorithm(member.config, *self.spaces)
+        like, groups = algorithm.init([self.seeds]), algorithm.parameter_groups()
+        member.state = state_from(tensors, like, where, groups, may_diverge=self.over)
+        return member
 
 
 def _member_to_json(member: Member) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from skillweave.collecting.calls import Lengths
+from skillweave.collecting.lengths import Lengths
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.training.plain_agent import check_algorithm

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import gymnasium as gym
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
-from skillweave.collecting.calls import Lengths, SkillSet
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
 from skillweave.messages import short
@@ -116,10 +117,11 @@ class Declaration:
             "selector_target_return is given": self.selector_target_return is not None,
             f"learn is {self.learn!r}": self.learn != "apart",
             "interrupt is True": self.interrupt,
+            "call_steps are Lengths": isinstance(self.call_steps, Lengths),
         }
         for what, asked in needs.items():
             if asked:
-                raise SkillweaveError(f"{what}, but the selector is ready: it is not trained")
+                raise SkillweaveError(f"{what}, but the selector is ready: it does not learn")
 
     @property
     def spec(self) -> EnvSpec:

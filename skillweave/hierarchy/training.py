@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from skillweave.collecting.calls import calls_to_json
+from skillweave.collecting.lengths import calls_to_json
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
+from skillweave.runs.copies import keep_policy, recorded_policy
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
@@ -67,7 +68,7 @@ def train(
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
     for name, policy in ready.items():
-        run.keep_policy(name, policy)
+        keep_policy(run, name, policy)
     stages = stages_of(declaration)
     apart = [s for s in stages if s.kind != "together"]
     before = train_stages(apart, run, listeners, ready, make_learner)
@@ -137,7 +138,7 @@ def _woven(
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
     """The ready policies as they were when the run began."""
     ready = declaration.ready_policies()
-    return {name: run.ready_policy(name, policy) for name, policy in ready.items()}
+    return {name: recorded_policy(run, name, policy) for name, policy in ready.items()}
 
 
 def _ready_selector(declaration: Declaration, run: RunDirectory, skill: Policy) -> Policy | None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
-from skillweave.collecting.calls import calls_from_json, calls_to_json
+from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption

@@ -24,14 +24,13 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy, state_from
-from skillweave.reading import read_file, shown
+from skillweave.reading import shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.files import (
     TEMPORARY,
     make_directory,
     read_signed,
     remove,
-    write_bytes,
     write_json,
     write_tensors,
 )
@@ -45,8 +44,7 @@ from skillweave.runs.manifest import (
     read_manifest,
     versions,
 )
-from skillweave.skills.foreign_policy import Foreign, as_recorded
-from skillweave.types import Policy, SkillweaveError, unprefixed
+from skillweave.types import SkillweaveError, unprefixed
 
 S = TypeVar("S")
 
@@ -126,10 +124,10 @@ class RunDirectory:
 
     def save(self) -> None:
         """Write ``run.json``."""
-        self._check()
+        self.check()
         write_json(self.path / "run.json", self.manifest, make_directories=False)
 
-    def _check(self) -> None:
+    def check(self) -> None:
         """Raise where the directory was deleted under our hands."""
         if self._lock is not None:
             self._lock.check()
@@ -160,12 +158,12 @@ class RunDirectory:
         tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
         header = self._place(header["stage"]) | header | self.line_bytes()
-        self._check()
+        self.check()
         self._checkpoints.save(tensors, header)
 
     def drop_checkpoints(self) -> None:
         """Remove the checkpoints of a stage that is done, and said to be so in ``run.json``."""
-        self._check()
+        self.check()
         self._checkpoints.drop()
 
     def load_checkpoint(
@@ -197,7 +195,7 @@ class RunDirectory:
 
     def save_policies(self, stage: str, policies: Mapping[str, AgentPolicy]) -> None:
         """Write who learnt in a finished stage; ``save`` then binds the files to the run."""
-        self._check()
+        self.check()
         entry, sums = self.stage(stage), {}
         for name, policy in policies.items():
             tensors, header = policy.to_file()
@@ -252,33 +250,6 @@ class RunDirectory:
             )
         return AgentPolicy.from_file(tensors, header, str(path))
 
-    def keep_policy(self, skill: str, policy: Policy) -> None:
-        """Copy into the run what a skill's ready policy acts by, where it is to be copied."""
-        if isinstance(policy, Foreign) and (content := policy.content()) is not None:
-            path = self._copy_path(skill, policy)
-            if not path.exists():  # a run that goes on has it
-                self._check()
-                make_directory(path.parent)
-                write_bytes(path, content, make_directories=False)
-
-    def ready_policy(self, skill: str, policy: Policy) -> Policy:
-        """A skill's ready policy as it was when the run began.
-
-        Raises:
-            SkillweaveError: the policy is another one, and the run holds no copy of its own.
-        """
-        entry: dict[str, Any] = next((s for s in self.manifest["skills"] if s["name"] == skill), {})
-
-        def read() -> bytes | None:
-            assert isinstance(policy, Foreign)
-            path = self._copy_path(skill, policy)
-            return read_file(path) if path.exists() else None
-
-        return as_recorded(policy, entry.get("policy"), read, f"{self.path}: skill {skill!r}")
-
-    def _copy_path(self, skill: str, policy: Foreign) -> Path:
-        return self.path / "policies" / f"{skill}{policy.suffix}"
-
     def policy_path(self, stage: str, name: str | None = None) -> Path:
         """Where the policy of a stage lies, or of one who learns in it."""
         file = stage if name in (None, stage) else f"{stage}.{name}"
@@ -286,7 +257,7 @@ class RunDirectory:
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""
-        self._check()
+        self.check()
         self._metrics.append([record])
 
     def line_bytes(self) -> dict[str, int]:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from skillweave.reading import check_file, fit, shown
+from skillweave.reading import check_file, fit, load_json, shown
 from skillweave.runs.older import header_today
 from skillweave.types import SkillweaveError
 
@@ -75,7 +75,7 @@ class JsonLines:
                 if not line.endswith(b"\n"):
                     return
                 try:
-                    record = json.loads(line)
+                    record = load_json(line)
                 except (ValueError, RecursionError) as error:
                     raise SkillweaveError(
                         f"{self.path} is damaged in line {number}: {str(error)[:300]}"

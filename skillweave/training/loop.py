@@ -123,7 +123,8 @@ class _Loop:
         if cut or not learner.overlap:
             kept = self._cut() if cut and not over else None
             self.wait(cut, kept, before)
-            self.ask()
+            if not over:
+                self.ask()
 
     def ask(self) -> None:
         """Say what is to be collected next, with the parameters as they are now."""

@@ -187,7 +187,8 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
     Raises:
         SkillweaveError: a number that the user gave does not divide ``num_envs``.
     """
-    workers = workers_for(spec)
+    alone = any(entry.get("evolution") is None for entry in entries)
+    workers = workers_for(spec) if alone else 1
     for entry in entries:
         num_envs = entry["algorithm"]["num_envs"]
         if entry.get("evolution") is not None:

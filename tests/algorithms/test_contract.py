@@ -30,6 +30,7 @@ from skillweave.algorithms import config as table
 from skillweave.algorithms.config import DQN, PPO, SAC, TD3, AlgorithmConfig, OnPolicy
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
+from skillweave.algorithms.ppo_samples import next_values
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
@@ -510,7 +511,7 @@ def test_the_value_after_an_end_remembers_what_led_to_it():
         out, after = net.sequence(views, {"vector": tr.obs}, own, tr.starts)
         params = algorithm.learning_params(state)
         value = out[..., 0]
-        following = algorithm._next_values(state, params, tr, value, after.flatten(1, 2))
+        following = next_values(algorithm, state, params, tr, value, after.flatten(1, 2))
         memory = own
         for t in range(16):
             memory = memory.masked_fill(tr.starts[:, t, :, None], 0.0)

@@ -149,13 +149,14 @@ def test_valid_rows_come_first_and_the_rectangle_is_as_high_as_the_fullest_colum
     e = experience(4, terminated=[(1, 0), (2, 1)])
     e.valid = np.array([[0, 1, 0, 1], [1, 0, 0, 1], [0, 0, 0, 0], [1, 0, 0, 0]], bool)
     r = rollout(e)
-    assert r.valid.tolist() == [[[True, True], [True, False]], [[False, True], [False, True]]]
+    assert r.valid.tolist() == [[[True, True], [True, False]], [[True, False], [True, False]]]
+    # Column 2 is empty: it stands behind column 3, as the other member has two.
     # Column 0 has times 1 (terminated) and 3, column 1 time 0, column 3 times 0 and 1.
     assert r.reward[r.valid].tolist() == [10, 1, 30, 3, 13]
-    assert r.last.tolist() == [[[True, True], [True, False]], [[False, False], [False, True]]]
+    assert r.last.tolist() == [[[True, True], [True, False]], [[False, False], [True, False]]]
     assert r.discount[r.valid].tolist() == pytest.approx([0, 0.9, 0.9, 0.5, 0.5])
     assert r.starts[r.valid].tolist() == [False, True, False, True, False]
-    assert torch.equal(r.memory[..., 0], torch.tensor([[0.0, 1], [2, 3]]))
+    assert torch.equal(r.memory[..., 0], torch.tensor([[0.0, 1], [3, 2]]))
 
 
 def test_rows_that_are_not_valid_repeat_valid_ones_so_that_nothing_is_out_of_range():
@@ -165,11 +166,32 @@ def test_rows_that_are_not_valid_repeat_valid_ones_so_that_nothing_is_out_of_ran
     e.obs_mask = np.repeat(e.valid[..., None], A, -1)  # elsewhere nothing at all is allowed
     e.obs[~e.valid] = e.reward[~e.valid] = e.head[~e.valid] = np.nan
     r = rollout(e, experience(3))
-    assert r.obs.shape == (P, 3, 2 * B, 2)
+    assert r.obs.shape == (P, 3, 3, 2)  # the second member has three columns
     assert r.obs_mask.all()
     for x in r.obs, r.reward, r.head, r.discount:
         assert x.isfinite().all()
     assert not r.last[~r.valid].any()
+
+
+def test_columns_without_a_valid_row_are_left_out():
+    e = experience()
+    e.valid = np.ones((T, P * B), bool)
+    e.valid[:, [0, 3]] = False
+    r = rollout(e)
+    assert r.valid is None
+    assert r.reward.tolist() == [[[1], [11], [21]], [[2], [12], [22]]]
+    assert r.memory[..., 0].tolist() == [[1], [2]]
+
+
+def test_what_is_not_valid_has_no_nan_of_another_member():
+    e = experience()
+    e.valid = np.ones((T, P * B), bool)
+    e.valid[1:, [1, 3]] = False
+    e.head[:, :B] = np.nan  # the first has diverged
+    r = rollout(e)
+    assert r.valid.sum((1, 2)).tolist() == [T + 1] * P
+    assert r.head[0].isnan().all()
+    assert r.head[1].isfinite().all()
 
 
 # Several experiences, side by side
@@ -233,9 +255,11 @@ def test_every_valid_row_is_there_once_in_its_order_and_cut_at_its_end(seed, sha
         assert not any(rows for columns in expected for rows in columns)
         return
     valid = torch.ones_like(r.last) if r.valid is None else r.valid
+    filled = [[rows for rows in columns if rows] for columns in expected]
+    assert r.reward.shape[2] == max(len(columns) for columns in filled)
     for p in range(P):
-        assert len(expected[p]) == r.reward.shape[2]
-        for c, rows in enumerate(expected[p]):
+        empty = [[]] * (r.reward.shape[2] - len(filled[p]))
+        for c, rows in enumerate(filled[p] + empty):
             assert valid[p, :, c].tolist() == [t < len(rows) for t in range(r.reward.shape[1])]
             for t, (reward, discount, last) in enumerate(rows):
                 assert r.reward[p, t, c] == reward

@@ -9,6 +9,7 @@ from toy_acting import Choices, requests
 
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.starters import Starters
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -119,3 +120,30 @@ def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(rows):
         one, two = first.collect(request).experience, again.collect(request).experience
         for name in ("obs", "action", "reward", "next_obs", "valid", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
+    drawn = []
+
+    def watched(space, n, rng, mask=None):
+        drawn.append((n, None if mask is None else mask.tolist()))
+        return np.full(n, 4)
+
+    monkeypatch.setattr("skillweave.collecting.starters.random_actions", watched)
+    skills = Forward(), OnlyFar()
+    policies = tuple(skill.policy for skill in skills)
+    space = Corridor.action_space
+
+    def acted(kinds, xs, ids):
+        starters = Starters(SkillSet(skills[kinds], policies[kinds]), len(xs), space)
+        obs = np.array([[x, 0] for x in xs], np.float32)
+        mask = np.eye(5, dtype=bool)[[1, 2, 1, 3]] | np.eye(5, dtype=bool)[1]
+        return starters.act(np.array(ids), obs, mask, np.random.default_rng(0)).tolist()
+
+    far_only, both = slice(1, 2), slice(0, 2)
+    assert acted(both, [0, 0, 950, 0], [0, 2, 3]) == [1, 1, 1]
+    assert not drawn
+    assert acted(far_only, [0, 0, 950, 0], [1, 2, 3]) == [4, 1, 4]
+    allowed = [[False, True, True, False, False], [False, True, False, True, False]]
+    assert drawn == [(2, allowed)]
+    assert acted(far_only, [0, 0, 0, 0], [2]) == [4]

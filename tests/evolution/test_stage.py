@@ -35,7 +35,7 @@ from skillweave import (
 from skillweave.evolution import stage as evolving
 from skillweave.evolution.population import Population, has_diverged
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.files import read_tensors
+from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 from skillweave.training.scene import skill_scene
 
@@ -296,6 +296,56 @@ def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tm
     assert [has_diverged(m) for m in population.members] == [False, True, False]
     fitness = population.fitness(scene.collector(2, None), Seeds(2))
     assert np.isfinite(fitness).tolist() == [True, False, True]
+
+
+def killed_at_save(name: str, path: Path, generation: int, monkeypatch: Any) -> None:
+    """Train until the checkpoint after so many generations is written."""
+    save = evolving.EvolvingPopulation._save
+
+    def dies(self: Any) -> None:
+        save(self)
+        if self.done == generation:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(evolving.EvolvingPopulation, "_save", dies)
+    with pytest.raises(KeyboardInterrupt):
+        train(name, path, Evolution(2, 2, 2))
+    monkeypatch.setattr(evolving.EvolvingPopulation, "_save", save)
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_members_that_are_to_train_hold_no_nan_in_a_checkpoint(name, tmp_path, monkeypatch):
+    killed_at_save(name, tmp_path / "run", 1, monkeypatch)
+    file = tmp_path / "run" / "checkpoint.safetensors"
+    tensors, header = read_tensors(file)
+    state = [k for k, v in tensors.items() if k.startswith("extra.1.") and v.is_floating_point()]
+    assert {"extra.1.params", "extra.1.return_mean", "extra.1.gamma"} <= set(state)
+    declaration = Agent(spec(name), CONFIGS[name], 256)
+    for key in state:
+        altered = tensors[key].clone()
+        altered.view(-1)[0] = float("nan")
+        write_tensors(file, tensors | {key: altered}, header)
+        said = f"member 1: tensor {key.removeprefix('extra.1.')} holds NaN"
+        with pytest.raises(SkillweaveError, match=said):
+            declaration.resume(tmp_path / "run", quiet=True)
+
+
+def test_a_member_that_diverged_in_the_last_generation_may_stand_in_a_checkpoint(
+    tmp_path, monkeypatch
+):
+    trained, calls = Population.train, [0]
+
+    def poison(self: Population, *given: Any) -> None:
+        trained(self, *given)
+        calls[0] += 1
+        if calls[0] == 2:
+            self.members[1].state.params[0, 3] = float("nan")
+
+    monkeypatch.setattr(Population, "train", poison)
+    killed_at_save("ppo", tmp_path / "run", 2, monkeypatch)
+    run = Agent(spec("ppo"), CONFIGS["ppo"], 256).resume(tmp_path / "run", quiet=True)
+    assert [x["diverged"] for x in lineage(run.path)] == [False, False, False, True]
+    assert all(bool(v.isfinite().all()) for v in run.policy.weights.values())
 
 
 class Patient(Skill):

@@ -280,7 +280,7 @@ def policy() -> AgentPolicy:
 
 
 def test_a_finished_policy_comes_back_exactly(run: RunDirectory, policy: AgentPolicy) -> None:
-    run.save_policy("landing", policy)
+    run.save_policies("landing", {"landing": policy})
     run.stage("landing")["status"] = "done"
     found = run.load_policy("landing")
     assert found.weights.keys() == policy.weights.keys()
@@ -295,7 +295,7 @@ def test_a_policy_of_an_unfinished_stage_says_how_to_finish_it(run: RunDirectory
 
 
 def test_a_damaged_policy_is_named(run: RunDirectory, policy: AgentPolicy) -> None:
-    run.save_policy("landing", policy)
+    run.save_policies("landing", {"landing": policy})
     run.stage("landing")["status"] = "done"
     damage(run.policy_path("landing"))
     with pytest.raises(SkillweaveError, match="damaged") as caught:
@@ -468,7 +468,7 @@ def test_a_run_json_that_is_no_plain_file_is_refused(tmp_path: Path) -> None:
 def finished(run: RunDirectory, *policies: AgentPolicy) -> None:
     """Every stage of the run, done."""
     for entry, policy in zip(run.manifest["stages"], policies, strict=True):
-        run.save_policy(entry["name"], policy)
+        run.save_policies(entry["name"], {entry["name"]: policy})
         entry.update(status="done", steps=1, seconds=1.0)
     run.save()
 
@@ -502,7 +502,7 @@ def test_a_policy_that_the_run_did_not_end_with_is_refused(
 ) -> None:
     finished(run, policy, other(policy))
     before = run.policy_path("landing").read_bytes()
-    run.save_policy("landing", other(policy, 2))  # not said in run.json
+    run.save_policies("landing", {"landing": other(policy, 2)})  # not said in run.json
     with pytest.raises(SkillweaveError, match="another checksum"):
         RunDirectory.open(run.path).load_policy("landing")
     run.policy_path("landing").write_bytes(before)
@@ -671,7 +671,7 @@ WRITES: dict[str, Any] = {
     "run.json": lambda run, policy: run.save(),
     "a checkpoint": lambda run, policy: save(run, 1),
     "metrics": lambda run, policy: run.log({"update": 1}),
-    "a policy": lambda run, policy: run.save_policy("landing", policy),
+    "a policy": lambda run, policy: run.save_policies("landing", {"landing": policy}),
 }
 
 

@@ -25,3 +25,6 @@ def test_a_half_written_line_is_left_out_and_a_damaged_one_is_named(tmp_path):
     lines.path.write_text('{"a": 1}\n{"a"\n')
     with pytest.raises(SkillweaveError, match="damaged in line 2"):
         list(lines.read())
+    lines.path.write_text('{"a": 1}\n{"a": 1}\n{"a": "\\ud800"}\n')
+    with pytest.raises(SkillweaveError, match=r"damaged in line 3: .* half of a character"):
+        list(lines.read())

@@ -402,6 +402,21 @@ def test_learning_that_diverges_is_an_error_that_says_what_where_and_when(on_tic
         train(Broken(16), 3, replace(CONFIG, overlap=overlap), on_tick=on_tick)
 
 
+@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, overlap=False), REPLAY])
+def test_nothing_is_asked_for_after_the_last_round(config, monkeypatch):
+    env, asked, collected = Identity(16), [], []
+    found = training(make_algorithm(config, env.observation_space, env.action_space), env)
+    request, collect = found.learner.request, found.collectors.collect
+    monkeypatch.setattr(
+        found.learner, "request", lambda *about: asked.append(about) or request(*about)
+    )
+    monkeypatch.setattr(
+        found.collectors, "collect", lambda what: collected.append(what) or collect(what)
+    )
+    end = found.run(3 * 16 * 16, cut_every=16 * 16)
+    assert len(asked) == len(collected) == end.update
+
+
 @pytest.mark.parametrize("config", [CONFIG, replace(REPLAY, num_envs=8)])
 def test_a_member_that_diverges_may_be_skipped(config):
     env, ticks = Identity(16), []

@@ -16,7 +16,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
 from skillweave.training import arena
-from skillweave.training.arena import returns_of
+from skillweave.training.arena import episodes_of, returns_of
 from skillweave.training.periodic import PeriodicEvaluation
 
 SMALL = Network((8,), "relu")
@@ -81,15 +81,19 @@ def test_equal_seeds_give_equal_starts_and_others_other_ones():
 def test_an_evaluation_is_made_once_in_every_so_many_steps_also_after_a_resume():
     scene: Any = SimpleNamespace(collector=lambda n, acting: Countdown(n).collector(acting))
     policy = fresh(Countdown(1))
+
+    def play(arena: Any, seeds: Seeds) -> Any:
+        return episodes_of(policy, arena, seeds)
+
     evaluation = PeriodicEvaluation(scene, Seeds(0), 100, 3)
     evaluation.start(250)
     ticks = (260, 299, 300, 350, 520, 599, 601)
-    assert [t for t in ticks if evaluation.due(t, lambda: policy)] == [300, 520, 601]
+    assert [t for t in ticks if evaluation.due(t, play)] == [300, 520, 601]
     assert evaluation.spent() == 3 * 3 * 5
-    assert evaluation.due(700, lambda: policy) == {"eval_return": 5.0, "eval_return_min": 5.0}
+    assert evaluation.due(700, play) == {"eval_return": 5.0, "eval_return_min": 5.0}
     assert (evaluation.spent(), evaluation.spent()) == (15, 0)
     never = PeriodicEvaluation(scene, Seeds(0), None, 3)
-    assert never.due(10**6, lambda: policy) == {}
+    assert never.due(10**6, play) == {}
 
 
 class Balance(Skill):

@@ -132,7 +132,7 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
 
     with monkeypatch.context() as patch:
         if where == "its policy":
-            patch.setattr(RunDirectory, "save_policy", lambda *_: 1 / 0)
+            patch.setattr(RunDirectory, "save_policies", lambda *_: 1 / 0)
         else:
             at, reached_at = [0], trainer.Target.reached
 

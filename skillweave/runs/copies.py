@@ -1,0 +1,42 @@
+"""What a run keeps of policies that were ready when it began."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from skillweave.reading import read_file
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import make_directory, write_bytes
+from skillweave.skills.foreign_policy import Foreign, as_recorded
+from skillweave.types import Policy
+
+
+def keep_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
+    """Copy into the run what a skill's ready policy acts by, where it is to be copied."""
+    if isinstance(policy, Foreign) and (content := policy.content()) is not None:
+        path = _copy_path(run, skill, policy)
+        if not path.exists():  # a run that goes on has it
+            run.check()
+            make_directory(path.parent)
+            write_bytes(path, content, make_directories=False)
+
+
+def recorded_policy(run: RunDirectory, skill: str, policy: Policy) -> Policy:
+    """A skill's ready policy as it was when the run began.
+
+    Raises:
+        SkillweaveError: the policy is another one, and the run holds no copy of its own.
+    """
+    entry: dict[str, Any] = next((s for s in run.manifest["skills"] if s["name"] == skill), {})
+
+    def read() -> bytes | None:
+        assert isinstance(policy, Foreign)
+        path = _copy_path(run, skill, policy)
+        return read_file(path) if path.exists() else None
+
+    return as_recorded(policy, entry.get("policy"), read, f"{run.path}: skill {skill!r}")
+
+
+def _copy_path(run: RunDirectory, skill: str, policy: Foreign) -> Path:
+    return run.path / "policies" / f"{skill}{policy.suffix}"

@@ -1,0 +1,77 @@
+"""How many processes a run takes: measured only where it matters, and never for long."""
+
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from skillweave.envs import make
+from skillweave.envs.make import EnvSpec, workers_for
+from skillweave.training.stage import assign_workers
+
+
+class Clock:
+    """The time, which goes on only where an environment says so."""
+
+    now = 0.0
+
+
+class Slow(gym.Env):
+    """Steps and resets take as long as they are told to."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    steps = 0
+
+    def __init__(self, first: float, step: float, reset: float):
+        self.first, self.each, self.again = first, step, reset
+
+    def reset(self, *, seed=None, options=None):
+        Clock.now += self.again
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        Clock.now += self.each if Slow.steps else self.first
+        Slow.steps += 1
+        return np.zeros(1, np.float32), 0.0, self.again > 0.0, False, {}
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "reset", "workers", "most"),
+    [
+        (1e-6, 1e-6, 0.0, 1, 250),  # fast
+        (1e-3, 1e-3, 0.0, 4, 250),
+        (2.0, 1e-6, 0.0, 1, 201),  # only its first step is slow
+        (3.0, 3.0, 0.0, 4, 5),
+        (1e-6, 1e-6, 3.0, 1, 5),  # slow resets are none of a step's time, but take long, too
+    ],
+)
+def test_a_step_is_timed_by_a_few_steps_if_it_is_slow(
+    first, step, reset, workers, most, monkeypatch
+):
+    monkeypatch.setattr(make, "time", SimpleNamespace(perf_counter=lambda: Clock.now))
+    monkeypatch.setattr(make, "cores", lambda: 4)
+    Clock.now, Slow.steps = 0.0, 0
+    assert workers_for(EnvSpec(lambda: Slow(first, step, reset), engine="sync")) == workers
+    assert Slow.steps == most
+
+
+def entry(name: str, num_envs: int, **more):
+    return {"name": name, "algorithm": {"num_envs": num_envs}} | more
+
+
+def test_where_every_stage_evolves_nothing_is_measured():
+    def never():
+        raise AssertionError("an environment was made")
+
+    entries = [entry("one", 4, evolution={}), entry("other", 6, evolution={})]
+    assign_workers(entries, EnvSpec(never, engine="sync"))
+    assert [e["workers"] for e in entries] == [1, 1]
+
+
+def test_a_measured_number_is_lowered_to_one_that_divides_the_environments(monkeypatch):
+    monkeypatch.setattr("skillweave.training.stage.workers_for", lambda spec: 4)
+    entries = [entry("one", 4, evolution={}), entry("two", 6), entry("three", 8, evolution=None)]
+    assign_workers(entries, EnvSpec("CartPole-v1"))
+    assert [e["workers"] for e in entries] == [1, 3, 4]
