@@ -69,6 +69,10 @@ class SkillCriticAlgorithm(Algorithm):
         worth = self.net(params.views, self.inputs(params, obs))
         return worth.argmax(-1), worth, None
 
+    def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:
+        """None: there is no chance in what it says."""
+        return [None] * steps
+
     def value(self, state: AgentState, obs: Tensor, mask: Tensor | None = None) -> Tensor:
         """What the best skill is worth, (P, B), in units of reward."""
         params = self.learning_params(state)

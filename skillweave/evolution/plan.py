@@ -10,8 +10,8 @@ from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short
-from skillweave.training.trainer import MakeLearner, OneAgent, StageLearner, StageRun
-from skillweave.training.woven import WovenAgents
+from skillweave.training.trainer import MakeLearner, StageLearner, StageRun
+from skillweave.training.woven import agents_of
 from skillweave.types import SkillweaveError
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
@@ -50,7 +50,7 @@ def make_learner(stages: list[dict[str, Any]], evolve: Evolve) -> MakeLearner:
 
     def make(stage: StageRun) -> StageLearner:
         if stage.entry.get("evolution") is None:
-            return WovenAgents(stage) if "together" in stage.entry else OneAgent(stage)
+            return agents_of(stage)
         how = asked.get(stage.name)
         return EvolvingPopulation(stage, None if how is None else how.selection)
 

@@ -19,7 +19,8 @@ from skillweave.training.evaluation import evaluate
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.training.stage import CRITIC, SELECTOR, Policies
 from skillweave.training.stage_log import Listener
-from skillweave.training.trainer import MakeLearner, OneAgent, train_stages
+from skillweave.training.trainer import MakeLearner, train_stages
+from skillweave.training.woven import agents_of
 from skillweave.types import Policy
 
 
@@ -58,7 +59,7 @@ def train(
     declaration: Declaration | PlainAgent,
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
-    make_learner: MakeLearner = OneAgent,
+    make_learner: MakeLearner = agents_of,
 ) -> Policy:
     """Train, or finish training, what the run says; returns the policy."""
     if run.manifest["kind"] == "agent":

@@ -31,7 +31,7 @@ from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
 from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.training.stage_log import StageLog
-from skillweave.training.trainer import OneAgent
+from skillweave.training.trainer import OneAgent, StageRun
 from skillweave.types import Array, prefixed, unprefixed
 
 
@@ -121,6 +121,11 @@ def adapted(coef: Tensor, kl: Tensor, nats: float | None) -> Tensor:
     nats = nats or 0.0
     factor = torch.where(kl > 1.5 * nats, 2.0, torch.where(kl < nats / 1.5, 0.5, 1.0))
     return (coef * factor).clamp(1e-3, 1e3)
+
+
+def agents_of(stage: StageRun) -> OneAgent:
+    """Who learns in a stage where nothing evolves."""
+    return WovenAgents(stage) if "together" in stage.entry else OneAgent(stage)
 
 
 class WovenAgents(OneAgent):

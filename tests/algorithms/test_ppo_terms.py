@@ -1,0 +1,133 @@
+"""What a stage adds to PPO: the floor under discrete actions, the anchor, the task's advantage."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Categorical, Independent, Normal, kl_divergence
+
+from skillweave import PPO, Network, SkillweaveError
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.ppo_samples import floor_now
+from skillweave.experience import Anchor, Rollout
+from skillweave.networks.heads import ActionHead
+from skillweave.ops.distributions import with_floor
+from skillweave.seeding import Seeds
+from skillweave.spaces import action_codec
+from skillweave.training.woven import adapted
+
+SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)
+SMALL = Network(hidden=(8,))
+
+
+def test_a_floor_is_shared_among_what_is_allowed():
+    logits = torch.tensor([[2.0, 0.0, 1.0, 5.0]])
+    mask = torch.tensor([[True, True, True, False]])
+    found = with_floor(logits, mask, torch.tensor([[0.3]])).softmax(-1)
+    own = logits[0, :3].softmax(-1)
+    torch.testing.assert_close(found[0, :3], 0.7 * own + 0.1)
+    assert found[0, 3] < 1e-6
+
+
+def test_the_floor_falls_over_the_budget():
+    config, like = PPO(floor=0.5, floor_final=0.1), torch.zeros(2)
+    assert floor_now(config, 0.25, like).flatten().tolist() == pytest.approx([0.4, 0.4])
+    assert floor_now(PPO(floor=0.5), 0.9, like).flatten().tolist() == [0.5, 0.5]
+    assert floor_now(PPO(), 0.5, like) is None
+
+
+def test_who_acts_has_the_floor_and_who_is_greedy_has_not():
+    algorithm = make_algorithm(PPO(floor=0.8, network=SMALL), SEEN, gym.spaces.Discrete(4))
+    state = algorithm.init([Seeds(0)])
+    obs = torch.zeros(1, 1, 3)
+    _, head, _ = algorithm.act(algorithm.acting_params(state, 0.0), obs, None, None)
+    assert head.softmax(-1).min() >= 0.2 - 1e-6
+    greedy = algorithm.acting_params_of(algorithm.weights(state))
+    assert "floor" not in greedy.extra
+
+
+def test_a_floor_needs_discrete_actions():
+    with pytest.raises(SkillweaveError, match="floor needs discrete actions"):
+        make_algorithm(PPO(floor=0.1), SEEN, SEEN)
+    with pytest.raises(SkillweaveError, match="floor"):
+        PPO(floor=1.5)
+
+
+def test_divergence_of_heads_is_that_of_their_distributions():
+    rng = torch.Generator().manual_seed(0)
+
+    def drawn(*shape):
+        return torch.randn(shape, generator=rng)
+
+    head = ActionHead(action_codec(gym.spaces.Discrete(5)))
+    a, b = drawn(1, 6, 5), drawn(1, 6, 5)
+    want = kl_divergence(Categorical(logits=a), Categorical(logits=b))
+    torch.testing.assert_close(head.kl(a, None, b, None, None), want)
+    mask = torch.tensor([True, True, False, True, False]).expand(1, 6, 5)
+    few = kl_divergence(
+        Categorical(logits=a[..., [0, 1, 3]]), Categorical(logits=b[..., [0, 1, 3]])
+    )
+    torch.testing.assert_close(head.kl(a, None, b, None, mask), few)
+    parts = ActionHead(action_codec(gym.spaces.MultiDiscrete([2, 3])))
+    one = kl_divergence(Categorical(logits=a[..., :2]), Categorical(logits=b[..., :2]))
+    two = kl_divergence(Categorical(logits=a[..., 2:]), Categorical(logits=b[..., 2:]))
+    torch.testing.assert_close(parts.kl(a, None, b, None, None), one + two)
+    box = ActionHead(action_codec(gym.spaces.Box(-1, 1, (5,), np.float32)))
+    std, other = drawn(1, 1, 5), drawn(1, 1, 5)
+    want = kl_divergence(
+        Independent(Normal(a, std.exp()), 1), Independent(Normal(b, other.exp()), 1)
+    )
+    torch.testing.assert_close(box.kl(a, std, b, other, None), want)
+
+
+def rollout_of(algorithm, state, seed=0, **more):
+    """One rollout of random rows in which the policy acted."""
+    rng = torch.Generator().manual_seed(seed)
+    obs = torch.randn(1, 16, 4, 3, generator=rng)
+    params = algorithm.acting_params(state, 0.0)
+    noise = algorithm.noise([rng], 1, 64)[0]
+    action, head, _ = algorithm.act(params, obs.flatten(1, 2), None, noise)
+    lead = (1, 16, 4)
+    return Rollout(
+        obs=obs, action=action.unflatten(1, lead[1:]), head=head.unflatten(1, lead[1:]),
+        reward=torch.randn(lead, generator=rng), discount=torch.full(lead, 0.9),
+        next_obs=torch.randn(1, 16, 4, 3, generator=rng),
+        last=torch.arange(16)[None, :, None].expand(lead) == 15,
+        log_std=params.views["actor.log_std"][:, None] if "actor.log_std" in params.views else None,
+        **more,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("space", [gym.spaces.Discrete(4), gym.spaces.Box(-1, 1, (2,), np.float32)])
+def test_an_anchor_keeps_the_policy_near(space):
+    config = PPO(network=SMALL, update_epochs=8, learning_rate=1e-2, batch_size=32)
+    algorithm, moved = make_algorithm(config, SEEN, space), {}
+    for coef in (0.0, 100.0):
+        state = algorithm.init([Seeds(0)])
+        near = Anchor(algorithm.acting_params(state), torch.tensor([coef]))
+        rngs = [torch.Generator().manual_seed(1)]
+        for i in range(3):
+            rollout = rollout_of(algorithm, state, i, anchor=near)
+            state, report = algorithm.update(state, rollout, rngs)
+        moved[coef] = report.metrics["anchor_kl"].item()
+    assert moved[100.0] < 0.1 * moved[0.0]
+
+
+def test_the_tasks_advantage_counts_beside_the_learners_own():
+    config = PPO(network=SMALL, update_epochs=20, learning_rate=1e-2, ent_coef=0.0)
+    algorithm = make_algorithm(config, SEEN, gym.spaces.Discrete(2))
+    state = algorithm.init([Seeds(0)])
+    rollout = rollout_of(algorithm, state)
+    before = rollout.head.softmax(-1)[..., 0].mean()
+    # For the task, action 0 is always much better; the learner's own reward is chance.
+    rollout.advantage = 20.0 * (1.0 - 2.0 * rollout.action)
+    state, _ = algorithm.update(state, rollout, [torch.Generator().manual_seed(1)])
+    params = algorithm.acting_params(state)
+    _, head, _ = algorithm.act(params, rollout.obs.flatten(1, 2), None, None)
+    assert head.softmax(-1)[..., 0].mean() > before + 0.1
+
+
+def test_the_price_of_divergence_follows_the_budget():
+    coef, kl = torch.tensor([1.0, 1.0, 1.0]), torch.tensor([0.2, 0.1, 0.01])
+    assert adapted(coef, kl, 0.1).tolist() == [2.0, 1.0, 0.5]
+    assert adapted(torch.tensor([1e3]), torch.tensor([9.0]), 0.1).tolist() == [1e3]

@@ -1,0 +1,207 @@
+"""Rows of skills that learn under a selector, worked out anew from the stream of steps."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference_calls import EPISODE, POSITION, T, Walk
+from toy_acting import Choices, requests
+
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.calls import Interruption, SkillSet, Why
+from skillweave.collecting.lengths import Lengths
+from skillweave.collecting.woven import WovenCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.seeding import Seeds
+from skillweave.skills import Skill
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.types import Step
+
+N = 4
+
+
+class Up(Skill):
+    """Ends by itself on even positions, after three steps at most."""
+
+    max_steps = 3
+
+    def reward(self, step: Step):
+        return step.next_obs[:, POSITION] - step.obs[:, POSITION] + 0.25 * step.elapsed
+
+    def termination(self, step: Step):
+        return step.next_obs[:, POSITION] % 4 == 0
+
+
+class Down(Skill):
+    """Never ends by itself."""
+
+    def reward(self, step: Step):
+        return step.obs[:, POSITION] - step.next_obs[:, POSITION]
+
+
+class Stay(Skill):
+    """Is ready: it does not learn."""
+
+    policy = ScriptedPolicy(lambda obs: np.ones(len(obs), int))
+
+
+class Learner(Choices):
+    """Acts as a learner would: one member, no memory."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, 3)
+        env = Walk()
+
+        class Algorithm:
+            observation_space, action_space = env.observation_space, env.action_space
+
+        self.stacks = ((Algorithm(), 1),)
+
+    def these(self, obs, mask, memory):
+        return self.some(np.arange(len(obs)), obs, mask, memory)
+
+
+class Values(Learner):
+    """A critic to whom skill k is worth k where the position is odd, else nothing."""
+
+    def these(self, obs, mask, memory):
+        found = super().these(obs, mask, memory)
+        odd = obs[:, POSITION] % 2 == 1
+        return replace(found, head=odd[:, None] * np.arange(3, dtype=np.float32))
+
+
+def collector_of(call_steps, margin=None, n=N):
+    kinds = (Up, Down, Stay)
+    skills = tuple(kind() for kind in kinds)
+    policies = (None, None, Stay.policy)
+    found = SkillSet(skills, policies, call_steps=call_steps)
+    engine = make_engine(EnvSpec(Walk, engine="sync"), n)
+    learners = {0: Learner(n), 1: Learner(n)}
+    collector = WovenCollector(
+        engine, Choices(n, found.choices), found, learners, Values(n), margin
+    )
+    collector.start(Seeds(7))
+    return collector
+
+
+def asked(rows):
+    """Requests of ``rows`` rows for the selector, two skills and the critic."""
+    for request in requests(rows):
+        yield replace(request, parts=(request, request, request))
+
+
+def calls_of(experience, n):
+    """(choice, steps) of the decisions of a column, in order."""
+    valid = experience.valid
+    rows = range(len(experience.reward)) if valid is None else np.flatnonzero(valid[:, n])
+    return [(int(experience.action[t, n]), int(experience.steps[t, n])) for t in rows]
+
+
+@pytest.mark.parametrize("call_steps", [1, 2, 5, Lengths(1, ..., 4)])
+@pytest.mark.parametrize("margin", [None, 0.5])
+def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
+    collector = collector_of(call_steps, margin)
+    skills, seen = collector.skills, {0: 0, 1: 0}
+    ended, continued = 0, 0
+    for request in itertools.islice(asked(40), 5):
+        open_steps = collector.kept["tau"] * ~collector.kept["over"]
+        experience = collector.collect(request).experience
+        *own, stream = experience.parts
+        owner = stream.action
+        for k in (0, 1):
+            np.testing.assert_array_equal(own[k].valid, owner == k)
+            assert own[k].obs is stream.obs, "columns are shared, not copied"
+        for n in range(N):
+            last = np.zeros(40, bool)
+            at = -int(open_steps[n])
+            for choice, steps in calls_of(experience, n):
+                first, at = max(0, at), at + steps
+                assert (owner[first:at, n] == int(skills.skill_of(np.array(choice)))).all()
+                last[at - 1] = True
+            elapsed = 1 + int(open_steps[n])
+            for t in range(40):
+                k = int(owner[t, n])
+                over = bool(last[t])
+                if k == 2:
+                    elapsed = 1 if over else elapsed + 1
+                    continue
+                skill, one = skills.skills[k], slice(n, n + 1)
+                step = Step(
+                    stream.obs[t, one], owner[t, one], stream.next_obs[t, one],
+                    stream.reward[t, one], stream.terminated[t, one], stream.truncated[t, one],
+                    np.zeros(1, bool), np.array([elapsed]), {},
+                )  # fmt: skip
+                row, episode = own[k], stream.terminated[t, n] | stream.truncated[t, n]
+                assert row.reward[t, n] == np.float32(skill.reward(step)[0])
+                assert row.head[t, n, 0] == row.action[t, n]
+                stops = bool(stream.terminated[t, n] or skill.termination(step)[0])
+                assert row.terminated[t, n] == stops
+                assert over or not (stops or episode)
+                timed_out = skill.max_steps is not None and elapsed >= skill.max_steps
+                again = t < 39 and owner[t + 1, n] == k and not episode and not timed_out
+                assert row.truncated[t, n] == (over and not stops and not again)
+                seen[k] += 1
+                ended, continued = ended + stops, continued + (over and again and not stops)
+                elapsed = 1 if over else elapsed + 1
+    assert min(seen.values()) > 40
+    assert ended > 5
+    assert continued > 5 or call_steps == 5
+
+
+def test_a_call_is_cut_where_another_skill_is_worth_clearly_more():
+    worth = np.array([[0.0, 1.0, 3.0], [0.0, 1.0, 1.4], [2.0, 1.0, 3.0], [0.0, 0.0, 0.0]])
+    skills = tuple(kind() for kind in (Down, Stay, Down))
+    policy = Stay.policy
+    cuts = Interruption(lambda obs: worth[obs[:, T].astype(int)], 0.5)
+    found = SkillSet(skills, (policy,) * 3, call_steps=9, interruption=cuts)
+    memory, rows = found.start(4), np.arange(4)
+    found.begin(memory, rows, np.array([1, 1, 2, 0]))
+    obs = np.zeros((4, 3), np.float32)
+    obs[:, T] = np.arange(4)
+    no = np.zeros(4, bool)
+    step = Step(obs, np.ones(4, int), obs, np.zeros(4), no, no, no, np.ones(4, int), {})
+    why = found.observe(memory, rows, step)
+    assert why.tolist() == [Why.INTERRUPTED, Why.RUNNING, Why.RUNNING, Why.RUNNING]
+
+
+def test_a_choice_is_a_skill_and_a_length():
+    skills = SkillSet((Down(), Stay()), (Stay.policy,) * 2, call_steps=Lengths(1, 4, 16))
+    assert skills.choices == 6
+    memory = skills.start(3)
+    skills.begin(memory, np.arange(3), np.array([0, 4, 5]))
+    assert memory["skill"].tolist() == [0, 1, 1]
+    assert memory["limit"].tolist() == [1, 4, 16]
+    found = [skills.observe(memory, np.arange(3), None).tolist() for _ in range(4)]
+    assert found[0] == [Why.LIMIT, Why.RUNNING, Why.RUNNING]
+    assert found[3] == [Why.LIMIT, Why.LIMIT, Why.RUNNING]
+
+
+def test_a_learner_of_the_library_acts_and_its_head_is_kept():
+    from skillweave.algorithms.config import PPO
+    from skillweave.algorithms.policy import make_algorithm
+
+    env, n = Walk(), N
+    algorithm = make_algorithm(PPO(), env.observation_space, env.action_space)
+    state = algorithm.init([Seeds(0)])
+    skills = SkillSet((Down(), Stay()), (None, Stay.policy), call_steps=3)
+    engine = make_engine(EnvSpec(Walk, engine="sync"), n)
+    collector = WovenCollector(engine, Choices(n, 2), skills, {0: Acting([(algorithm, 1)], n)})
+    collector.start(Seeds(1))
+    request = next(requests(30))
+    own = replace(request, params=(algorithm.acting_params(state),))
+    (rows,) = collector.collect(replace(request, parts=(own,))).experience.parts
+    _, head, _ = algorithm.act(own.params[0], _tensor(rows.obs[rows.valid]), None, None)
+    np.testing.assert_allclose(rows.head[rows.valid], head[0].numpy(), atol=1e-5)
+    assert not rows.head[~rows.valid].any()
+    assert rows.valid.any()
+    assert not rows.valid.all()
+    assert rows.obs[..., EPISODE].max() > 1
+
+
+def _tensor(rows):
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(rows))[None]

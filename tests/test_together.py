@@ -1,0 +1,234 @@
+"""Skills and selector that learn together: whole runs, stopped and resumed, and what is kept."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from test_resume import assert_same, lines, policies, stopped_run
+
+from skillweave import (
+    DQN,
+    PPO,
+    RNN,
+    SAC,
+    EnvSpec,
+    Evolution,
+    Hierarchy,
+    Lengths,
+    Network,
+    Skill,
+    SkillweaveError,
+    Together,
+)
+from skillweave.runs.directory import RunDirectory
+
+SMALL = Network(hidden=(8,))
+ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
+OFF = DQN(
+    num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
+)
+
+
+class Left(Skill):
+    """Moves to the left."""
+
+    max_steps = 15
+
+    def reward(self, step):
+        return -step.next_obs[:, 0] + 0.1 * step.timed_out
+
+
+class Balance(Skill):
+    """Stays up, until it is far away."""
+
+    def initiation(self, obs):
+        return np.abs(obs[:, 2]) < 0.15
+
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 0]) > 0.5
+
+
+class Push(Skill):
+    """Is ready."""
+
+    call_steps = 2
+
+    def policy(self, obs):
+        return (obs[:, 2] > 0).astype(np.int64)
+
+
+def declare(*skills, **how):
+    options = {
+        "env": EnvSpec("CartPole-v1", engine="sync", workers=how.pop("workers", 1)),
+        "skills": skills or [Left(), Balance(), Push()],
+        "call_steps": 6,
+        "algorithm": ON,
+        "selector": ON,
+        "learn": "together",
+        "together_steps": 900,
+        "skill_steps": 300,
+        "selector_steps": 300,
+        "cut_every": 150,
+    }
+    return Hierarchy(**options | how)
+
+
+class Other(Balance):
+    """Learns from replay."""
+
+    algorithm = OFF
+
+
+class Remembers(Left):
+    """Learns with a memory."""
+
+    algorithm = PPO(
+        num_envs=4, n_steps=16, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6))
+    )
+
+
+KINDS = {
+    "all": lambda: declare(
+        call_steps=Lengths(1, ..., 8), interrupt=True, together=Together(task_weight=0.5)
+    ),
+    "mixed": lambda: declare(Left(), Other(), Push()),
+    "memory": lambda: declare(Remembers(), Balance(), together=Together(task_weight=0.5)),
+    "off-policy selector": lambda: declare(Left(), Balance(), selector=OFF),
+    "then": lambda: declare(learn="apart, then together", together=Together(anchor_nats=0.001)),
+    "interrupt apart": lambda: declare(learn="apart", interrupt=True, selector_steps=900),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run of each kind, made once."""
+    made = {}
+
+    def make(kind):
+        if kind not in made:
+            path = tmp_path_factory.mktemp("whole") / "run"
+            made[kind] = KINDS[kind]().train(path, seed=3, quiet=True), path
+        return made[kind]
+
+    return make
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("tick", [2, 4, 5])
+def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, tick):
+    run = stopped_run(KINDS[kind](), tmp_path / "run", tick)
+    assert not run.finished
+    KINDS[kind]().resume(run.path, quiet=True)
+    assert_same(run.path, whole(kind)[1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
+    run, path = whole(kind)
+    scores = run.evaluate(3).returns
+    assert KINDS[kind]().load(path).evaluate(3).returns == scores
+    run.save_weights(tmp_path / "weights")
+    assert KINDS[kind]().load_weights(tmp_path / "weights").evaluate(3).returns == scores
+
+
+def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
+    _, path = whole("all")
+    names = {"selector", "left", "balance", "skill_critic"}
+    assert {p.split(".")[1] for p in policies(path)} == names
+    told = [name for line in lines(path) for name in line]
+    for name in ("selector", "left", "balance"):
+        assert f"{name}.samples" in told
+    (entry,) = RunDirectory.open(path).manifest["stages"]
+    assert entry["learns"] == ["selector", "left", "balance", "skill_critic"]
+    assert 900 <= entry["steps"] <= 900 + 64, "a stage ends within one rollout of its budget"
+
+
+def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch):
+    declare(workers=2).train(tmp_path / "processes", seed=3, quiet=True)
+    from skillweave.collecting import group
+
+    def here(make, num_envs, workers, members, name):
+        each = num_envs // workers
+        return group.Collectors([make(each, i * each) for i in range(workers)], members)
+
+    monkeypatch.setattr("skillweave.training.trainer.make_collectors", here)
+    declare(workers=2).train(tmp_path / "here", seed=3, quiet=True)
+    assert_same(tmp_path / "processes", tmp_path / "here")
+
+
+def test_the_better_of_before_and_after_is_kept(whole):
+    _, path = whole("then")
+    told = RunDirectory.open(path).stage("together")["kept"]
+    better = "after" if told["after"] >= told["before"] else "before"
+    assert told["kept"] == better
+    names = {"selector", "left", "balance"}
+    own = {f"{n}.safetensors" for n in names} | {f"together.{n}.safetensors" for n in names}
+    assert set(policies(path)) == own, "nothing that was learnt is lost"
+    assert "anchor_kl" in " ".join(lines(path)[-1])
+
+
+class Right(Skill):
+    """The reward of the task, so that it is learnt by a flat agent as well."""
+
+
+def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
+    """What a flat agent would learn from: the value of a state is that of its episode."""
+    alone = declare(Right(), call_steps=1, together_steps=6_000, together=Together(floor=0.0))
+    path = tmp_path / "run"
+    alone.train(path, seed=0, quiet=True)
+    found = lines(path)[-1]
+    assert found["right.samples"] == 64
+    assert found["length"] > 15
+
+
+WRONG = {
+    "learn is 'both'": {"learn": "both"},
+    "write together=Together": {"together": 3},
+    "it must be at least 1, Lengths": {"call_steps": 0},
+    "learn is 'together', but the selector is ready": {"selector": lambda obs: obs[:, 0] > 0},
+}
+
+
+@pytest.mark.parametrize("says", WRONG)
+def test_a_wrong_declaration_is_told(says):
+    with pytest.raises(SkillweaveError, match=says):
+        declare(**WRONG[says])
+
+
+@pytest.mark.parametrize("steps", [(), (0, 4), (4, 2), (1, 2.5), (..., 4), (1, ...)])
+def test_wrong_lengths_are_told(steps):
+    with pytest.raises(SkillweaveError, match="Lengths"):
+        Lengths(*steps)
+
+
+def test_lengths_double_where_dots_stand():
+    assert Lengths(1, ..., 16).steps == (1, 2, 4, 8, 16)
+    assert Lengths(3, ..., 10, 40).steps == (3, 6, 10, 40)
+    assert repr(Lengths(1, 4)) == "Lengths(1, 4)"
+
+
+def test_hierarchies_that_learn_as_a_whole_do_not_evolve(tmp_path):
+    with pytest.raises(SkillweaveError, match="stage 'together': selector and left"):
+        declare().train(tmp_path / "run", quiet=True, evolve=Evolution(population=2))
+
+
+def test_continuous_skills_of_several_algorithms_learn_together(tmp_path):
+    class Slow(Skill):
+        algorithm = SAC(
+            num_envs=4, learning_starts=40, batch_size=16, buffer_size=2_000, train_freq=16,
+            network=SMALL,
+        )  # fmt: skip
+
+        def reward(self, step):
+            return -np.abs(step.next_obs[:, 2])
+
+    hierarchy = declare(
+        Slow(), Right(), env=EnvSpec("Pendulum-v1", engine="sync"), call_steps=5,
+        together_steps=600,
+    )  # fmt: skip
+    run = hierarchy.train(tmp_path / "run", seed=0, quiet=True)
+    told = lines(tmp_path / "run")[-1]
+    assert "slow.policy_loss" in told or "slow.critic_loss" in told
+    assert "right.kl" in told
+    assert isinstance(run.policy.action_space, gym.spaces.Box)
