@@ -32,6 +32,7 @@ ALL = (
     ["reading"],
     ["search"],
     ["four_rooms"],
+    ["together"],
 )
 
 

@@ -9,9 +9,10 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 5
+COUNT = 7
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
+    "doorkey.py": ("--steps", "3000", "--out", "{folder}/run"),
     "foreign_skills.py": ("--steps", "3000"),
     "four_rooms.py": ("--steps", "3000"),
     "own_algorithm.py": ("--steps", "2000", "--out", "{folder}/run"),
@@ -20,11 +21,13 @@ SMALL = {
 }
 """Small budgets, for those that take long."""
 NEEDS = {
+    "doorkey.py": ("minigrid",),
     "foreign_skills.py": ("stable_baselines3", "onnx", "onnxruntime"),
     "sb3_selector.py": ("stable_baselines3",),
     "tutorial.py": ("Box2D", "PIL"),
 }
 SAYS = {
+    "doorkey.py": "solved: ",
     "foreign_skills.py": "woven by the selector: ",
     "four_rooms.py": "steps from the corner to the goal: ",
     "own_algorithm.py": "mean return: ",

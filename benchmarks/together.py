@@ -1,0 +1,98 @@
+"""What learning together is worth: key and door (MiniGrid), against flat agents.
+
+    python -m benchmarks.together [CASE …] [--seeds 0 1 2 3 4] [--size 8x8] [--steps 500000]
+
+Every case has the same number of environment steps in all. Scores are 100 sampled episodes with
+seeds that training never saw. Two runs go side by side (``--processes``), so the seconds are those
+of a busy machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common import median, report, table, workers
+from examples import doorkey
+from skillweave import Hierarchy, Lengths, SkillweaveError, Together
+
+FLOOR = Together(floor=0.6, floor_final=0.2)
+
+
+def apart(size: str, steps: int) -> Hierarchy:
+    """Three skills apart, then the selector."""
+    selector = doorkey.algorithm(floor=FLOOR.floor, floor_final=FLOOR.floor_final)
+    return doorkey.declare(
+        size, learn="apart", skill_steps=steps // 5, selector_steps=2 * steps // 5,
+        selector=selector,
+    )  # fmt: skip
+
+
+CASES: dict[str, Callable[[str, int], Hierarchy]] = {
+    "together": doorkey.declare,
+    "apart": apart,
+    "low floor": functools.partial(doorkey.declare, together=Together()),
+    "no floor": functools.partial(
+        doorkey.declare, together=replace(FLOOR, floor=0.0, floor_final=0.0)
+    ),
+    "no call cost": functools.partial(doorkey.declare, call_cost=0.0),
+    "task advantage": functools.partial(doorkey.declare, together=replace(FLOOR, task_weight=1.0)),
+    "lengths": functools.partial(doorkey.declare, call_steps=Lengths(4, ..., 64)),
+    "interrupt": functools.partial(doorkey.declare, interrupt=True),
+    "flat": doorkey.declare,
+}
+"""By name, a hierarchy of this size of the task, with so many steps."""
+
+
+def one(case: str, size: str, steps: int, seed: int) -> dict[str, Any]:
+    """Train and score in this process."""
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        hierarchy = CASES[case](size, steps)
+        run = hierarchy.train(Path(folder) / "run", seed=seed, quiet=True, flat=case == "flat")
+        seconds = time.perf_counter() - started
+        found = run.evaluate(100, deterministic=False)
+        spent = sum(s["steps"] + s["evaluation_steps"] for s in run.info()["stages"])
+    usage = found.to_json()["skill_usage"]
+    solved = float(np.mean(np.array(found.returns) > 0))
+    return {"seed": seed, "solved": solved, "steps": spent, "seconds": seconds, "usage": usage}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="*", default=["together", "flat"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--size", default="8x8")
+    parser.add_argument("--steps", type=int, default=500_000)
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    unknown = [c for c in asked.cases if c not in CASES]
+    if unknown:
+        raise SkillweaveError(f"no case {unknown[0]!r}; there are: {', '.join(CASES)}")
+    rows, found = [], {}
+    with workers(asked.processes) as pool:
+        futures = {
+            case: [pool.submit(one, case, asked.size, asked.steps, s) for s in asked.seeds]
+            for case in asked.cases
+        }
+        for case, pending in futures.items():
+            found[case] = runs = [f.result() for f in pending]
+            solved = [r["solved"] for r in runs]
+            seconds = f"{median(r['seconds'] for r in runs):.0f}"
+            steps = f"{median(r['steps'] for r in runs):,.0f}"
+            each = " ".join(f"{x:.0%}" for x in solved)
+            rows.append((case, f"{median(solved):.0%}", f"{min(solved):.0%}", steps, seconds, each))
+            print(table(("case", "median", "worst", "steps", "s", "each"), rows), flush=True)
+    report("together", {"size": asked.size, "seeds": asked.seeds, "cases": found})
+
+
+if __name__ == "__main__":
+    main()

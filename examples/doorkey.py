@@ -1,0 +1,122 @@
+"""Key and door (MiniGrid): three skills and a selector that learn together, from nothing.
+
+    pip install minigrid
+    python examples/doorkey.py
+
+The third skill would never see a state that it is for, if it learnt apart: behind the door. Here
+all learn from the same steps, and the others lead it there.
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import skillweave as sw
+
+KEY, DOOR, OPEN = 5, 4, 0
+
+
+def make(render_mode: str | None = None, size: str = "8x8") -> gym.Env[Any, Any]:
+    """DoorKey; observations are the 7×7 cells in view: kind, colour and state of each."""
+    import minigrid  # noqa: F401, it registers the environments
+    from minigrid.wrappers import ImgObsWrapper
+
+    return ImgObsWrapper(gym.make(f"MiniGrid-DoorKey-{size}-v0", render_mode=render_mode))
+
+
+def carrying(obs: sw.Array) -> sw.Array:
+    """(N,) bool, the key is in the agent's hands."""
+    return obs[:, 3, 6, 0] == KEY
+
+
+def door_open(obs: sw.Array) -> sw.Array:
+    """(N,) bool, an open door is in view."""
+    return ((obs[..., 0] == DOOR) & (obs[..., 2] == OPEN)).any((1, 2))
+
+
+class GetKey(sw.Skill):
+    """Picks up the key."""
+
+    max_steps = 64
+
+    def reward(self, step: sw.Step) -> sw.Array:
+        return (carrying(step.next_obs) & ~carrying(step.obs)) - 0.01
+
+    def termination(self, step: sw.Step) -> sw.Array:
+        return carrying(step.next_obs)
+
+
+class OpenDoor(sw.Skill):
+    """Opens the door, once the key is there."""
+
+    max_steps = 64
+
+    def initiation(self, obs: sw.Array) -> sw.Array:
+        return carrying(obs)
+
+    def reward(self, step: sw.Step) -> sw.Array:
+        return (door_open(step.next_obs) & ~door_open(step.obs)) - 0.01
+
+    def termination(self, step: sw.Step) -> sw.Array:
+        return door_open(step.next_obs)
+
+
+class Goal(sw.Skill):
+    """Reaches the goal."""
+
+    max_steps = 64
+
+    def reward(self, step: sw.Step) -> sw.Array:
+        return step.reward * 10 - 0.01
+
+
+def algorithm(**how: Any) -> sw.PPO:
+    """Who learns. A cell's numbers are kinds of things, not brightnesses: ``encoder="cells"``."""
+    return sw.PPO(
+        num_envs=16, n_steps=128, gamma=0.99, gae_lambda=0.95, learning_rate_schedule="constant",
+        network=sw.Network(hidden=(64,), encoder="cells"), **how,
+    )  # fmt: skip
+
+
+def declare(
+    size: str = "8x8", steps: int = 500_000, workers: int | None = None, **how: Any
+) -> sw.Hierarchy:
+    """The hierarchy; ``how`` changes any of its settings."""
+    settings = {
+        "call_steps": 32,
+        "learn": "together",
+        "together_steps": steps,
+        # A floor under every skill's share of calls: one that may start anywhere takes them all.
+        "together": sw.Together(floor=0.6, floor_final=0.2),
+        "call_cost": 0.01,  # a call that ends at once is not worth as much as one that does not
+        "greedy_skills": False,
+        "algorithm": algorithm(),
+        "selector": algorithm(),
+    } | how
+    env = sw.EnvSpec(make if size == "8x8" else partial(make, size=size), workers=workers)
+    return sw.Hierarchy(env, [GetKey(), OpenDoor(), Goal()], **settings)
+
+
+hierarchy = declare()
+
+
+def main() -> None:
+    """Train it, and say how many episodes it solves."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=500_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", default="runs/doorkey")
+    asked = parser.parse_args()
+    run = declare(steps=asked.steps).train(asked.out, seed=asked.seed)
+    found = run.evaluate(100)
+    print(found.for_people())
+    print(f"solved: {np.mean(np.array(found.returns) > 0):.0%} of the episodes")
+
+
+if __name__ == "__main__":
+    main()
