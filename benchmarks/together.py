@@ -26,28 +26,28 @@ from skillweave import Hierarchy, Lengths, SkillweaveError, Together
 
 FLOOR = Together(floor=0.6, floor_final=0.2)
 
+declare = functools.partial(doorkey.declare, workers=1)  # runs go side by side
+
 
 def apart(size: str, steps: int) -> Hierarchy:
     """Three skills apart, then the selector."""
     selector = doorkey.algorithm(floor=FLOOR.floor, floor_final=FLOOR.floor_final)
-    return doorkey.declare(
+    return declare(
         size, learn="apart", skill_steps=steps // 5, selector_steps=2 * steps // 5,
         selector=selector,
     )  # fmt: skip
 
 
 CASES: dict[str, Callable[[str, int], Hierarchy]] = {
-    "together": doorkey.declare,
+    "together": declare,
     "apart": apart,
-    "low floor": functools.partial(doorkey.declare, together=Together()),
-    "no floor": functools.partial(
-        doorkey.declare, together=replace(FLOOR, floor=0.0, floor_final=0.0)
-    ),
-    "no call cost": functools.partial(doorkey.declare, call_cost=0.0),
-    "task advantage": functools.partial(doorkey.declare, together=replace(FLOOR, task_weight=1.0)),
-    "lengths": functools.partial(doorkey.declare, call_steps=Lengths(4, ..., 64)),
-    "interrupt": functools.partial(doorkey.declare, interrupt=True),
-    "flat": doorkey.declare,
+    "low floor": functools.partial(declare, together=Together()),
+    "no floor": functools.partial(declare, together=Together(floor=0.0, floor_final=0.0)),
+    "no call cost": functools.partial(declare, call_cost=0.0),
+    "task advantage": functools.partial(declare, together=replace(FLOOR, task_weight=1.0)),
+    "lengths": functools.partial(declare, call_steps=Lengths(4, ..., 64)),
+    "interrupt": functools.partial(declare, interrupt=True),
+    "flat": declare,
 }
 """By name, a hierarchy of this size of the task, with so many steps."""
 
