@@ -186,6 +186,8 @@ WRONG = {
     "learn is 'both'": {"learn": "both"},
     "write together=Together": {"together": 3},
     "it must be at least 1, Lengths": {"call_steps": 0},
+    "call_cost is -1": {"call_cost": -1},
+    "interrupt is 3": {"interrupt": 3},
     "learn is 'together', but the selector is ready": {"selector": lambda obs: obs[:, 0] > 0},
 }
 
@@ -206,6 +208,18 @@ def test_lengths_double_where_dots_stand():
     assert Lengths(1, ..., 16).steps == (1, 2, 4, 8, 16)
     assert Lengths(3, ..., 10, 40).steps == (3, 6, 10, 40)
     assert repr(Lengths(1, 4)) == "Lengths(1, 4)"
+
+
+def test_a_stage_ends_early_at_its_target(tmp_path):
+    hierarchy = declare(
+        eval_every=200, eval_episodes=2, selector_target_return=5.0, together_steps=10_000
+    )
+    path = tmp_path / "run"
+    hierarchy.train(path, seed=0, quiet=True)
+    (entry,) = RunDirectory.open(path).manifest["stages"]
+    assert entry["reached"]["value"] >= 5.0
+    assert 200 <= entry["steps"] < 500
+    assert entry["evaluation_steps"] > 10
 
 
 def test_hierarchies_that_learn_as_a_whole_do_not_evolve(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -100,6 +101,11 @@ class Declaration:
         target_of(self.selector_target_return, None, "selector")
         check_fields(self)
         check_calls(self.call_steps, self.skills)
+        cost: Any = self.call_cost
+        if isinstance(cost, bool) or not isinstance(cost, int | float) or not 0 <= cost < math.inf:
+            raise SkillweaveError(
+                f"call_cost is {short(cost)}; it must be a number of at least 0, in units of reward"
+            )
         if not isinstance(self.together, Together):
             raise SkillweaveError(
                 f"together is {short(self.together)}; write together=Together(floor=0.3)"

@@ -78,11 +78,15 @@ def train(
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
     if not apart:
         return _woven(declaration, run, after)
-    return _better(declaration, run, before, after)
+    return _better(declaration, run, listeners, before, after)
 
 
 def _better(
-    declaration: Declaration, run: RunDirectory, before: Policies, after: Policies
+    declaration: Declaration,
+    run: RunDirectory,
+    listeners: tuple[Listener, ...],
+    before: Policies,
+    after: Policies,
 ) -> HierarchyPolicy:
     """The better of two hierarchies, by episodes of the environment; written into the run."""
     entry = run.stage(TOGETHER)
@@ -101,6 +105,12 @@ def _better(
         entry["kept"]["kept"] = "after" if better else "before"
         entry["evaluation_steps"] += sum(sum(found.lengths) for found in means.values())
         run.save()
+        kept = entry["kept"]
+        for listener in listeners:
+            listener.message(
+                f"{TOGETHER}: mean return before {kept['before']:.1f}, after {kept['after']:.1f} "
+                f"(100 episodes each): kept what was {kept['kept']}"
+            )
     return policies[entry["kept"]["kept"]]
 
 

@@ -109,6 +109,8 @@ class WovenLearner:
             own = unprefixed(name, kept)
             coef = own.pop("anchor_coef", None)
             if isinstance(part, RolloutLearner) and part.anchor and coef is not None:
+                if coef.shape != (1,) or not bool(coef.isfinite().all()):
+                    raise ValueError(f"the price of divergence of {name} is {coef.tolist()}")
                 part.anchor.coef = coef.to(part.anchor.coef.device)
             part.load(own)
 
