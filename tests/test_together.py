@@ -16,6 +16,7 @@ from skillweave import (
     Evolution,
     Hierarchy,
     Lengths,
+    Mutations,
     Network,
     Skill,
     SkillweaveError,
@@ -155,6 +156,21 @@ def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch)
     monkeypatch.setattr("skillweave.training.trainer.make_collectors", here)
     declare(workers=2).train(tmp_path / "here", seed=3, quiet=True)
     assert_same(tmp_path / "processes", tmp_path / "here")
+
+
+def test_skills_that_grew_in_a_population_go_on_as_they_are(tmp_path):
+    always = Mutations(none=0, hyperparameters=0, parameters=0, activation=0, architecture=1)
+    grows = Evolution(population=4, generations=4, episodes=2, mutations=always)
+    hierarchy = declare(
+        Left(), Push(), learn="apart, then together", skill_steps=2_000, together_steps=300
+    )
+    run = hierarchy.train(tmp_path / "run", seed=1, quiet=True, evolve={"left": grows})
+    assert len(run.evaluate(2).returns) == 2
+    told = RunDirectory.open(tmp_path / "run")
+    before, after = told.load_policy("left"), told.load_policy("together", "left")
+    shapes = [{k: v.shape for k, v in p.weights.items()} for p in (before, after)]
+    assert shapes[0] == shapes[1]
+    assert before.algorithm.config.network != SMALL
 
 
 def test_the_better_of_before_and_after_is_kept(whole):

@@ -140,18 +140,30 @@ class WovenAgents(OneAgent):
         scene = self.scene
         self.together = Together(**self.stage.entry["together"])
         told = self.stage.entry["algorithms"]
-        self.configs: dict[str, AlgorithmConfig] = {SELECTOR: self.stage.config}
-        self.configs |= {name: config_from_json(told[name]) for name in told}
+        configs: dict[str, AlgorithmConfig] = {SELECTOR: self.stage.config}
+        configs |= {name: config_from_json(told[name]) for name in told}
         spaces = {
             SELECTOR: scene.action_space,
             CRITIC: gym.spaces.Discrete(len(scene.skills.skills)),
         }
         self.algorithms: dict[str, Algorithm] = {
             name: make_algorithm(
-                config, scene.observation_space, spaces.get(name, scene.skill_space)
+                self._as_grown(name, config),
+                scene.observation_space,
+                spaces.get(name, scene.skill_space),
             )
-            for name, config in self.configs.items()
+            for name, config in configs.items()
         }
+
+    def _as_grown(self, name: str, config: Any) -> Any:
+        """The settings, with the networks that ``name`` has grown in a population."""
+        before = self.stage.policies.get(name)
+        if not isinstance(before, AgentPolicy):
+            return config
+        had: Any = before.algorithm.config
+        return replace(
+            config, **{k: getattr(had, k) for k in ("network", "critic") if hasattr(had, k)}
+        )
 
     @property
     def scene(self) -> WovenScene:
