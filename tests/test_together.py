@@ -95,6 +95,10 @@ KINDS = {
     ),
     "mixed": lambda: declare(Left(), Other(), Push()),
     "memory": lambda: declare(Remembers(), Balance(), together=Together(task_weight=0.5)),
+    "a selector with a memory": lambda: declare(
+        Left(), Balance(), selector=Remembers.algorithm, interrupt=True
+    ),
+    "replay then": lambda: declare(Left(), Other(), learn="apart, then together"),
     "off-policy selector": lambda: declare(Left(), Balance(), selector=OFF),
     "then": lambda: declare(learn="apart, then together", together=Together(anchor_nats=0.001)),
     "interrupt apart": lambda: declare(learn="apart", interrupt=True, selector_steps=900),

@@ -105,7 +105,7 @@ class WovenCollector(DecisionCollector):
         others = [skill.acts for skill in self.learners.values()]
         others += [] if self.critic is None else [self.critic]
         for acting, own in zip(others, request.parts, strict=True):
-            acting.begin(replace(own, greedy=request.greedy), every_step=False)
+            acting.begin(own, every_step=False)
 
     def _worth(self, obs: Array) -> Array:
         """What each skill is worth in observations (n, …), (n, S)."""

@@ -53,6 +53,8 @@ def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
     shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(own, PPO):
         shared |= {f: getattr(own, f) for f in ("n_steps", "gae_lambda", "network", "overlap")}
+    if "network" in shared:  # the critic remembers nothing
+        shared["network"] = replace(shared["network"], rnn=None)
     return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}
 
 

@@ -54,16 +54,21 @@ class ReplayLearner:
         self.members = sum(s.members for s in stacks)
         self._first = [0, *itertools.accumulate(s.members for s in stacks)]
         self._random_until = int(self.config.learning_starts) * self.members
+        self._acts_at_random = True
         # A resumed stage whose store was not saved fills it by what it has learnt already.
         self._learns_from = self._random_until + (0 if len(store) else goes_on_at)
         self._transitions = np.zeros(2)  # of a member, all so far: when last learnt, and now
         self._returns: Array | None = None  # (N,), the open episodes' discounted returns
 
+    def act_from_the_start(self) -> None:
+        """Never act at random: it has learnt before."""
+        self._acts_at_random = False
+
     def request(self, update: int, steps: int, progress: float) -> Request:
         """``train_freq`` rows of every environment."""
         params = tuple(s.algorithm.acting_params(s.state, progress) for s in self.stacks)
         rows = int(self.config.train_freq) * self._row_steps
-        at_random = steps < self._random_until
+        at_random = self._acts_at_random and steps < self._random_until
         seeds = self._seeds / "collect" / update
         return Request(rows, params, self._gamma(), seeds, at_random)
 

@@ -74,7 +74,7 @@ class WovenLearner:
         rollout = store.rollout(stack.state.gamma)
         assert rollout is not None
         found: Array = stack.algorithm.advantage(stack.state, rollout)[0].cpu().numpy()
-        scaled: Array = found / (found.std() + np.float32(1e-8))
+        scaled: Array = (found - found.mean()) / (found.std() + np.float32(1e-3))
         return scaled
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
@@ -123,6 +123,13 @@ def adapted(coef: Tensor, kl: Tensor, nats: float | None) -> Tensor:
     nats = nats or 0.0
     factor = torch.where(kl > 1.5 * nats, 2.0, torch.where(kl < nats / 1.5, 0.5, 1.0))
     return (coef * factor).clamp(1e-3, 1e3)
+
+
+def stack_of(algorithm: Algorithm, policy: AgentPolicy) -> Any:
+    """A state of one member that acts as a policy does."""
+    state = algorithm.init([Seeds(0)])
+    algorithm.set_weights(state, policy.weights)
+    return state
 
 
 def agents_of(stage: StageRun) -> OneAgent:
@@ -191,16 +198,17 @@ class WovenAgents(OneAgent):
             before = self.stage.policies.get(name)
             if isinstance(before, AgentPolicy):
                 algorithm.set_weights(fresh, before.weights)
-                fresh.obs_count.fill_(float(self._steps_of(name)))
+                fresh.obs_count.fill_(max(1.0, self._steps_of(name)))
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
             stack = Stack(algorithm, state_to(fresh, resolve_device(algorithm.config.device)))
             part = self._part(name, stack, log)
             near = self.together.anchor_nats is not None and name not in (SELECTOR, CRITIC)
+            near &= not algorithm.memory_size  # what an anchor would remember is not known
             if near and isinstance(before, AgentPolicy) and isinstance(part, RolloutLearner):
-                params = algorithm.acting_params_of(before.weights)
-                if not algorithm.memory_size:
-                    part.anchor = Anchor(params, torch.ones(1))
+                device = stack.state.params.device
+                params = algorithm.acting_params(stack_of(algorithm, before), device=device)
+                part.anchor = Anchor(params, torch.ones(1, device=device))
             parts[name] = part
         return WovenLearner(parts, self.together)
 
@@ -215,12 +223,17 @@ class WovenAgents(OneAgent):
             return RolloutLearner(stack, seeds, quota)
         row_steps = self.scene.row_steps if name == SELECTOR else 1
         store = store_of(stack.algorithm, num_envs)
-        return ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"])
+        found = ReplayLearner(
+            [stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"]
+        )
+        if isinstance(self.stage.policies.get(name), AgentPolicy):
+            found.act_from_the_start()
+        return found
 
     def _steps_of(self, name: str) -> int:
         """Environment steps that ``name`` has learnt from in earlier stages."""
         stages = self.stage.run.manifest["stages"]
-        return sum(s.get("steps", 0) for s in stages if s["learns"] == [name])
+        return sum(s.get("steps", 0) for s in stages if name in s["learns"])
 
     def policies(self) -> dict[str, AgentPolicy]:
         """By name, who learns, as they are now."""
@@ -233,7 +246,7 @@ class WovenAgents(OneAgent):
         requests = [
             Request(
                 0, (s.algorithm.acting_params(s.state),), s.state.gamma.cpu().numpy(),
-                seeds / name, greedy=True,
+                seeds / name, greedy=name == SELECTOR or self.scene.skills.greedy,
             )
             for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
         ]  # fmt: skip
