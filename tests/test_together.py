@@ -230,6 +230,12 @@ def test_lengths_double_where_dots_stand():
     assert repr(Lengths(1, 4)) == "Lengths(1, 4)"
 
 
+def test_a_skill_that_would_never_learn_is_told(tmp_path):
+    with pytest.raises(SkillweaveError, match="budget is 30 steps, but 'other' begins to learn"):
+        declare(Left(), Other(), together_steps=30).train(tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_stage_ends_early_at_its_target(tmp_path):
     hierarchy = declare(
         eval_every=200, eval_episodes=2, selector_target_return=5.0, together_steps=10_000

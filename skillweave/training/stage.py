@@ -165,6 +165,13 @@ def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> N
                 f"{where}: its budget is {budget:,} steps{each}, but it begins to learn only after "
                 f"{starts:,} (learning_starts). Give it more steps, or start earlier"
             )
+        for name, own in entry.get("algorithms", {}).items():
+            if budget <= (starts := own.get("learning_starts", 0)):
+                raise SkillweaveError(
+                    f"{where}: its budget is {budget:,} steps, but {name!r} begins to learn only "
+                    f"after {starts:,} (learning_starts). Give the stage more steps, or start "
+                    "earlier"
+                )
         target = entry.get("target")
         if target is not None and population is not None and target["of"] != "return":
             raise SkillweaveError(
