@@ -46,6 +46,11 @@ class AgentState:
     learning_rate: Tensor  # (P,), of each member
     gamma: Tensor  # (P,), of each member
 
+    @property
+    def return_scale(self) -> Tensor:
+        """The deviation of returns, (P, 1)."""
+        return (self.return_var + 1e-8).sqrt()
+
 
 def state_to(state: S, device: Device) -> S:
     """The state on a device; tensors that are there already are not copied."""

@@ -223,8 +223,4 @@ class PPOAlgorithm(Algorithm):
 
     def in_rewards(self, state: State, raw: Tensor) -> Tensor:
         """The critic's outputs (P, N, 1) in units of reward, (P, N)."""
-        return raw.squeeze(-1) * self.return_scale(state) + state.return_mean
-
-    def return_scale(self, state: State) -> Tensor:
-        """The deviation that the critic learns returns in units of, (P, 1)."""
-        return (state.return_var + 1e-8).sqrt()
+        return raw.squeeze(-1) * state.return_scale + state.return_mean

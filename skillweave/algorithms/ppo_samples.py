@@ -10,7 +10,7 @@ from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import PPO
-from skillweave.algorithms.rollouts import Cells, Samples, rows_where
+from skillweave.algorithms.rollouts import Cells, Samples, values_after
 from skillweave.experience import Anchor, Rollout
 from skillweave.networks.stacked import take_rows
 from skillweave.ops.distributions import with_floor
@@ -80,7 +80,7 @@ def samples_of(
     metrics = {"explained_variance": explained_variance(value, returns, valid)}
     if cfg.normalize_returns:
         agent.update_return_stats(state, returns, valid)
-    mean, scale = state.return_mean, agent.return_scale(state)
+    mean, scale = state.return_mean, state.return_scale
     action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.obs_mask)
     # Clipping and KL count from the policy as it is now, whoever acted.
     head, _ = agent.run(agent.actor_net, params.views, inputs, memory, starts)
@@ -144,14 +144,13 @@ def next_values(
     Args:
         after: (P, T·B, M), the critic's memory after each row, if it has one.
     """
-    following = torch.zeros_like(value)
-    following[:, :-1] = value[:, 1:]
-    # Surplus rows of members with fewer ends get what the shift gave them.
-    rows = rows_where(rollout.last.flatten(1))
-    inputs = agent.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
-    if after is None:
-        raw = agent.critic_net(params.views, inputs)
-    else:
-        raw, _ = agent.critic_net.step(params.views, inputs, take_rows(after, rows))
-    ends = agent.in_rewards(state, raw)
-    return following.flatten(1).scatter(1, rows, ends).view_as(value)
+
+    def at_ends(rows: Tensor) -> Tensor:
+        inputs = agent.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
+        if after is None:
+            raw = agent.critic_net(params.views, inputs)
+        else:
+            raw, _ = agent.critic_net.step(params.views, inputs, take_rows(after, rows))
+        return agent.in_rewards(state, raw)
+
+    return values_after(value, rollout.last, at_ends)

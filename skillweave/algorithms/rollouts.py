@@ -24,6 +24,21 @@ def rows_where(flags: Tensor) -> Tensor:
     return _first_true(flags, *on_host(flags.sum(1).max()))
 
 
+def values_after(value: Tensor, last: Tensor, at_ends: Callable[[Tensor], Tensor]) -> Tensor:
+    """What follows each row is worth: the next row's value, except at ends; (P, T, B).
+
+    Args:
+        value: (P, T, B), of each row.
+        last: (P, T, B) bool, ends.
+        at_ends: rows (P, K) of T·B to what follows them is worth, (P, K).
+    """
+    found = torch.zeros_like(value)
+    found[:, :-1] = value[:, 1:]
+    # Surplus rows of members with fewer ends get what the shift gave them.
+    rows = rows_where(last.flatten(1))
+    return found.flatten(1).scatter(1, rows, at_ends(rows)).view_as(value)
+
+
 class Cells:
     """The cells of a rollout that networks run on: the valid ones, or all.
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.rollouts import rows_where
+from skillweave.algorithms.rollouts import values_after
 from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, take_rows
@@ -77,26 +77,26 @@ class SkillCriticAlgorithm(Algorithm):
         """What the best skill is worth, (P, B), in units of reward."""
         params = self.learning_params(state)
         worth = self.net(params.views, self.inputs(params, obs)).amax(-1)
-        return worth * _scale(state) + state.return_mean
+        return worth * state.return_scale + state.return_mean
 
     def advantage(self, state: AgentState, rollout: Rollout) -> Tensor:
         """GAE(λ) of the task's reward, (P, T, B), in deviations of the return."""
         found, _ = self._judged(state, rollout)
-        return found / _scale(state)[..., None]
+        return found / state.return_scale[..., None]
 
     def update(
         self, state: AgentState, batch: Rollout, rng: Sequence[torch.Generator]
     ) -> tuple[AgentState, Report]:
         """Learn λ-returns of the skills that acted, in place; ``rng`` orders the minibatches."""
-        rollout, cfg = batch, self.config
-        self.update_obs_stats(state, rollout.obs.flatten(1, 2))
-        advantage, value = self._judged(state, rollout)
+        cfg = self.config
+        self.update_obs_stats(state, batch.obs.flatten(1, 2))
+        advantage, value = self._judged(state, batch)
         returns = (advantage + value).flatten(1)
         self.update_return_stats(state, returns)
-        target = (returns - state.return_mean) / _scale(state)
+        target = (returns - state.return_mean) / state.return_scale
         leaves = self.layout.leaves(state.params)
-        inputs = self.inputs(self.learning_params(state), rollout.obs.flatten(1, 2))
-        action, size = rollout.action.flatten(1), target.shape[1]
+        inputs = self.inputs(self.learning_params(state), batch.obs.flatten(1, 2))
+        action, size = batch.action.flatten(1), target.shape[1]
         rate, loss = state.learning_rate * (1.0 - batch.progress), target.new_zeros(len(target))
         parts = max(1, round(size / cfg.batch_size))
         for _ in range(cfg.update_epochs):
@@ -117,24 +117,20 @@ class SkillCriticAlgorithm(Algorithm):
 
         What follows a step is worth Q of whoever acts next; at ends, of who acted.
         """
-        params, action = self.learning_params(state), rollout.action
-        scale, mean = _scale(state)[..., None], state.return_mean[..., None]
-        raw = self.net(params.views, self.inputs(params, rollout.obs.flatten(1, 2)))
-        own = raw.gather(2, action.flatten(1)[..., None]).view_as(rollout.reward)
-        value = own * scale + mean
-        following = torch.zeros_like(value)
-        following[:, :-1] = value[:, 1:]
-        rows = rows_where(rollout.last.flatten(1))
-        ends = self.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
-        chosen = take_rows(action.flatten(1), rows)[..., None]
-        worth = self.net(params.views, ends).gather(2, chosen).squeeze(-1)
-        worth = worth * scale.squeeze(-1) + mean.squeeze(-1)
-        following = following.flatten(1).scatter(1, rows, worth).view_as(value)
+        value = self._worth(state, rollout.obs, rollout.action).view_as(rollout.reward)
+
+        def at_ends(rows: Tensor) -> Tensor:
+            obs, action = rollout.next_obs.flatten(1, 2), rollout.action.flatten(1)
+            return self._worth(state, take_rows(obs, rows)[:, None], take_rows(action, rows))
+
+        following = values_after(value, rollout.last, at_ends)
         decay = torch.full_like(state.gamma, self.config.gae_lambda)
         found = gae(rollout.reward, rollout.discount, value, following, rollout.last, decay)
         return found, value
 
-
-def _scale(state: AgentState) -> Tensor:
-    """The running deviation of returns, (P, 1)."""
-    return (state.return_var + 1e-8).sqrt()
+    def _worth(self, state: AgentState, obs: Tensor, skill: Tensor) -> Tensor:
+        """Q(s, skill) in units of reward, (P, N), of (P, …) observations on two axes."""
+        params = self.learning_params(state)
+        raw = self.net(params.views, self.inputs(params, obs.flatten(1, 2)))
+        chosen = raw.gather(2, skill.flatten(1)[..., None]).squeeze(-1)
+        return chosen * state.return_scale + state.return_mean

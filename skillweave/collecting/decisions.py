@@ -88,10 +88,11 @@ class DecisionCollector(Collector):
         raw = self.engine.step(action)
         self._count(raw)
         ended = raw.terminated | raw.truncated
-        why = self._observe(obs, action, raw)
+        seen = self._seen(obs, action, raw) if self._watches else None
+        why = self.skills.observe(self._calls, self._all, seen)
         why[ended] = Why.EPISODE
-        if out is not None:
-            self._record(obs, mask, raw, why)
+        if out is not None and seen is not None:
+            self._record(seen, mask, why)
         self.obs = raw.next_obs
         ids = np.flatnonzero(why != Why.RUNNING)
         if len(ids):
@@ -105,17 +106,14 @@ class DecisionCollector(Collector):
                 self._tell(ids, None if success is None else success[ids])
                 self._begin_anew(ids)
 
-    def _observe(self, obs: Array, action: Array, raw: RawStep) -> Array:
-        """Show a step to the running skills; (N,) int8, why their calls are over."""
-        seen = None
-        if self._watches:
-            seen = Step(
-                obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-                self._never, self._calls["elapsed"], raw.info,
-            )  # fmt: skip
-        return self.skills.observe(self._calls, self._all, seen)
+    def _seen(self, obs: Array, action: Array, raw: RawStep) -> Step:
+        """The step as skills are shown it."""
+        return Step(
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            self._never, self._calls["elapsed"], raw.info,
+        )  # fmt: skip
 
-    def _record(self, obs: Array, mask: Array | None, raw: RawStep, why: Array) -> None:
+    def _record(self, step: Step, mask: Array | None, why: Array) -> None:
         """Keep the step for skills that learn; here they do not."""
 
     def _decide(self, rows: Array) -> None:

@@ -12,7 +12,7 @@ from skillweave.collecting.acting import Acted, Acting, Request
 from skillweave.collecting.calls import Interruption, SkillSet, Why, skill_step
 from skillweave.collecting.columns import stacked
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.engine import Engine
 from skillweave.experience import Experience
 from skillweave.skills import asked
 from skillweave.spaces import action_codec
@@ -123,20 +123,10 @@ class WovenCollector(DecisionCollector):
         if self._rows is not None:
             self._rows.go_on(rows[same])
 
-    def _observe(self, obs: Array, action: Array, raw: RawStep) -> Array:
-        why = super()._observe(obs, action, raw)
-        self._action = action
-        return why
-
-    def _record(self, obs: Array, mask: Array | None, raw: RawStep, why: Array) -> None:
+    def _record(self, step: Step, mask: Array | None, why: Array) -> None:
         """Keep the step for the skills that learn."""
-        if self._rows is None:
-            return
-        self._rows.put(obs, mask, self.engine.mask(), raw)
-        step = Step(
-            obs, self._action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            self._never, self._calls["elapsed"], raw.info,
-        )  # fmt: skip
+        assert self._rows is not None
+        self._rows.put(step, mask, self.engine.mask())
         for i, skill in self.learners.items():
             mine = np.flatnonzero(self._calls["skill"] == i)
             if len(mine):
@@ -197,12 +187,12 @@ class Rows:
             on = ids[self._goes_on[ids]]
             self._truncated[self._at - 1, on] = False
 
-    def put(self, obs: Array, mask: Array | None, next_mask: Array | None, raw: RawStep) -> None:
+    def put(self, step: Step, mask: Array | None, next_mask: Array | None) -> None:
         """Write what happened in the environments."""
         at, collector = self._at, self._collector
-        self._obs[at], self._next_obs[at], self._task[at] = obs, raw.next_obs, raw.reward
+        self._obs[at], self._next_obs[at], self._task[at] = step.obs, step.next_obs, step.reward
         self._owner[at], self._fresh[at] = collector._calls["skill"], collector.kept["fresh"]
-        self._ended[at], self._cut[at] = raw.terminated, raw.truncated
+        self._ended[at], self._cut[at] = step.terminated, step.truncated
         self._masks.append(mask)
         self._next_masks.append(next_mask)
         self._goes_on[:] = False

@@ -75,19 +75,17 @@ def _apart(declaration: Declaration) -> list[Stage]:
 
     def calls(policies: Policies) -> Scene:
         skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
+        if declaration.interrupt:
+            return woven_scene(declaration.spec, skills, ())
         return selector_scene(declaration.spec, skills)
-
-    def watched_calls(policies: Policies) -> WovenScene:
-        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
-        return woven_scene(declaration.spec, skills, ())
 
     first = [skill_stage(s) for s in declaration.skills if s.policy is None]
     if not isinstance(config := declaration.selector, AlgorithmConfig):
         return first
     budget = declaration.selector_steps
     target = target_of(declaration.selector_target_return, None, SELECTOR)
-    if not declaration.interrupt:
-        return [*first, Stage(SELECTOR, "selector", config, budget, calls, target)]
-    how, beside = declaration.together, _critic(declaration)
-    last = config, budget, watched_calls, target, beside, how, True
-    return [*first, Stage(SELECTOR, "selector", *last)]
+    last = Stage(SELECTOR, "selector", config, budget, calls, target)
+    if declaration.interrupt:
+        how, beside = declaration.together, _critic(declaration)
+        last = replace(last, beside=beside, together=how, interrupt=True)
+    return [*first, last]

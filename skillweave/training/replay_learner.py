@@ -19,7 +19,7 @@ from skillweave.spaces import to_tensor
 from skillweave.training.learner import Learner, RolloutLearner, Stack, member_seeds
 from skillweave.types import Array, prefixed, unprefixed
 
-TOGETHER = 8
+DRAWN_AT_ONCE = 8
 """Gradient steps whose samples are drawn at once."""
 
 
@@ -130,9 +130,9 @@ class ReplayLearner:
         seeds = member_seeds(self._seeds, "learn", stack.members, update, first)
         rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
         # Several draws at once cost little more than one, but priorities change in between.
-        together, gamma = 1 if cfg.prioritized else TOGETHER, stack.state.gamma.cpu()
-        for done in range(0, due, together):
-            size = cfg.batch_size * min(together, due - done)
+        draws, gamma = 1 if cfg.prioritized else DRAWN_AT_ONCE, stack.state.gamma.cpu()
+        for done in range(0, due, draws):
+            size = cfg.batch_size * min(draws, due - done)
             drawn = self.store.sample(size, gamma, rngs, beta, first, progress)
             for sample in drawn.split(cfg.batch_size):
                 stack.state, report = stack.algorithm.update(stack.state, sample, generators)

@@ -125,13 +125,6 @@ def adapted(coef: Tensor, kl: Tensor, nats: float | None) -> Tensor:
     return (coef * factor).clamp(1e-3, 1e3)
 
 
-def stack_of(algorithm: Algorithm, policy: AgentPolicy) -> Any:
-    """A state of one member that acts as a policy does."""
-    state = algorithm.init([Seeds(0)])
-    algorithm.set_weights(state, policy.weights)
-    return state
-
-
 def agents_of(stage: StageRun) -> OneAgent:
     """Who learns in a stage where nothing evolves."""
     return WovenAgents(stage) if "together" in stage.entry else OneAgent(stage)
@@ -194,23 +187,30 @@ class WovenAgents(OneAgent):
         """All learners, from a checkpoint, from what they learnt in earlier stages, or fresh."""
         saved, parts = unprefixed("state", extra), dict[str, Learner]()
         for name, algorithm in self.algorithms.items():
-            fresh = algorithm.init([self.stage.seeds / name / "member" / 0])
-            before = self.stage.policies.get(name)
+            fresh: Any = algorithm.init([self.stage.seeds / name / "member" / 0])
+            device = resolve_device(algorithm.config.device)
+            before, anchor = self.stage.policies.get(name), None
             if isinstance(before, AgentPolicy):
                 algorithm.set_weights(fresh, before.weights)
                 fresh.obs_count.fill_(max(1.0, self._steps_of(name)))
+                anchor = self._anchor(name, algorithm, fresh, device)
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
-            stack = Stack(algorithm, state_to(fresh, resolve_device(algorithm.config.device)))
-            part = self._part(name, stack, log)
-            near = self.together.anchor_nats is not None and name not in (SELECTOR, CRITIC)
-            near &= not algorithm.memory_size  # what an anchor would remember is not known
-            if near and isinstance(before, AgentPolicy) and isinstance(part, RolloutLearner):
-                device = stack.state.params.device
-                params = algorithm.acting_params(stack_of(algorithm, before), device=device)
-                part.anchor = Anchor(params, torch.ones(1, device=device))
+            part = self._part(name, Stack(algorithm, state_to(fresh, device)), log)
+            if isinstance(part, RolloutLearner):
+                part.anchor = anchor
             parts[name] = part
         return WovenLearner(parts, self.together)
+
+    def _anchor(
+        self, name: str, algorithm: Algorithm, state: Any, device: torch.device
+    ) -> Anchor | None:
+        """What a skill that was trained before is to stay near: this state."""
+        near = self.together.anchor_nats is not None and name not in (SELECTOR, CRITIC)
+        if not near or algorithm.memory_size:  # what an anchor would remember is not known
+            return None
+        params = algorithm.acting_params(state, device=device)
+        return Anchor(params, torch.ones(1, device=device))
 
     def _part(self, name: str, stack: Stack, log: StageLog) -> Learner:
         """The learner of the selector, or of a skill."""
