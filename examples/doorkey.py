@@ -91,8 +91,8 @@ def declare(
         "call_steps": 32,
         "learn": "together",
         "together_steps": steps,
-        # A floor under every skill's share of calls: one that may start anywhere takes them all.
-        "together": sw.Together(floor=0.6, floor_final=0.2),
+        # At first any skill that may start is called: one that may start anywhere would take them all.
+        "together": sw.Together(floor=1.0, floor_final=0.1),
         "call_cost": 0.01,  # a call that ends at once is not worth as much as one that does not
         "greedy_skills": False,
         "algorithm": algorithm(),
