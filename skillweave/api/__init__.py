@@ -169,6 +169,7 @@ class Hierarchy(Declaration):
                 self.together = replace(self.together, margin=margin)
             self.learn = run.manifest.get("learn", "apart")
             self.reflexes_in_training = run.manifest.get("reflexes_in_training", True)
+            self.start_calls = run.manifest.get("start_calls")
             self.greedy_skills = run.manifest["greedy_skills"]
 
 

@@ -65,6 +65,10 @@ class Declaration:
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000
     """Training budget of the selector, in environment steps; a ready one takes none."""
+    start_calls: int | None = None
+    """While a skill trains apart, its episodes begin after up to this many calls of the skills that
+    can act already, a number drawn for each: it learns where it will be called. None: it starts as
+    soon as it may."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
     call_cost: float = 0.0

@@ -69,7 +69,10 @@ def _apart(declaration: Declaration) -> list[Stage]:
         def scene(policies: Policies) -> Scene:
             others = [s for s in declaration.skills if s.name in policies]
             starters = declaration.skill_set([policies[s.name] for s in others], others)
-            return skill_scene(declaration.spec, skill, reflexes, starters if others else None)
+            led_by = starters if others else None
+            return skill_scene(
+                declaration.spec, skill, reflexes, led_by, declaration.start_calls or 0
+            )
 
         return Stage(skill.name, "skill", config, budget, scene, target)
 

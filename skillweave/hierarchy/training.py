@@ -42,6 +42,7 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "interrupt": declaration.together.margin if declaration.interrupt else None,
         "greedy_skills": declaration.greedy_skills,
         "reflexes_in_training": declaration.reflexes_in_training,
+        "start_calls": declaration.start_calls,
         "resume_needs_recipe": not declaration.trains_from_data,
         "reflexes": [r.name for r in declaration.reflexes],
         "needs_recipe": not declaration.is_data,

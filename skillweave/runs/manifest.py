@@ -140,6 +140,7 @@ class HierarchyManifest(Manifest):
     """Of a ready selector; absent where it is trained."""
     reflexes: NotRequired[list[str]]
     reflexes_in_training: NotRequired[bool]
+    start_calls: NotRequired[int | None]
 
 
 class MemberEntry(TypedDict):

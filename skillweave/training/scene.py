@@ -57,18 +57,20 @@ def skill_scene(
     skill: Skill | None = None,
     reflexes: Sequence[Reflex] = (),
     starters: SkillSet | None = None,
+    start_calls: int = 0,
 ) -> Scene:
     """The environments seen through a skill; None: as they are.
 
     Args:
         starters: skills that can act already: they lead to where the skill may start.
+        start_calls: an episode begins after up to so many calls of theirs.
     """
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return SkillCollector(engine, acting, skill, tuple(reflexes), starters)
+        return SkillCollector(engine, acting, skill, tuple(reflexes), starters, start_calls)
 
     return Scene(spec.name, *_spaces(spec), collector)
 
