@@ -91,7 +91,7 @@ def declare(
         "call_steps": 32,
         "learn": "together",
         "together_steps": steps,
-        # At first any skill that may start is called: one that may start anywhere would take them all.
+        # At first any skill that may start is called: else one that may start anywhere takes all.
         "together": sw.Together(floor=1.0, floor_final=0.1),
         "call_cost": 0.01,  # a call that ends at once is not worth as much as one that does not
         "greedy_skills": False,

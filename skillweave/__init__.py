@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy, Run, train_agent
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
+    from skillweave.envs.pool import PoolWrapper, envpool
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, Selection
     from skillweave.experience import Report, Rollout, Sample
@@ -46,6 +47,7 @@ _HOME = {
     "Network": "networks.config",
     "OptionsEnv": "hierarchy.options",
     "PPO": "algorithms.config",
+    "PoolWrapper": "envs.pool",
     "RNN": "networks.config",
     "Range": "evolution.config",
     "Reflex": "skills",
@@ -62,6 +64,7 @@ _HOME = {
     "Together": "training.stage",
     "Tournament": "evolution.config",
     "Truncation": "evolution.config",
+    "envpool": "envs.pool",
     "evaluate": "training.evaluation",
     "from_function": "skills",
     "from_onnx": "skills",
@@ -96,6 +99,7 @@ __all__ = [
     "Mutations",
     "Network",
     "OptionsEnv",
+    "PoolWrapper",
     "Range",
     "Reflex",
     "Report",
@@ -109,6 +113,7 @@ __all__ = [
     "Together",
     "Tournament",
     "Truncation",
+    "envpool",
     "evaluate",
     "from_function",
     "from_onnx",
