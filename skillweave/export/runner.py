@@ -24,10 +24,7 @@ RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = range(5)  # why a call is over
 
 
 class Runner:
-    """The policy of one environment. ``code``: the functions that it needs, by name.
-
-    What ``code`` lacks is taken from the skills and reflexes of ``hierarchy``.
-    """
+    """The policy of one environment; ``code``, or ``hierarchy``, has the functions it needs."""
 
     def __init__(self, path: Any, code: Any = None, hierarchy: Any = None, seed: Any = None):
         self.path, self.code, self.rng = Path(path), dict(code or {}), np.random.default_rng(seed)
@@ -47,7 +44,7 @@ class Runner:
         self.root.reset()
 
     def act(self, obs: Any, reward: float = 0.0, info: Any = None, mask: Any = None) -> Any:
-        """The action for an observation and what came with it; ``mask``: the actions allowed."""
+        """The action for an observation and what came with it; ``mask`` says which are allowed."""
         self.obs, self.feeds = np.zeros((1, *self.told["shape"]), self.dtype), {}
         for name, fields, keys in self.told["inputs"]:
             self.feeds[name] = reduce(getitem, fields, self.obs)
@@ -64,13 +61,15 @@ class Runner:
         """The latest step, as seen by who has acted for ``elapsed`` steps: arrays of one row."""
         obs, action, after, reward, info = self.latest
         no, told = np.zeros(1, bool), {k: np.array([v]) for k, v in info.items()}
-        rows = {"action": action, "reward": reward, "timed_out": timed_out, "elapsed": elapsed}
-        found = {k: np.array([v]) for k, v in rows.items()} | {"obs": obs, "next_obs": after}
-        return SimpleNamespace(**found, terminated=no, truncated=no, info=told)
+        rows = {"action": action, "timed_out": timed_out, "elapsed": elapsed}
+        found = {k: np.array([v]) for k, v in rows.items()} | {"reward": np.array([reward], "f4")}
+        found |= {"obs": obs, "next_obs": after, "info": told}
+        return SimpleNamespace(**found, terminated=no, truncated=no)
 
     def made(self, told: Any) -> Any:
         """The part of the policy that an entry of ``policy.json`` describes."""
-        return _KINDS[f"_{told['kind']}"](self, told)
+        kinds = {c.__name__: c for c in (_Code, *_Code.__subclasses__())}
+        return kinds[f"_{told['kind']}"](self, told)
 
     def asks(self, name: str, about: Any) -> bool:
         """What code says of an observation or a step."""
@@ -92,7 +91,7 @@ class _Code:
 
     def reset(self) -> None: ...
     def observe(self, elapsed: int, timed_out: bool) -> None: ...
-    def watch(self, elapsed: int, timed_out: bool, last: Any) -> None: ...
+    def watch(self, last: Any, *when: Any) -> None: ...
     def act(self, mask: Any, last: Any = None) -> Any:
         return self.runner.action(self.runner.code[self.told["code"]](self.runner.obs)[0])
 
@@ -102,10 +101,9 @@ class _Network(_Code):
 
     def __init__(self, runner: Runner, told: Any) -> None:
         super().__init__(runner, told)
-        options = ort.SessionOptions()
+        options, where = ort.SessionOptions(), {"providers": ["CPUExecutionProvider"]}
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        file, where = str(runner.path / told["file"]), ["CPUExecutionProvider"]
-        self.session = ort.InferenceSession(file, options, providers=where)
+        self.session = ort.InferenceSession(str(runner.path / told["file"]), options, **where)
         self.outputs = [o.name for o in self.session.get_outputs()]
         self.reset()
 
@@ -157,8 +155,7 @@ class _Hierarchy(_Code):
         return action
 
     def observe(self, elapsed: int, timed_out: bool) -> None:
-        self.elapsed += 1
-        runner, told = self.runner, self.skills[self.skill]
+        runner, told, self.elapsed = self.runner, self.skills[self.skill], self.elapsed + 1
         own = self.elapsed, self.elapsed >= (told["max_steps"] or np.inf)
         self.why = LIMIT if self.elapsed >= self.limit else RUNNING
         self.policies[self.skill].observe(*own)
@@ -168,10 +165,10 @@ class _Hierarchy(_Code):
             worth = self.critic.act(None)
             best = worth[self.may_start()].max(initial=-np.inf)
             self.why = INTERRUPTED if best - worth[self.skill] > self.told["margin"] else RUNNING
-        self.succeeded = self.why == OWN
-        if told["success"] and self.why != RUNNING:
-            self.succeeded = runner.asks(told["success"], runner.step(*own))
-        self.selector.watch(elapsed, timed_out, self)
+        judge, self.succeeded = told["success"], self.why == OWN
+        if judge and self.why != RUNNING:
+            self.succeeded = runner.asks(judge, runner.step(*own))
+        self.selector.watch(self, elapsed, timed_out)
 
 
 class _Function(_Code):
@@ -193,14 +190,11 @@ class _Automaton(_Code):
     def act(self, mask: Any, last: Any = None) -> Any:
         return next(skill for skill in self.told["skills"][self.state] if mask[0, skill])
 
-    def watch(self, elapsed: int, timed_out: bool, last: Any) -> None:
-        step = self.runner.step(elapsed, timed_out)
+    def watch(self, last: Any, *when: Any) -> None:
+        asks, step = self.runner.asks, self.runner.step
         ended = {"success": last.succeeded, "failure": not last.succeeded}
         for origin, target, event, code in self.told["transitions"]:
             over = last.why != RUNNING and ended.get(event)
-            if self.state == origin and (self.runner.asks(code, step) if code else over):
+            if self.state == origin and (asks(code, step(*when)) if code else over):
                 self.state = target
                 return
-
-
-_KINDS: Any = {c.__name__: c for c in (_Code, _Network, _Hierarchy, _Function, _Automaton)}

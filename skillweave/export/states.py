@@ -171,7 +171,7 @@ class States:
         }  # fmt: skip
 
     def _asks(self, name: str, function: Any, what: str) -> str:
-        """The name under which the runner is to be given a function; another one's gets a number."""
+        """The name under which the runner is given a function; of two functions, a number too."""
         names = [name, *(f"{name}#{i}" for i in range(2, 1000))]
         free = next(n for n in names if self._known.get(n, function) == function)
         self._known[free] = function

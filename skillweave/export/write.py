@@ -71,7 +71,7 @@ def write_export(path: Path, policy: Policy, env: str) -> Export:
 
 
 def _inputs(space: gym.Space[Any]) -> list[list[Any]]:
-    """Of each leaf: its name, its fields in the packed array, and its keys in what Gymnasium gives."""
+    """Of each leaf its name, its fields in the packed array, and its keys in an observation."""
 
     def within(space: gym.Space[Any], fields: list[str], keys: list[Any]) -> list[list[Any]]:
         inner = parts(space)
