@@ -40,7 +40,7 @@ class Player:
 
     def reset(self) -> None:
         """A new episode begins: nothing is remembered."""
-        self._memory: Memory = self.policy.start(1)
+        self.memory: Memory = self.policy.start(1)
         self._before: tuple[Array, Array] | None = None
         self._elapsed = 0
 
@@ -67,10 +67,10 @@ class Player:
         if self._before is not None:
             self._elapsed += 1
             step = self._step(seen, reward, info or {})
-            self._memory = self.policy.observe(self._memory, step)
+            self.memory = self.policy.observe(self.memory, step)
         allowed = None if mask is None else np.asarray(mask, bool)[None]
-        action, self._memory = self.policy.act(
-            self._memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
+        action, self.memory = self.policy.act(
+            self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
         )
         self._before = seen, action
         return action[0]

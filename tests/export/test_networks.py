@@ -13,7 +13,7 @@ import pytest
 import torch
 from toys import ASKS, SHOWS
 
-from skillweave import DQN, PPO, RNN, SAC, TD3, CNN, Network, SkillweaveError
+from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api.player import Player
@@ -22,8 +22,8 @@ from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.seeding import Seeds
-from skillweave.spaces import unpack
 from skillweave.skills.foreign_policy import made_up
+from skillweave.spaces import unpack
 
 pytest.importorskip("onnxscript")
 torch.set_num_threads(1)
@@ -33,8 +33,10 @@ REPLAY: dict[str, Any] = {"buffer_size": 100, "network": SMALL, "normalize_obs":
 BOX64 = gym.spaces.Box(np.array([-2.0, -np.inf]), np.array([1.0, np.inf]), dtype=np.float64)
 NESTED = gym.spaces.Dict(
     image=gym.spaces.Box(0, 255, (5, 5, 3), np.uint8),
-    inner=gym.spaces.Tuple((gym.spaces.Discrete(3, start=1), gym.spaces.Box(-1, 1, (2,), np.float64))),
-)  # fmt: skip
+    inner=gym.spaces.Tuple(
+        (gym.spaces.Discrete(3, start=1), gym.spaces.Box(-1, 1, (2,), np.float64))
+    ),
+)
 CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
     "ppo, normalised": (PPO(network=SMALL), SHOWS["vector"], ASKS["Discrete"][0]),
     "ppo, elu, layer norm": (
