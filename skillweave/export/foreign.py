@@ -133,7 +133,8 @@ class _Nodes:
         """One operation on the results of others, and on constants; the name of its result."""
         from onnx import helper, numpy_helper
 
-        names, out = [], out or f"then.{len(self.added)}"
+        out = out or f"then.{len(self.added)}"
+        names: list[str] = []
         for value in given:
             if not isinstance(value, str):
                 fixed = numpy_helper.from_array(value, f"{out}.{len(names)}")

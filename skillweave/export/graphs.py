@@ -181,17 +181,30 @@ def traced(
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise MissingExtra("exporting to ONNX", "onnx") from error
-    file = io.BytesIO()
     try:
         with _quiet(), torch.no_grad():
-            torch.onnx.export(
-                module, tuple(given.values()), file, dynamo=True, verbose=False,
-                opset_version=OPSET, external_data=False,
-                input_names=list(given), output_names=list(outputs),
+            program = torch.onnx.export(
+                module, tuple(given.values()), None, dynamo=True, verbose=False,
+                opset_version=OPSET, input_names=list(given), output_names=list(outputs),
             )  # fmt: skip
     except Exception as error:  # torch's own errors have no common class
         raise SkillweaveError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
-    return file.getvalue()
+    assert program is not None
+    model = program.model_proto
+    model.ClearField("metadata_props")
+    _strip(model.graph)
+    content: bytes = model.SerializeToString(deterministic=True)
+    return content
+
+
+def _strip(graph: Any) -> None:
+    """Forget where each operation was written: paths of this machine, and half of the size."""
+    for part in (graph, *graph.node, *graph.value_info):
+        part.ClearField("metadata_props")
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _strip(attribute.g)
 
 
 @contextlib.contextmanager

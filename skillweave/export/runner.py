@@ -40,7 +40,8 @@ class Runner:
 
     def reset(self) -> None:
         """A new episode begins."""
-        self.before, self.elapsed = (), 0
+        self.before: Any = ()
+        self.elapsed = 0
         self.root.reset()
 
     def act(self, obs: Any, reward: float = 0.0, info: Any = None, mask: Any = None) -> Any:
@@ -51,7 +52,7 @@ class Runner:
             self.feeds[name][0] = reduce(getitem, keys, obs)
         if self.before:
             self.elapsed += 1
-            self.latest = (*self.before, self.obs, reward, info or {})
+            self.latest: Any = (*self.before, self.obs, np.float32(reward), info or {})
             self.root.observe(self.elapsed, False)
         action = self.root.act(None if mask is None else np.array(mask, bool)[None])
         self.before = self.obs, action
@@ -61,14 +62,13 @@ class Runner:
         """The latest step, as seen by who has acted for ``elapsed`` steps: arrays of one row."""
         obs, action, after, reward, info = self.latest
         no, told = np.zeros(1, bool), {k: np.array([v]) for k, v in info.items()}
-        rows = {"action": action, "timed_out": timed_out, "elapsed": elapsed}
-        found = {k: np.array([v]) for k, v in rows.items()} | {"reward": np.array([reward], "f4")}
-        found |= {"obs": obs, "next_obs": after, "info": told}
-        return SimpleNamespace(**found, terminated=no, truncated=no)
+        rows = {"action": action, "reward": reward, "timed_out": timed_out, "elapsed": elapsed}
+        found = {k: np.array([v]) for k, v in rows.items()} | {"obs": obs, "next_obs": after}
+        return SimpleNamespace(**found, terminated=no, truncated=no, info=told)
 
     def made(self, told: Any) -> Any:
         """The part of the policy that an entry of ``policy.json`` describes."""
-        kinds = {c.__name__: c for c in (_Code, *_Code.__subclasses__())}
+        kinds = {c.__name__: c for c in [_Code] + _Code.__subclasses__()}  # noqa: RUF005
         return kinds[f"_{told['kind']}"](self, told)
 
     def asks(self, name: str, about: Any) -> bool:

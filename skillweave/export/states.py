@@ -58,7 +58,7 @@ class States:
             case OnnxPolicy():
                 return self._network(file_graph(policy, sampled), name)
             case ScriptedPolicy():
-                acts = policy.function
+                acts: Any = policy.function
             case _:
                 acts = policy
         if policy.start(1):
@@ -72,7 +72,7 @@ class States:
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills, cuts, selector = policy.skills, policy.skills.interruption, policy.selector
         told_ends = isinstance(selector, Automaton) or getattr(selector, "asks_last", False)
-        told = {
+        told: dict[str, Any] = {
             "kind": "Hierarchy",
             "selector": self._selector(policy, prefix, sampled),
             "skills": [
@@ -159,11 +159,11 @@ class States:
     def _automaton(self, selector: Automaton, name: str) -> dict[str, Any]:
         ranks, transitions = selector.ranks, []
         for origin, target, event in selector.arrows:
-            told, code = event, None
-            if not isinstance(event, str):
-                told, what = None, "a Step to (1,) bool"
+            ends, code = event, None
+            if callable(event):
+                ends, what = "", "a Step to (1,) bool"
                 code = self._asks(f"{name}.{function_name(event)}", event, what)
-            transitions.append([origin, target, told, code])
+            transitions.append([origin, target, ends, code])
         order = [[int(i) for i in np.argsort(-rank, kind="stable") if rank[i]] for rank in ranks]
         start = selector.state_names.index(selector.start_state)
         return {

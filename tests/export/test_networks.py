@@ -100,6 +100,8 @@ def test_a_plain_agent_acts_as_here(case: Any, tmp_path: Path) -> None:
     policy = agent(config, obs_space, action_space)
     export = write_export(tmp_path, policy, "toy")
     assert export.code == {}
+    written = (tmp_path / "agent.onnx").read_bytes()
+    assert b"skillweave" not in written  # no paths of the machine that wrote it
     theirs, mine = Runner(tmp_path), Player(policy)
     rng = np.random.default_rng(0)
     seen = one_by_one(obs_space, 40)
