@@ -116,6 +116,34 @@ def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
     assert first["resume"] == again["resume"] == "allow"
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_saved_evaluation_draws_what_each_skill_did(run: RunDirectory) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    from skillweave.training.evaluation import Evaluation
+    from skillweave.training.evaluation_file import save_evaluation
+    from skillweave.training.skill_report import SkillReport
+
+    land = SkillReport(steps=30, calls=10, succeeded=4, ended={}, return_sum=None)
+    hover = SkillReport(steps=10, calls=2, succeeded=None, ended={}, return_sum=None)
+    run.manifest["track"] = ["tensorboard"]
+    run.manifest["stages"] = [{"name": "land", "steps": 500}, {"name": "selector", "steps": 200}]
+    for returns in ((1.0, 1.0), (1.0, 2.0)):  # the later one takes the place of the first
+        found = Evaluation(returns, (20, 20), None, {"land": land, "hover": hover})
+        save_evaluation(run, found, 0, True)
+    events = EventAccumulator(str(run.path / "tensorboard/evaluation")).Reload()
+    shown = {}
+    for tag in events.Tags()["scalars"]:
+        (point,) = events.Scalars(tag)
+        assert point.step == 700
+        shown[tag.removeprefix("evaluation/")] = point.value
+    assert shown == {
+        "return_mean": 1.5, "usage/land": 0.75, "usage/hover": 0.25, "call_length/land": 3.0,
+        "call_length/hover": 5.0, "success/land": pytest.approx(0.4),
+    }  # fmt: skip
+
+
 OFFLINE = """
 import socket, sys
 from pathlib import Path
