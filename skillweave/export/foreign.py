@@ -188,5 +188,6 @@ def _noise(policy: Any, sampled: bool) -> tuple[tuple[str, int], ...]:
     space = policy.action_space
     if not sampled or isinstance(space, Box):
         return ()
-    kind = "logistic" if isinstance(space, MultiBinary) else "gumbel"
-    return ((kind, action_codec(space).size),)
+    if isinstance(space, MultiBinary):  # one logit for each bit
+        return (("logistic", int(np.prod(space.shape))),)
+    return (("gumbel", action_codec(space).size),)
