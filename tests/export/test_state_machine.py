@@ -18,6 +18,8 @@ from skillweave import PPO, RNN, Automaton, Lengths, Network, Reflex, Skillweave
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
 from skillweave.collecting.calls import SkillSet
+from skillweave.export import states
+from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
@@ -27,6 +29,17 @@ from skillweave.types import Array, Step
 
 pytest.importorskip("onnxscript")
 torch.set_num_threads(1)
+
+
+@cache
+def traced_before(policy: Any, sampled: bool) -> Any:
+    return agent_graph(policy, sampled, "a network of these tests")
+
+
+@pytest.fixture(autouse=True)
+def traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tracing takes a second, and these policies share their networks."""
+    monkeypatch.setattr(states, "agent_graph", lambda p, sampled, _: traced_before(p, sampled))
 
 
 class LongWalk(Walk):
