@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave as sw
-from skillweave.types import Array
+from skillweave import Array
 
 PLACE, KEY, DOOR = range(3)
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skillweave.api.player import Player
+from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
 from skillweave.messages import short, whole_number
@@ -27,6 +29,7 @@ class Run:
 
     def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
         self.declaration, self.path, self.policy = declaration, path, policy
+        self._player: Player | None = None
 
     @property
     def hierarchy(self) -> Hierarchy:
@@ -115,6 +118,43 @@ class Run:
             max_steps=max_steps,
             rng=np.random.default_rng(seed),
         )
+
+    def act(self, obs: Any, **told: Any) -> Any:
+        """The greedy action for one observation; the arguments are ``Player.act``'s.
+
+        It remembers what a policy remembers, so call ``reset`` where an episode begins.
+        """
+        if self._player is None:
+            self._player = self.player()
+        return self._player.act(obs, **told)
+
+    def reset(self) -> None:
+        """For ``act``: a new episode begins."""
+        if self._player is not None:
+            self._player.reset()
+
+    def player(self, *, deterministic: bool = True, seed: int = 0) -> Player:
+        """The policy for one environment, with a memory of its own.
+
+        Args:
+            deterministic: act greedily, else sample; as in ``evaluate``.
+            seed: of what is sampled.
+        """
+        return Player(self.policy, deterministic=deterministic, seed=seed)
+
+    def export(self, path: str | Path) -> Export:
+        """Write ONNX files, ``policy.json`` and ``runner.py``, which needs only onnxruntime.
+
+        What is Python code (initiation, termination, reflexes' conditions, functions) is not
+        written: ``Export.code`` lists it, and the ``Runner`` is given it by name.
+
+        Args:
+            path: a folder; files of the same names are replaced.
+
+        Raises:
+            SkillweaveError: a part cannot be exported; the message says which, and what to do.
+        """
+        return write_export(as_path(path, "path"), self.policy, self.declaration.spec.name)
 
     def save_weights(self, path: str | Path) -> Path:
         """Write every policy into one file for ``Hierarchy.load_weights``."""

@@ -134,6 +134,22 @@ class Weights(Output):
 
 
 @dataclass(frozen=True)
+class Export(Output):
+    """Write a policy for machines without this library: ONNX files and a runner of one file."""
+
+    target: Positional[str] = tyro.MISSING
+    """A run's directory, a weights file, or with --pretrained a recipe's name."""
+    onnx: bool = False
+    """As ONNX, the only format there is; needed, so that a later one can be told apart."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """The folder to write; default: NAME-onnx here."""
+    pretrained: bool = False
+    """Take the shipped weights of a shipped recipe."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+
+
+@dataclass(frozen=True)
 class ImportAgilerl(Output):
     """Convert a checkpoint of AgileRL 0.1 or 1.0, which is a pickle."""
 
@@ -145,8 +161,8 @@ class ImportAgilerl(Output):
     """The file to write; default: FILE with the suffix .safetensors."""
 
 
-COMMANDS = (Train, Resume, Evaluate, Render, Plot, List, Info, Weights, ImportAgilerl)
-Command = Train | Resume | Evaluate | Render | Plot | List | Info | Weights | ImportAgilerl
+COMMANDS = (Train, Resume, Evaluate, Render, Plot, List, Info, Weights, Export, ImportAgilerl)
+Command = Train | Resume | Evaluate | Render | Plot | List | Info | Weights | Export | ImportAgilerl
 
 
 def name_of(command: type) -> str:

@@ -43,6 +43,8 @@ def run(command: commands.Command) -> int:
             _info(command)
         case commands.Weights():
             _weights(command)
+        case commands.Export():
+            _export(command)
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0
@@ -149,6 +151,15 @@ def _weights(command: commands.Weights) -> None:
     _tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
 
 
+def _export(command: commands.Export) -> None:
+    if not command.onnx:
+        raise SkillweaveError("say as what to export: --onnx")
+    name = Path(command.target).name.removesuffix(".safetensors")
+    found = _target(command).export(command.out or Path(f"{name}-onnx"))
+    told = {"path": str(found.path), "files": list(found.files), "code": found.code}
+    _tell(command, told, str(found))
+
+
 def _import_agilerl(command: commands.ImportAgilerl) -> None:
     if not command.trust:
         raise SkillweaveError(
@@ -162,7 +173,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
     _tell(command, {"path": str(out), "algorithm": algo}, text)
 
 
-def _target(command: commands.Watched) -> Run:
+def _target(command: commands.Watched | commands.Export) -> Run:
     """The trained policy that a command names."""
     path = Path(command.target)
     if command.pretrained:

@@ -82,19 +82,19 @@ class Automaton(ReadySelector):
                 "transitions={('from', 'to'): event}"
             )
         self.transitions = dict(transitions)
-        self._arrows = [(*self._ends_of(pair, e), e) for pair, e in self.transitions.items()]
-        self._rank = np.zeros((len(states), 0))
+        self.arrows = [(*self._ends_of(pair, e), e) for pair, e in self.transitions.items()]
+        self.ranks = np.zeros((len(states), 0))
 
     def among(self, skills: tuple[str, ...]) -> Self:
         """A copy that chooses among the skills of these names."""
         found = super().among(skills)
         # The larger, the earlier: 0 where the skill is none of the state's.
-        found._rank = np.zeros((len(self.states), len(skills)), np.int64)
+        found.ranks = np.zeros((len(self.states), len(skills)), np.int64)
         for i, (state, names) in enumerate(self.states.items()):
             numbers = [found._number(n, f"automaton: state {short(state)}") for n in names]
             numbers = sorted(numbers) if isinstance(names, frozenset) else numbers
             for place, number in enumerate(numbers):
-                found._rank[i, number] = len(numbers) - place
+                found.ranks[i, number] = len(numbers) - place
         return found
 
     def start(self, n: int) -> Memory:
@@ -103,7 +103,7 @@ class Automaton(ReadySelector):
 
     def allowed(self, memory: Memory) -> Array:
         """(n, S) bool: the skills of the state that each environment is in."""
-        allowed: Array = self._rank[memory["state"]] > 0
+        allowed: Array = self.ranks[memory["state"]] > 0
         return allowed
 
     def act(
@@ -121,7 +121,7 @@ class Automaton(ReadySelector):
             allowed &= mask
         if not allowed.any(axis=1).all():
             self._nothing_may_start(memory, obs, int(np.flatnonzero(~allowed.any(axis=1))[0]))
-        score = self._rank[memory["state"]]
+        score = self.ranks[memory["state"]]
         if not deterministic:
             score = (rng or np.random.default_rng()).random(allowed.shape)
         return np.where(allowed, score, -1).argmax(axis=1), memory
@@ -130,7 +130,7 @@ class Automaton(ReadySelector):
         """Take the transitions whose events have happened."""
         before, after = memory["state"], memory["state"].copy()
         waiting = np.ones(len(before), bool)  # no transition was taken yet
-        for origin, target, event in self._arrows:
+        for origin, target, event in self.arrows:
             here = waiting & (before == origin)
             if not here.any():
                 continue

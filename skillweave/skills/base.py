@@ -155,6 +155,15 @@ class Reflex:
             action[holds] = self._actions(obs[holds], space)
         return action, holds
 
+    def fixed(self, space: Space[Any]) -> Array:
+        """Its action, where that is no function, as one of ``space``."""
+        who, shape = f"{self._who}: action", space.shape or ()
+        one = as_array(self.action, who)
+        # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
+        value = np.full(shape, one) if one.shape == () else one
+        found: Array = checked_actions(value[None], 1, space, who)[0]
+        return found
+
     @property
     def _who(self) -> str:
         return f"reflex {self.name!r}"
@@ -163,11 +172,7 @@ class Reflex:
         """Its actions for observations (n, ...)."""
         n, who = len(obs), f"{self._who}: action"
         if not callable(self.action):
-            one = as_array(self.action, who)
-            # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
-            shape = space.shape or ()
-            value = np.full(shape, one) if one.shape == () else one
-            return np.repeat(checked_actions(value[None], 1, space, who), n, axis=0)
+            return np.repeat(self.fixed(space)[None], n, axis=0)
         return checked_actions(called(self.action, obs, f"{who}()"), n, space, f"{who}()")
 
 

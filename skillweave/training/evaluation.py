@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.messages import whole_number
 from skillweave.reading import Count, Positive
+from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.skill_report import SkillReport, SkillTally, skill_table
@@ -119,7 +121,7 @@ def interquartile_mean(values: Array) -> float:
 
 def evaluate(
     policy: Policy,
-    env: EnvSpec,
+    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
     *,
     episodes: int = 100,
     seed: int = 0,
@@ -130,6 +132,8 @@ def evaluate(
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
     Args:
+        policy: who acts; one made elsewhere (``from_function``) takes the environment's spaces.
+        env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
         seed: picks the episodes; the same seed gives the same starts to every policy.
         deterministic: act greedily, else sample.
         num_envs: environments side by side; does not change the result of a greedy policy.
@@ -142,15 +146,19 @@ def evaluate(
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = min(whole_number(num_envs, "num_envs", 1), episodes)
-    reference = env.make()
+    spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
+    reference = spec.make()
     try:
         limit = limit or time_limit(reference) or LONGEST_EPISODE
         threshold = reference.spec.reward_threshold if reference.spec else None
     finally:
         reference.close()
-    engine = make_engine(replaced(env, engine="sync"), n)
+    engine = make_engine(replaced(spec, engine="sync"), n)
     try:
-        _check_spaces(policy, engine.observation_space, engine.action_space, env.name)
+        spaces = engine.observation_space, engine.action_space
+        if isinstance(policy, Foreign):
+            policy = policy.bind(*spaces, "the policy")
+        _check_spaces(policy, *spaces, spec.name)
         engine.reset(0)
         seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
         moments = play(
