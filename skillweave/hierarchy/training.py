@@ -21,7 +21,7 @@ from skillweave.training.stage import CRITIC, SELECTOR, Policies
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, train_stages
 from skillweave.training.woven import agents_of
-from skillweave.types import Policy
+from skillweave.types import Policy, SkillweaveError
 
 
 def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
@@ -121,6 +121,11 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
     found = ready | _learnt(run)
+    if run.unjudged:
+        raise SkillweaveError(
+            f"{run.path}: all is learnt, but whether the hierarchy before or that after learning "
+            f"together is better was not judged yet; skillweave resume {run.path}"
+        )
     policy = _woven(declaration, run, found)
     check_parts(declaration, policy.skills.policies, policy.selector, str(run.path))
     return policy

@@ -84,6 +84,10 @@ class StageLearner(Protocol):
         """Learn until the stage is over; by name, those who learnt, as they end."""
         ...
 
+    def states(self) -> dict[str, Any]:
+        """By name, all that those have learnt who may learn on in a later stage."""
+        ...
+
     def close(self) -> None:
         """Release the environments."""
         ...
@@ -143,6 +147,11 @@ class OneAgent:
         """By name, who learns, as they are now."""
         (stack,) = self.learner.stacks
         return {self.stage.name: AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))}
+
+    def states(self) -> dict[str, Any]:
+        """All that the agent has learnt."""
+        (stack,) = self.learner.stacks
+        return {self.stage.name: state_to(stack.state, "cpu")}
 
     def play(self, arena: Collector, seeds: Seeds) -> Array:
         """An episode in each environment of an arena, (N, 4); see ``Collected.episodes``."""
@@ -238,7 +247,7 @@ def train_stage(
         policies = learner.train(log)
     finally:
         learner.close()
-    log.done(policies)
+    log.done(policies, learner.states())
     return policies
 
 

@@ -24,6 +24,7 @@ from skillweave.envs.make import make_engine
 from skillweave.experience import Anchor, Experience
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
+from skillweave.runs.states import load_state
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
 from skillweave.training.learner import Learner, RolloutLearner, Stack
@@ -191,8 +192,7 @@ class WovenAgents(OneAgent):
             device = resolve_device(algorithm.config.device)
             before, anchor = self.stage.policies.get(name), None
             if isinstance(before, AgentPolicy):
-                algorithm.set_weights(fresh, before.weights)
-                fresh.obs_count.fill_(max(1.0, self._steps_of(name)))
+                fresh = self._as_before(name, algorithm, fresh, before)
                 anchor = self._anchor(name, algorithm, fresh, device)
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
@@ -201,6 +201,15 @@ class WovenAgents(OneAgent):
                 part.anchor = anchor
             parts[name] = part
         return WovenLearner(parts, self.together)
+
+    def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: AgentPolicy) -> Any:
+        """The state that ``name`` ended its latest stage with; of a population its weights."""
+        found = load_state(self.stage.run, name, fresh)
+        if found is None:
+            found = fresh
+            algorithm.set_weights(found, before.weights)
+            found.obs_count.fill_(max(1.0, self._steps_of(name)))
+        return found
 
     def _anchor(
         self, name: str, algorithm: Algorithm, state: Any, device: torch.device
@@ -240,6 +249,11 @@ class WovenAgents(OneAgent):
         stacks = zip(self.algorithms, self.learner.stacks, strict=True)
         return {k: AgentPolicy.of(s.algorithm, state_to(s.state, "cpu")) for k, s in stacks}
 
+    def states(self) -> dict[str, Any]:
+        """By name, all that they have learnt."""
+        stacks = zip(self.algorithms, self.learner.stacks, strict=True)
+        return {name: state_to(stack.state, "cpu") for name, stack in stacks}
+
     def play(self, arena: Collector, seeds: Seeds) -> Array:
         """An episode in each environment of an arena, (N, 4), by the hierarchy as it is now."""
         player = self.woven(arena.engine)
@@ -257,7 +271,6 @@ class WovenAgents(OneAgent):
     def save(self, tick: Tick, log: StageLog) -> None:
         """Write a checkpoint: all states are in ``extra``."""
         states: dict[str, Tensor] = {}
-        for name, stack in zip(self.algorithms, self.learner.stacks, strict=True):
-            own = vars(state_to(stack.state, "cpu"))
-            states |= prefixed(f"state.{name}", own)
+        for name, state in self.states().items():
+            states |= prefixed(f"state.{name}", vars(state))
         log.save(None, (tick.extra or {}) | states)
