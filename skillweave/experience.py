@@ -43,6 +43,7 @@ class Experience:
     starts: Array | None = None  # (T, N) bool, an episode begins here, so memory is empty before it
     rewards: Array | None = None  # (T, N, L) float32, of each step of a call, then zeros
     advantage: Array | None = None  # (T, N) float32, what counts beside the learner's own
+    overridden: Array | None = None  # (T, N) bool, a reflex acted, not ``action``; None: nowhere
     parts: tuple[Experience, ...] = ()
     """Of a selector: what its skills did in the same steps, those that learn, in their order."""
     spent: int = 0
@@ -73,10 +74,12 @@ class Rollout:
     obs_mask: Tensor | None = None  # (P, T, B, A) bool
     valid: Tensor | None = None  # (P, T, B) bool; None: all
     head: Tensor | None = None  # (P, T, B, H)
-    log_std: Tensor | None = None  # (P, 1, 1, A), of who acted, where it is no part of ``head``
+    log_std: Tensor | None = None
+    """Of who acted, where it is no part of ``head``: (P, 1, 1, A), or (P, 1, B, A), by column."""
     memory: Tensor | None = None  # (P, B, M), before the first row
     starts: Tensor | None = None  # (P, T, B) bool, memory is empty before this row
     advantage: Tensor | None = None  # (P, T, B), what counts beside the learner's own advantage
+    overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted, not ``action``; None: nowhere
     anchor: Anchor | None = None
     progress: float = 0.0  # share of the budget that is spent, for schedules
 

@@ -193,7 +193,7 @@ class SkillSet:
         assert actions is not None, "act() before begin()"
         if not self.reflexes:
             return actions
-        return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)
+        return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)[0]
 
     def limit(self, i: int) -> int | None:
         """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""

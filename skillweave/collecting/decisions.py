@@ -84,7 +84,7 @@ class DecisionCollector(Collector):
         if len(rows):
             self._decide(rows)
         obs, mask = self.obs, self.engine.mask()
-        action = self.skills.act(self._calls, self._all, obs, self._rng, mask)
+        action = self._act(obs, mask)
         raw = self.engine.step(action)
         self._count(raw)
         ended = raw.terminated | raw.truncated
@@ -105,6 +105,10 @@ class DecisionCollector(Collector):
                 success = told_success(raw.info, self.num_envs)
                 self._tell(ids, None if success is None else success[ids])
                 self._begin_anew(ids)
+
+    def _act(self, obs: Array, mask: Array | None) -> Array:
+        """What the running skills do, with the reflexes in force."""
+        return self.skills.act(self._calls, self._all, obs, self._rng, mask)
 
     def _seen(self, obs: Array, action: Array, raw: RawStep) -> Step:
         """The step as skills are shown it."""

@@ -92,8 +92,9 @@ class SkillCollector(Collector):
             playing = None
         acted = self.acting.all(obs, mask, memory)
         action = self.acting.to_env(acted.action)
+        overridden = None
         if self.reflexes:
-            action = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
+            action, overridden = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
         searching = np.zeros(0, np.int64) if playing is None else np.flatnonzero(~playing)
         if playing is not None:
             action = action.copy()
@@ -103,7 +104,8 @@ class SkillCollector(Collector):
         judged = self._judge(obs, action, raw, playing)
         ended = judged.terminated | judged.truncated
         if out is not None:
-            out.put(obs, mask, acted, judged, raw.next_obs, self.engine.mask(), playing)
+            next_mask = self.engine.mask()
+            out.put(obs, mask, acted, judged, raw.next_obs, next_mask, playing, overridden)
         self._count(raw, judged, playing)
         if memory is not None and acted.memory is not None:
             memory[:] = acted.memory

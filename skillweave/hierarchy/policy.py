@@ -135,4 +135,5 @@ class SkillAlone:
     ) -> tuple[Array, Memory]:
         """The skill's actions, or those of the reflexes where one holds."""
         action, memory = self.policy.act(memory, obs, mask, deterministic=deterministic, rng=rng)
-        return apply_reflexes(self.reflexes, obs, action, self.action_space), memory
+        action, _ = apply_reflexes(self.reflexes, obs, action, self.action_space)
+        return action, memory

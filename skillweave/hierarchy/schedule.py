@@ -36,7 +36,10 @@ def _together(declaration: Declaration) -> Stage:
     def scene(policies: Policies) -> WovenScene:
         acts: Any = [None if s in learns else policies[s.name] for s in declaration.skills]
         numbers = tuple(i for i, s in enumerate(declaration.skills) if s in learns)
-        return woven_scene(declaration.spec, declaration.skill_set(acts), numbers)
+        skills = declaration.skill_set(acts)
+        if not declaration.reflexes_in_training:
+            skills = replace(skills, reflexes=())
+        return woven_scene(declaration.spec, skills, numbers)
 
     config: Any = declaration.selector
     if isinstance(config, PPO) and not config.floor:

@@ -85,7 +85,6 @@ class RolloutLearner:
         config = stack.algorithm.config
         self.overlap, self.threads = bool(config.overlap), int(config.threads)
         self._store = RolloutStore(stack.members, quota, stack.state.params.device)
-        self._log_std: Tensor | None = None
         self.anchor: Anchor | None = None
         """The policy that it is to stay near, if there is one."""
         self._progress = 0.0  # where the rollout began, so that the first has the whole rate
@@ -102,15 +101,13 @@ class RolloutLearner:
         """Keep a rollout, and what it was collected with."""
         params, self._progress = self._asked
         log_std = params.views.get("actor.log_std")
-        if log_std is not None:
-            self._log_std = log_std[:, None].to(self._stack.state.params.device)
-        self._store.add(experience)
+        self._store.add(experience, None if log_std is None else log_std[:, None])
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """An update, where there was something to learn from."""
         stack = self._stack
         gamma, anchor = stack.state.gamma, self.anchor
-        rollout = self._store.rollout(gamma, self._log_std, self._progress, anchor)
+        rollout = self._store.rollout(gamma, self._progress, anchor)
         if rollout is None:
             return {}
         seeds = member_seeds(self._seeds, "learn", stack.members, update)

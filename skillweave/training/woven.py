@@ -215,8 +215,7 @@ class WovenAgents(OneAgent):
         self, name: str, algorithm: Algorithm, state: Any, device: torch.device
     ) -> Anchor | None:
         """What a skill that was trained before is to stay near: this state."""
-        near = self.together.anchor_nats is not None and name not in (SELECTOR, CRITIC)
-        if not near or algorithm.memory_size:  # what an anchor would remember is not known
+        if self.together.anchor_nats is None or name in (SELECTOR, CRITIC):
             return None
         params = algorithm.acting_params(state, device=device)
         return Anchor(params, torch.ones(1, device=device))

@@ -19,7 +19,7 @@ from skillweave import DQN, PPO, SAC, TD3, Network, SkillweaveError
 from skillweave.algorithms import rollouts
 from skillweave.algorithms.base import state_to
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.experience import Rollout, Sample
+from skillweave.experience import Anchor, Rollout, Sample
 from skillweave.networks.config import CNN, RNN
 from skillweave.ops.device import Constant, all_false, on_host, resolve_device
 from skillweave.seeding import Seeds
@@ -102,10 +102,13 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
         obs_mask=torch.ones(*lead, width, dtype=torch.bool) if algorithm.codec.discrete else None,
         log_std=None if algorithm.codec.discrete else torch.zeros(P, 1, 1, width),
         memory=memory, starts=None if memory is None else last,
+        overridden=last,
     )  # fmt: skip
     rng = [Seeds(m).torch() for m in range(P)]
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state, batch = on_device(algorithm, mode), moved(batch, mode)
+        near = algorithm.acting_params(state, device=THERE)
+        batch.anchor = Anchor(near, mode.from_tensor(torch.ones(P)).to(THERE))
         assert algorithm.value(state, batch.obs[:, 0]).device == THERE
         state, report = algorithm.update(state, batch, rng)
         assert devices(state) == {"meta"}
