@@ -198,7 +198,8 @@ class PPOAlgorithm(Algorithm):
             kl = approximate_kl(log_prob, old, weight, acted)
         report = {"policy_loss": policy, "value_loss": value, "entropy": bonus, "kl": kl}
         if now.anchor is not None:
-            other = now.anchor.params.views.get("actor.log_std")
+            near = now.anchor.params
+            other = None if near is None else near.views.get("actor.log_std")
             assert batch.anchor is not None
             away = self.head.kl(own, log_std, batch.anchor, other, batch.mask)
             report["anchor_kl"] = masked_mean(away, acted)

@@ -125,6 +125,8 @@ def _anchor(
     """
     if now.anchor is None:
         return None
+    if now.anchor.params is None:
+        return cells.flat_or_none(rollout.guide)
     params, recurrent = now.anchor.params, bool(agent.memory_size)
     inputs = agent.inputs(params, cells.flat(rollout.obs))
     if recurrent:

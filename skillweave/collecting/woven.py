@@ -12,6 +12,7 @@ from skillweave.collecting.acting import Acted, Acting, Request
 from skillweave.collecting.calls import Interruption, SkillSet, Why, skill_step
 from skillweave.collecting.columns import stacked
 from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.guide import Guide
 from skillweave.envs.engine import Engine
 from skillweave.experience import Experience
 from skillweave.skills import apply_reflexes, asked
@@ -68,6 +69,7 @@ class WovenCollector(DecisionCollector):
         critic: of skills; None: nobody asks what they are worth.
         margin: calls are cut where the critic says that another skill is worth so much more; None:
             they are not.
+        guide: a ready selector that is asked wherever the selector decides.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class WovenCollector(DecisionCollector):
         learners: Mapping[int, Acting],
         critic: Acting | None = None,
         margin: float | None = None,
+        guide: Guide | None = None,
     ) -> None:
         self.learners = {i: LearningSkill(a) for i, a in learners.items()}
         self.critic = critic
@@ -85,7 +88,7 @@ class WovenCollector(DecisionCollector):
         cuts = None if margin is None else Interruption(self._worth, margin)
         self.reflexes, self._overridden = skills.reflexes, np.zeros(engine.num_envs, bool)
         skills = replace(skills, policies=tuple(policies), interruption=cuts, reflexes=())
-        super().__init__(engine, acting, skills)
+        super().__init__(engine, acting, skills, guide=guide)
         self._watches = True
         self.kept["fresh"] = np.zeros(self.num_envs, bool)  # the skill that acts begins to
         self._rows: Rows | None = None

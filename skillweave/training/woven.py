@@ -82,12 +82,7 @@ class WovenLearner:
         """Let those learn that have enough rows; metrics under ``<name>.``."""
         found: dict[str, Tensor] = {}
         for name, part in self.parts.items():
-            metrics = part.learn(update, steps, progress)
-            if isinstance(part, RolloutLearner) and part.anchor and "anchor_kl" in metrics:
-                part.anchor.coef = adapted(
-                    part.anchor.coef, metrics["anchor_kl"], self._how.anchor_nats
-                )
-            found |= prefixed(name, metrics)
+            found |= prefixed(name, part.learn(update, steps, progress))
         return found
 
     def cut(self, columns: Array) -> None:
@@ -100,30 +95,12 @@ class WovenLearner:
         found: dict[str, Tensor] = {}
         for name, part in self.parts.items():
             found |= prefixed(name, part.kept())
-            if isinstance(part, RolloutLearner) and part.anchor:
-                found[f"{name}.anchor_coef"] = part.anchor.coef.clone()
         return found
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """The inverse of ``kept``."""
         for name, part in self.parts.items():
-            own = unprefixed(name, kept)
-            coef = own.pop("anchor_coef", None)
-            if isinstance(part, RolloutLearner) and part.anchor and coef is not None:
-                if coef.shape != (1,) or not bool(coef.isfinite().all()):
-                    raise ValueError(f"the price of divergence of {name} is {coef.tolist()}")
-                part.anchor.coef = coef.to(part.anchor.coef.device)
-            part.load(own)
-
-
-def adapted(coef: Tensor, kl: Tensor, nats: float | None) -> Tensor:
-    """What a nat of KL costs from now on, so that KL comes near ``nats``; (P,) each.
-
-    The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
-    """
-    nats = nats or 0.0
-    factor = torch.where(kl > 1.5 * nats, 2.0, torch.where(kl < nats / 1.5, 0.5, 1.0))
-    return (coef * factor).clamp(1e-3, 1e3)
+            part.load(unprefixed(name, kept))
 
 
 def agents_of(stage: StageRun) -> OneAgent:
@@ -218,7 +195,7 @@ class WovenAgents(OneAgent):
         if self.together.anchor_nats is None or name in (SELECTOR, CRITIC):
             return None
         params = algorithm.acting_params(state, device=device)
-        return Anchor(params, torch.ones(1, device=device))
+        return Anchor(params, torch.ones(1, device=device), self.together.anchor_nats)
 
     def _part(self, name: str, stack: Stack, log: StageLog) -> Learner:
         """The learner of the selector, or of a skill."""
