@@ -81,7 +81,7 @@ class Rollout:
     starts: Tensor | None = None  # (P, T, B) bool, memory is empty before this row
     advantage: Tensor | None = None  # (P, T, B), what counts beside the learner's own advantage
     guide: Tensor | None = None  # (P, T, B, A), logits of a ready selector's choice
-    overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted, not ``action``; None: nowhere
+    overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted instead; None: nowhere
     anchor: Anchor | None = None
     progress: float = 0.0  # share of the budget that is spent, for schedules
 

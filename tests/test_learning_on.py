@@ -106,5 +106,3 @@ def test_a_damaged_state_is_told(tmp_path):
     file.write_bytes(file.read_bytes()[:-8])
     with pytest.raises(SkillweaveError, match=r"left\.safetensors"):
         then().resume(run.path, quiet=True)
-
-

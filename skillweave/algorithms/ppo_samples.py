@@ -115,9 +115,7 @@ def _own(overridden: Tensor | None, valid: Tensor | None) -> Tensor | None:
     return ~overridden if valid is None else valid & ~overridden
 
 
-def _anchor(
-    agent: PPOAlgorithm, now: Terms, rollout: Rollout, cells: Cells
-) -> Tensor | None:
+def _anchor(agent: PPOAlgorithm, now: Terms, rollout: Rollout, cells: Cells) -> Tensor | None:
     """Heads (P, N, H) of the policy that the learner is to stay near.
 
     Where there is a memory, it runs along each trajectory. What the anchor would remember from

@@ -154,9 +154,7 @@ def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:
         every = [masks[0].new_ones(*h["valid"].shape, masks[0].shape[-1]) for h in held]
         held = [{"obs_mask": free} | h for free, h in zip(every, held, strict=True)]
     if "log_std" in held[0]:  # each was acted with one of its own
-        held = [
-            h | {"log_std": h["log_std"].expand(-1, -1, h["valid"].shape[2], -1)} for h in held
-        ]
+        held = [h | {"log_std": h["log_std"].expand(-1, -1, h["valid"].shape[2], -1)} for h in held]
     t = max(h["valid"].shape[1] for h in held)
     return {k: torch.cat([_padded(k, h[k], t) for h in held], 2) for k in held[0]}
 

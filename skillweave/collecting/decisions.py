@@ -162,7 +162,7 @@ class DecisionCollector(Collector):
         self.skills.begin(self._calls, rows, choice)
 
     def _allowed(self, rows: Array, here: Array) -> Array:
-        """Choices that are allowed in environments ``rows`` (k,), whose observations are ``here``."""
+        """Choices that are allowed in environments ``rows`` (k,), in observations ``here``."""
         may = self.skills.mask(here)
         if may is None:
             may = np.ones((len(rows), self.skills.choices), bool)

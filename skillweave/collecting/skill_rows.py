@@ -94,7 +94,8 @@ class SkillCollector(Collector):
         action = self.acting.to_env(acted.action)
         overridden = None
         if self.reflexes:
-            action, overridden = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
+            space = self.engine.action_space
+            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
         searching = np.zeros(0, np.int64) if playing is None else np.flatnonzero(~playing)
         if playing is not None:
             action = action.copy()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from skillweave.collecting.lengths import calls_to_json
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.guidance import fitted_guide, ready_guide
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.hierarchy.weights import check_parts
@@ -148,7 +149,12 @@ def _woven(
     if declaration.interrupt:
         skills = with_interruption(skills, found[CRITIC], declaration.together.margin)
     selector = _ready_selector(declaration, run, skills.policies[0]) or found[SELECTOR]
-    return HierarchyPolicy(selector, skills)
+    guide = fitted_guide(declaration, selector.observation_space)
+    if guide is None or not guide.restricts:
+        return HierarchyPolicy(selector, skills)
+    told = run.manifest.get("guide")
+    as_recorded(cast(Policy, guide.selector), told, lambda: None, f"{run.path}: the guide")
+    return HierarchyPolicy(selector, skills, guide)
 
 
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
@@ -168,9 +174,12 @@ def _ready_selector(declaration: Declaration, run: RunDirectory, skill: Policy) 
 
 
 def _selector_entry(declaration: Declaration) -> dict[str, Any]:
-    """Where a ready selector comes from; nothing where it is trained."""
+    """Where a ready selector comes from, or the guide of a trained one."""
     selector = declaration.ready_selector
-    return {} if selector is None else {SELECTOR: source_of(selector)}
+    found: dict[str, Any] = {} if selector is None else {SELECTOR: source_of(selector)}
+    if (guide := ready_guide(declaration)) is not None:
+        found |= {"guide": source_of(guide), "guide_restricts": declaration.guide_restricts}
+    return found
 
 
 def _skill_entry(skill: Skill) -> dict[str, Any]:

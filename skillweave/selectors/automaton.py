@@ -13,8 +13,9 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.collecting.calls import Why
+from skillweave.collecting.guide import LastCall
 from skillweave.messages import short
-from skillweave.selectors.base import LastCall, ReadySelector, function_name, listed, shown_obs
+from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.base import answer
 from skillweave.skills.foreign_policy import checksum
 from skillweave.types import Array, Memory, SkillweaveError, Step

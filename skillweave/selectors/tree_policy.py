@@ -10,7 +10,8 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.collecting.calls import Why
-from skillweave.selectors.base import LastCall, ReadySelector, shown_obs
+from skillweave.collecting.guide import LastCall
+from skillweave.selectors.base import ReadySelector, shown_obs
 from skillweave.selectors.tree import Composite, Condition, Node, Status
 from skillweave.skills.base import answer
 from skillweave.skills.foreign_policy import checksum, made_up

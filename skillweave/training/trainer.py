@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import state_to
@@ -15,13 +16,14 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import make_collectors
+from skillweave.experience import Anchor
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import Learner, Stack
+from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.training.loop import Progress, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import learner_of
@@ -138,10 +140,12 @@ class OneAgent:
         """Who learns, from this state on."""
         stage, config = self.stage, self.stage.config
         stack = Stack(self.algorithm, state_to(state, resolve_device(config.device)))
-        return learner_of(
+        found = learner_of(
             stack, config.num_envs, stage.seeds, row_steps=stage.scene.row_steps,
             goes_on_at=log.at["steps"],
         )  # fmt: skip
+        keep_to_guide(found, stage.entry)
+        return found
 
     def policies(self) -> dict[str, AgentPolicy]:
         """By name, who learns, as they are now."""
@@ -208,6 +212,15 @@ class OneAgent:
     def close(self) -> None:
         """Release the environments."""
         self._open.close()
+
+
+def keep_to_guide(learner: Learner, entry: dict[str, Any]) -> None:
+    """Let a selector stay near its guide, if a stage's entry asks for it."""
+    nats = entry.get("guide_nats")
+    if nats is not None and isinstance(learner, RolloutLearner):
+        (stack,) = learner.stacks
+        coef = torch.ones(stack.members, device=stack.state.params.device)
+        learner.anchor = Anchor(None, coef, nats)
 
 
 class _TargetReached(Exception):

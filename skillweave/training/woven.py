@@ -32,7 +32,7 @@ from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
 from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.training.stage_log import StageLog
-from skillweave.training.trainer import OneAgent, StageRun
+from skillweave.training.trainer import OneAgent, StageRun, keep_to_guide
 from skillweave.types import Array, prefixed, unprefixed
 
 
@@ -40,7 +40,7 @@ class WovenLearner:
     """A selector and skills, each with a learner of its own; nobody learns from others' rows.
 
     Args:
-        parts: by name, the selector first, then the skills in their order.
+        parts: by name, the selector first unless it is ready, then the skills in their order.
         how: how much the task counts, and how far skills may move from their anchors.
     """
 
@@ -52,10 +52,16 @@ class WovenLearner:
         self.threads = max(part.threads for part in parts.values())
 
     def request(self, update: int, steps: int, progress: float) -> Request:
-        """As many rows as the selector's learner asks for, with the parameters of all."""
+        """As many rows as the selector's learner asks for, with the parameters of all.
+
+        Where the selector is ready, as many as the skill asks for that asks for most.
+        """
         self._weight = self._how.task_weight * progress
-        first, *others = (p.request(update, steps, progress) for p in self.parts.values())
-        return replace(first, parts=tuple(others))
+        asked = tuple(p.request(update, steps, progress) for p in self.parts.values())
+        if SELECTOR in self.parts:
+            return replace(asked[0], parts=asked[1:])
+        rows, seeds = max(r.rows for r in asked), asked[0].seeds / SELECTOR
+        return Request(rows, (), asked[0].gamma, seeds, parts=asked)
 
     def take(self, experience: Experience) -> None:
         """Give each its own rows, and skills the task's advantage in them, if it counts."""
@@ -63,7 +69,9 @@ class WovenLearner:
             advantage = self._weight * self._task_advantage(experience.parts[-1])
             for rows in experience.parts[:-1]:
                 rows.advantage = advantage
-        own = (replace(experience, parts=()), *experience.parts)
+        own = experience.parts
+        if SELECTOR in self.parts:
+            own = (replace(experience, parts=()), *own)
         for part, rows in zip(self.parts.values(), own, strict=True):
             part.take(rows)
 
@@ -118,7 +126,8 @@ class WovenAgents(OneAgent):
         scene = self.scene
         self.together = Together(**self.stage.entry["together"])
         told = self.stage.entry["algorithms"]
-        configs: dict[str, AlgorithmConfig] = {SELECTOR: self.stage.config}
+        learns = SELECTOR in self.stage.entry["learns"]
+        configs: dict[str, AlgorithmConfig] = {SELECTOR: self.stage.config} if learns else {}
         configs |= {name: config_from_json(told[name]) for name in told}
         spaces = {
             SELECTOR: scene.action_space,
@@ -157,7 +166,7 @@ class WovenAgents(OneAgent):
         """A collector of these environments in which all act."""
         n = engine.num_envs
         acting = {name: Acting([(a, 1)], n) for name, a in self.algorithms.items()}
-        selector, critic = acting.pop(SELECTOR), acting.pop(CRITIC, None)
+        selector, critic = acting.pop(SELECTOR, None), acting.pop(CRITIC, None)
         margin = self.together.margin if self.stage.entry.get("interrupt") else None
         return self.scene.woven(engine, selector, list(acting.values()), critic, margin)
 
@@ -176,6 +185,8 @@ class WovenAgents(OneAgent):
             part = self._part(name, Stack(algorithm, state_to(fresh, device)), log)
             if isinstance(part, RolloutLearner):
                 part.anchor = anchor
+            if name == SELECTOR:
+                keep_to_guide(part, self.stage.entry)
             parts[name] = part
         return WovenLearner(parts, self.together)
 
@@ -233,14 +244,15 @@ class WovenAgents(OneAgent):
     def play(self, arena: Collector, seeds: Seeds) -> Array:
         """An episode in each environment of an arena, (N, 4), by the hierarchy as it is now."""
         player = self.woven(arena.engine)
-        requests = [
-            Request(
+        requests = {
+            name: Request(
                 0, (s.algorithm.acting_params(s.state),), s.state.gamma.cpu().numpy(),
                 seeds / name, greedy=name == SELECTOR or self.scene.skills.greedy,
             )
             for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
-        ]  # fmt: skip
-        asked = replace(requests[0], parts=tuple(requests[1:]))
+        }  # fmt: skip
+        ready = Request(0, (), np.ones(1), seeds / SELECTOR, greedy=True)
+        asked = replace(requests.pop(SELECTOR, ready), parts=tuple(requests.values()))
         with torch_threads(1):
             return player.play(asked, seeds / "start", LONGEST_EPISODE)
 

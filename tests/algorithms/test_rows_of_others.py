@@ -110,9 +110,7 @@ def test_each_rollout_that_was_held_counts_by_the_deviation_it_was_acted_with():
     importance = samples.importance.view(1, T, 2 * B)
     torch.testing.assert_close(importance[..., B:], torch.ones(1, T, B))
     std = [x.log_std[0, 0, 0].exp() for x in (one, two)]
-    log_prob = [
-        torch.distributions.Normal(one.head, s).log_prob(one.action).sum(-1) for s in std
-    ]
+    log_prob = [torch.distributions.Normal(one.head, s).log_prob(one.action).sum(-1) for s in std]
     torch.testing.assert_close(importance[..., :B], (log_prob[1] - log_prob[0]).exp())
 
 
