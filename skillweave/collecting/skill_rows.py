@@ -15,6 +15,7 @@ from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
 from skillweave.experience import Experience
+from skillweave.messages import shortened
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, SkillweaveError, Step
 
@@ -152,8 +153,10 @@ class SkillCollector(Collector):
         if self.kept["searched"].max() > PATIENCE and not self.kept["found"].any():
             raise SkillweaveError(
                 f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps "
-                f"{self._sought()}, so there is nothing to train on; widen it, or give an "
-                "environment that starts where it holds"
+                f"{self._sought()}, so there is nothing to train on; the latest observation was "
+                f"{shortened(np.array2string(self.obs[waiting[0]], precision=3), 300)}. Widen it; "
+                "or put the skills that lead to where it holds before it in skills, as skills are "
+                "trained in that order; or give an environment that starts where it holds"
             )
 
     def _sought(self) -> str:

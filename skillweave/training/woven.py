@@ -46,6 +46,8 @@ class WovenLearner:
 
     def __init__(self, parts: Mapping[str, Learner], how: Together) -> None:
         self.parts, self._how, self._weight = dict(parts), how, 0.0
+        self.counts = {name: [0, 0] for name in parts}
+        """By name, in how many rows each has acted, and how often it has learnt from them."""
         self.stacks: Sequence[Stack] = [s for part in parts.values() for s in part.stacks]
         self.overlap = all(part.overlap for part in parts.values())
         self.report_every = max(part.report_every for part in parts.values())
@@ -72,7 +74,10 @@ class WovenLearner:
         own = experience.parts
         if SELECTOR in self.parts:
             own = (replace(experience, parts=()), *own)
-        for part, rows in zip(self.parts.values(), own, strict=True):
+        for (name, part), rows in zip(self.parts.items(), own, strict=True):
+            self.counts[name][0] += int(
+                rows.reward.size if rows.valid is None else rows.valid.sum()
+            )
             part.take(rows)
 
     def _task_advantage(self, rows: Experience) -> Array:
@@ -90,7 +95,9 @@ class WovenLearner:
         """Let those learn that have enough rows; metrics under ``<name>.``."""
         found: dict[str, Tensor] = {}
         for name, part in self.parts.items():
-            found |= prefixed(name, part.learn(update, steps, progress))
+            metrics = part.learn(update, steps, progress)
+            self.counts[name][1] += bool(metrics)
+            found |= prefixed(name, metrics)
         return found
 
     def cut(self, columns: Array) -> None:
@@ -100,13 +107,15 @@ class WovenLearner:
 
     def kept(self) -> dict[str, Tensor]:
         """What going on exactly needs beside the states of the stacks, at a clean cut."""
-        found: dict[str, Tensor] = {}
+        found = {"counts": torch.tensor(list(self.counts.values()))}
         for name, part in self.parts.items():
             found |= prefixed(name, part.kept())
         return found
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """The inverse of ``kept``."""
+        counts = kept["counts"].tolist()
+        self.counts = dict(zip(self.parts, counts, strict=True))
         for name, part in self.parts.items():
             part.load(unprefixed(name, kept))
 
@@ -230,6 +239,25 @@ class WovenAgents(OneAgent):
         """Environment steps that ``name`` has learnt from in earlier stages."""
         stages = self.stage.run.manifest["stages"]
         return sum(s.get("steps", 0) for s in stages if name in s["learns"])
+
+    def train(self, log: StageLog) -> dict[str, AgentPolicy]:
+        """Learn until the stage is over; skills that learnt nothing are told."""
+        found = super().train(log)
+        assert isinstance(self.learner, WovenLearner)
+        for name, (rows, updates) in self.learner.counts.items():
+            if rows and not updates:
+                log.tell(
+                    f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "
+                    "to learn from once: lower together.quota, raise together.floor, or give more "
+                    "steps"
+                )
+            elif not rows:
+                log.tell(
+                    f"skill {name!r} was never called in {log.at['steps']:,} steps, so it learnt "
+                    "nothing: perhaps its initiation() holds nowhere that the other skills lead "
+                    "to, or the selector never chooses it"
+                )
+        return found
 
     def policies(self) -> dict[str, AgentPolicy]:
         """By name, who learns, as they are now."""
