@@ -89,7 +89,7 @@ class Declaration:
     greedy_skills: bool = True
     """Skills act greedily under the selector; else they sample."""
     reflexes_in_training: bool = True
-    """Reflexes are in force while skills train too: skills learn the body they will have."""
+    """Reflexes are in force while skills train, apart or together: the body they will have."""
     cut_every: int = 100_000
     """Environment steps between checkpoints."""
     eval_every: int | None = None
