@@ -12,7 +12,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet, Why
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import as_wide
-from skillweave.collecting.guide import Guide, LastCall, as_logits
+from skillweave.collecting.guide import Guide, as_logits, tell_guide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import told_success
@@ -106,8 +106,7 @@ class DecisionCollector(Collector):
         why = self.skills.observe(self._calls, self._all, seen)
         why[ended] = Why.EPISODE
         if self.guide is not None and seen is not None:
-            succeeded = self.skills.succeeded(self._calls, self._all, seen, why)
-            self.guide.watch(self.kept, seen, LastCall(self._calls["skill"], why, succeeded))
+            tell_guide(self.guide, self.kept, self.skills, self._calls, seen, why)
         if out is not None and seen is not None:
             self._record(seen, mask, why)
         self.obs = raw.next_obs
@@ -164,13 +163,11 @@ class DecisionCollector(Collector):
     def _allowed(self, rows: Array, here: Array) -> Array:
         """Choices that are allowed in environments ``rows`` (k,), in observations ``here``."""
         may = self.skills.mask(here)
-        if may is None:
-            may = np.ones((len(rows), self.skills.choices), bool)
         if self.guide is None:
+            assert may is not None
             return may
-        chances = self.guide.ask(self.kept, rows, here, may, self._greedy, self._rng)
-        self.kept["chances"][rows] = chances
-        return chances > 0.0 if self.guide.restricts else may
+        may = self.skills.startable(here) if may is None else may
+        return self.guide.mask(self.kept, rows, here, may, self._greedy, self._rng)
 
     def _count(self, raw: RawStep) -> None:
         """Add a step to the open calls and episodes."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from skillweave.collecting.acting import Acted, Request
+from skillweave.collecting.calls import SkillSet
 from skillweave.types import Array, Memory, Step, prefixed, unprefixed
 
 SMOOTHED = 0.05
@@ -113,6 +114,23 @@ class Guide:
             memory[f"guide.{k}"][rows] = v
         return chances.repeat(lengths, axis=1) / np.float32(lengths)
 
+    def mask(
+        self,
+        kept: Memory,
+        rows: Array,
+        obs: Array,
+        may: Array,
+        greedy: bool,
+        rng: np.random.Generator,
+    ) -> Array:
+        """Choices that are allowed at decisions of a collector, (k, choices) bool.
+
+        How likely its own choices are is left in ``kept["chances"]``.
+        """
+        chances = self.ask(kept, rows, obs, may, greedy, rng)
+        kept["chances"][rows] = chances
+        return chances > 0.0 if self.restricts else may
+
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
         """What is left of choices (k, choices) bool in environments ``rows`` (k,), as far as known.
 
@@ -129,6 +147,20 @@ class Guide:
         after = self.selector.watch(unprefixed("guide", memory), step, last)
         for k, v in after.items():
             memory[f"guide.{k}"][:] = v
+
+
+def tell_guide(
+    guide: Guide, kept: Memory, skills: SkillSet, calls: Memory, step: Step, why: Array
+) -> None:
+    """Tell a collector's guide of a step of all environments, and how calls ended with it.
+
+    Args:
+        kept: with the guide's memory, and ``age``: it sees the time of the episode.
+        calls: what the skills remember.
+    """
+    succeeded = skills.succeeded(calls, np.arange(len(why)), step, why)
+    last = LastCall(calls["skill"], why, succeeded)
+    guide.watch(kept, replace(step, elapsed=kept["age"]), last)
 
 
 def as_logits(chances: Array, may: Array) -> Array:

@@ -106,3 +106,22 @@ def test_logits_are_smoothed_among_what_is_allowed():
     assert found[1].tolist() == pytest.approx(
         [(1 - SMOOTHED) / 2 + SMOOTHED / 3] * 2 + [SMOOTHED / 3]
     )
+
+
+def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts():
+    def late(step):
+        return step.elapsed == 4
+
+    clock = Automaton({"early": "get_key", "late": "wait"}, {("early", "late"): late})
+    skills = (Leave(), Wait(), type("Again", (Leave,), {"name": "get_key"})())
+    skill_set = SkillSet(skills, tuple(s.policy for s in skills), call_steps=1)
+    names = tuple(s.name for s in skills)
+    guide = Guide(bound(clock, names), decides=True)
+    collector = DecisionCollector(make_engine(SPEC, N), AskedElsewhere(N), skill_set, guide=guide)
+    collector.start(Seeds(2))
+    found = collector.collect(next(requests(60))).experience
+    for n in range(N):
+        t = 0
+        for row in np.flatnonzero(found.valid[:, n]) if found.valid is not None else range(60):
+            assert names[found.action[row, n]] == ("get_key" if t < 4 else "wait"), t
+            t = 0 if found.ended[row, n] else t + int(found.steps[row, n])
