@@ -13,6 +13,7 @@ from skillweave import Automaton, SkillweaveError, Together
 from skillweave.collecting import skill_rows
 from skillweave.hierarchy import training
 from skillweave.skills import Skill
+from skillweave.training.stage_log import StageLog
 
 
 class Beyond(Skill):
@@ -64,7 +65,9 @@ def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monke
 
 
 def test_no_skill_may_start_where_learning_together_begins(tmp_path):
-    with pytest.raises(SkillweaveError, match=r"no skill may start.*'beyond', 'unlock'"):
+    with pytest.raises(
+        SkillweaveError, match=r"no skill may start.*after 0 steps.*'beyond', 'unlock'"
+    ):
         chain(Beyond(), Unlock()).train(tmp_path / "run", quiet=True)
 
 
@@ -110,3 +113,24 @@ def test_every_state_of_an_automaton_needs_a_skill_and_every_event_a_state():
         Automaton({"a": "x", "b": []}, {})
     with pytest.raises(SkillweaveError, match=r"\('a', 'c'\) names the state 'c', which is not"):
         Automaton({"a": "x", "b": "y"}, {("a", "c"): "success"})
+
+
+def test_a_run_killed_right_after_its_last_checkpoint_says_what_it_would_have_said(
+    tmp_path, monkeypatch
+):
+    heard, again = Heard(), Heard()
+    whole, run = new_run(never(), tmp_path / "whole"), new_run(never(), tmp_path / "run")
+    training.train(never(), whole, (heard,))
+
+    def killed(*told):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StageLog, "done", killed)
+        with pytest.raises(KeyboardInterrupt):
+            training.train(never(), run)
+    training.train(never(), run, (again,))
+    assert again.said == heard.said
+    assert_same(run.path, whole.path)
+    for each in (run, whole):
+        each.close()

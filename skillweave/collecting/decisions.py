@@ -162,7 +162,7 @@ class DecisionCollector(Collector):
 
     def _allowed(self, rows: Array, here: Array) -> Array:
         """Choices that are allowed in environments ``rows`` (k,), in observations ``here``."""
-        may = self.skills.mask(here)
+        may = self.skills.mask(here, self.kept["age"][rows])
         if self.guide is None:
             assert may is not None
             return may

@@ -171,7 +171,9 @@ class OneAgent:
         """Stand where a checkpoint says."""
         self.learner = self.learner_from(state, extra, log)
         self._steps_before = int(log.at["steps"])
-        if extra and "collector.collectors" not in extra:
+        if self._steps_before >= self.stage.budget:
+            pass  # nothing is collected any more, and the last checkpoint holds no episodes
+        elif extra and "collector.collectors" not in extra:
             log.tell(
                 "the checkpoint is of an older version: learning goes on where it stood, but all "
                 "episodes, and what was kept to learn from, begin anew"

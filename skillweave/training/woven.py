@@ -13,7 +13,7 @@ from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
+from skillweave.algorithms.policy import AgentPolicy, checked_tensor, make_algorithm, state_from
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
@@ -107,15 +107,13 @@ class WovenLearner:
 
     def kept(self) -> dict[str, Tensor]:
         """What going on exactly needs beside the states of the stacks, at a clean cut."""
-        found = {"counts": torch.tensor(list(self.counts.values()))}
+        found: dict[str, Tensor] = {}
         for name, part in self.parts.items():
             found |= prefixed(name, part.kept())
         return found
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """The inverse of ``kept``."""
-        counts = kept["counts"].tolist()
-        self.counts = dict(zip(self.parts, counts, strict=True))
         for name, part in self.parts.items():
             part.load(unprefixed(name, kept))
 
@@ -197,7 +195,11 @@ class WovenAgents(OneAgent):
             if name == SELECTOR:
                 keep_to_guide(part, self.stage.entry)
             parts[name] = part
-        return WovenLearner(parts, self.together)
+        found = WovenLearner(parts, self.together)
+        if extra:
+            told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
+            found.counts = dict(zip(parts, told.tolist(), strict=True))
+        return found
 
     def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: AgentPolicy) -> Any:
         """The state that ``name`` ended its latest stage with; of a population its weights."""
@@ -286,7 +288,8 @@ class WovenAgents(OneAgent):
 
     def save(self, tick: Tick, log: StageLog) -> None:
         """Write a checkpoint: all states are in ``extra``."""
-        states: dict[str, Tensor] = {}
+        assert isinstance(self.learner, WovenLearner)
+        states = {"counts": torch.tensor(list(self.learner.counts.values()))}
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
         log.save(None, (tick.extra or {}) | states)
