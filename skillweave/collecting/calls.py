@@ -114,7 +114,8 @@ class SkillSet:
             where = np.array2string(obs[row], precision=3)
             where += "" if age is None else f", after {int(age[row])} steps of the episode"
             raise SkillweaveError(
-                f"no skill may start in observation {where}: the initiation() of {names} is False there. Let at least one start everywhere"
+                f"no skill may start in observation {where}: the initiation() of {names} is False "
+                "there. Let at least one start everywhere"
             )
         return mask
 
