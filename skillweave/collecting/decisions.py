@@ -284,6 +284,7 @@ class Decisions:
         obs, lead = collector.obs[None], (1, collector.num_envs)
         no = np.zeros(lead, bool)
         head, size = collector.open.get("head"), collector.acting.memory_size
+        tells = collector.guide is not None and collector.guide.tells
         return Experience(
             obs=obs, action=np.zeros(lead, np.int64), reward=np.zeros(lead, np.float32),
             steps=np.ones(lead, np.int64), terminated=no, truncated=no, next_obs=obs, valid=no,
@@ -291,5 +292,5 @@ class Decisions:
             memory=np.zeros((collector.num_envs, size), np.float32) if size else None,
             starts=no if size else None,
             rewards=np.zeros((*lead, 1), np.float32) if collector.keep_rewards else None,
-            guide=collector.kept["chances"][None] if collector.guide is not None else None,
+            guide=collector.kept["chances"][None] if tells else None,
         )  # fmt: skip

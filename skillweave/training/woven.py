@@ -247,6 +247,8 @@ class WovenAgents(OneAgent):
         found = super().train(log)
         assert isinstance(self.learner, WovenLearner)
         for name, (rows, updates) in self.learner.counts.items():
+            if name in (SELECTOR, CRITIC):
+                continue
             if rows and not updates:
                 log.tell(
                     f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "

@@ -11,6 +11,7 @@ from toy_acting import Choices, requests
 
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.collector import side_by_side
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.guide import SMOOTHED, AskedElsewhere, Guide, as_logits
 from skillweave.collecting.lengths import Lengths
@@ -125,3 +126,14 @@ def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts()
         for row in np.flatnonzero(found.valid[:, n]) if found.valid is not None else range(60):
             assert names[found.action[row, n]] == ("get_key" if t < 4 else "wait"), t
             t = 0 if found.ended[row, n] else t + int(found.steps[row, n])
+
+
+@pytest.mark.parametrize("tells", [False, True])
+def test_collectors_agree_on_what_they_tell_also_where_no_call_has_ended(tells):
+    found = []
+    for call_steps, rows in ((30, 2), (1, 2)):
+        collector = collector_of(Guide(bound(AUTOMATON), tells=tells), call_steps)
+        found.append(collector.collect(next(requests(rows))))
+    joined = side_by_side(found, 1).experience
+    assert (joined.guide is not None) == tells
+    assert joined.reward.shape[1] == 2 * N
