@@ -30,7 +30,9 @@ AUTOMATON = Automaton(
 class Drawn(Choices):
     """Chooses at random among what is allowed."""
 
-    rng = np.random.default_rng(0)
+    def __init__(self, num_envs, actions):
+        super().__init__(num_envs, actions)
+        self.rng = np.random.default_rng(0)
 
     def some(self, rows, obs, mask, memory):
         action = (mask[rows] * self.rng.random(mask[rows].shape)).argmax(1)
@@ -131,9 +133,10 @@ def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts()
 @pytest.mark.parametrize("tells", [False, True])
 def test_collectors_agree_on_what_they_tell_also_where_no_call_has_ended(tells):
     found = []
-    for call_steps, rows in ((30, 2), (1, 2)):
+    for call_steps, rows in ((30, 1), (1, 2)):
         collector = collector_of(Guide(bound(AUTOMATON), tells=tells), call_steps)
         found.append(collector.collect(next(requests(rows))))
+    assert not found[0].experience.valid.any(), "no call has ended"
     joined = side_by_side(found, 1).experience
     assert (joined.guide is not None) == tells
     assert joined.reward.shape[1] == 2 * N
