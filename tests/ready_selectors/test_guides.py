@@ -142,7 +142,7 @@ def whole(tmp_path_factory):
     return make
 
 
-STOPS = [(kind, tick) for kind in KINDS for tick in (3, 7, 22) if tick < 20 or "then" in kind]
+STOPS = [(kind, tick) for kind in KINDS for tick in (3, 5, 22) if tick < 20 or "then" in kind]
 
 
 @pytest.mark.parametrize(("kind", "tick"), STOPS)
