@@ -19,6 +19,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.guidance import adopt_guide
 from skillweave.hierarchy.weights import check_selector, open_weights, read_agent, read_weights
 from skillweave.messages import short, whole_number
 from skillweave.reporting.progress import Progress
@@ -26,7 +27,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
+from skillweave.training.stage import CRITIC, SELECTOR, assign_workers, check_replay, check_stages
 from skillweave.types import SkillweaveError
 
 
@@ -162,6 +163,7 @@ class Hierarchy(Declaration):
         """Take over from a run how its skills are called, after a check that it fits."""
         _check_run(self, run)
         if run.manifest["kind"] == "hierarchy":
+            adopt_guide(self, run.manifest, str(run.path))
             self.call_steps = calls_from_json(run.manifest)
             margin = run.manifest.get("interrupt")
             self.interrupt = margin is not None
@@ -231,7 +233,7 @@ def _train(
     assign_workers(content["stages"], declared.spec)
     for stage in content["stages"]:
         acts: Any = action_space
-        if stage["decides"] is not None and isinstance(declared, Hierarchy):
+        if SELECTOR in stage["learns"] and isinstance(declared, Hierarchy):
             acts = gym.spaces.Discrete(declared.choices)
         check_replay(stage, observation_space, acts)
         for name, config in stage.get("algorithms", {}).items():

@@ -96,8 +96,11 @@ class SkillSet:
         remembers = any(p.start(1) for p in self.policies)
         return stops or remembers or self.interruption is not None
 
-    def mask(self, obs: Array) -> Array | None:
+    def mask(self, obs: Array, age: Array | None = None) -> Array | None:
         """Which choices are allowed, (n, choices) bool; None: all, everywhere.
+
+        Args:
+            age: (n,), steps of the episodes so far, for messages.
 
         Raises:
             SkillweaveError: in some observation no skill may start.
@@ -108,9 +111,11 @@ class SkillSet:
         if not mask.any(axis=1).all():
             row = int(np.flatnonzero(~mask.any(axis=1))[0])
             names = ", ".join(repr(s.name) for s in self.skills)
+            where = np.array2string(obs[row], precision=3)
+            where += "" if age is None else f", after {int(age[row])} steps of the episode"
             raise SkillweaveError(
-                f"no skill may start in observation {np.array2string(obs[row], precision=3)}: the "
-                f"initiation() of {names} is False there. Let at least one start everywhere"
+                f"no skill may start in observation {where}: the initiation() of {names} is False "
+                "there. Let at least one start everywhere"
             )
         return mask
 
@@ -193,7 +198,7 @@ class SkillSet:
         assert actions is not None, "act() before begin()"
         if not self.reflexes:
             return actions
-        return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)
+        return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)[0]
 
     def limit(self, i: int) -> int | None:
         """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""

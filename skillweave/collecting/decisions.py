@@ -12,6 +12,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet, Why
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import as_wide
+from skillweave.collecting.guide import Guide, as_logits, tell_guide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import told_success
@@ -31,15 +32,22 @@ class DecisionCollector(Collector):
         skills: what their actions mean.
         keep_rewards: of each call, keep the reward of every step, so that others may learn from it
             with a γ of their own.
+        guide: a ready selector that is asked wherever they decide.
     """
 
     def __init__(
-        self, engine: Engine, acting: Acting | None, skills: SkillSet, keep_rewards: bool = False
+        self,
+        engine: Engine,
+        acting: Acting | None,
+        skills: SkillSet,
+        keep_rewards: bool = False,
+        guide: Guide | None = None,
     ) -> None:
         super().__init__(engine, acting)
         n, count = self.num_envs, skills.choices
         self.skills, self.keep_rewards = skills, keep_rewards
-        self._watches = skills.watches
+        self.guide = guide
+        self._watches = skills.watches or guide is not None
         self._calls: Memory = skills.start(n)  # what the skills remember of each environment
         self._never = np.zeros(n, bool)
         self.kept |= prefixed("skills", self._calls) | {
@@ -51,19 +59,25 @@ class DecisionCollector(Collector):
             "choice": np.zeros(n, np.int64),
             "before": np.zeros_like(self.kept["memory"]),  # the selector's, when it decided
         }
-        self._restricts = any(s.defines("initiation") for s in skills.skills)
+        self._restricts = guide is not None or any(s.defines("initiation") for s in skills.skills)
+        if guide is not None:
+            self.kept |= guide.start(n)
+            self.kept["chances"] = np.zeros((n, count), np.float32)  # of its choices, when asked
         if self._restricts:
             self.kept["allowed"] = np.ones((n, count), bool)  # when it decided
 
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:
         """The same over other environments."""
-        return DecisionCollector(engine, acting, self.skills, self.keep_rewards)
+        return DecisionCollector(engine, acting, self.skills, self.keep_rewards, self.guide)
 
     def _forget(self, ids: Array) -> None:
         super()._forget(ids)
         self.skills.forget(self._calls, ids)
         self.kept["over"][ids] = True
         self.kept["first"][ids] = True
+        if self.guide is not None:
+            for name, value in self.guide.start(len(ids)).items():
+                self.kept[name][ids] = value
 
     def _collect(self, request: Request) -> Experience:
         self._prepare(request)
@@ -76,7 +90,7 @@ class DecisionCollector(Collector):
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request, every_step=False)
         self._gamma = request.gamma.astype(np.float64).repeat(self.acting.each)
-        self._rng = (request.seeds / "skills").numpy()
+        self._rng, self._greedy = (request.seeds / "skills").numpy(), request.greedy
 
     def _step(self, out: Decisions | None = None) -> None:
         """One step of every environment."""
@@ -84,13 +98,15 @@ class DecisionCollector(Collector):
         if len(rows):
             self._decide(rows)
         obs, mask = self.obs, self.engine.mask()
-        action = self.skills.act(self._calls, self._all, obs, self._rng, mask)
+        action = self._act(obs, mask)
         raw = self.engine.step(action)
         self._count(raw)
         ended = raw.terminated | raw.truncated
         seen = self._seen(obs, action, raw) if self._watches else None
         why = self.skills.observe(self._calls, self._all, seen)
         why[ended] = Why.EPISODE
+        if self.guide is not None and seen is not None:
+            tell_guide(self.guide, self.kept, self.skills, self._calls, seen, why)
         if out is not None and seen is not None:
             self._record(seen, mask, why)
         self.obs = raw.next_obs
@@ -105,6 +121,10 @@ class DecisionCollector(Collector):
                 success = told_success(raw.info, self.num_envs)
                 self._tell(ids, None if success is None else success[ids])
                 self._begin_anew(ids)
+
+    def _act(self, obs: Array, mask: Array | None) -> Array:
+        """What the running skills do, with the reflexes in force."""
+        return self.skills.act(self._calls, self._all, obs, self._rng, mask)
 
     def _seen(self, obs: Array, action: Array, raw: RawStep) -> Step:
         """The step as skills are shown it."""
@@ -121,7 +141,7 @@ class DecisionCollector(Collector):
         kept, here = self.kept, self.obs[rows]
         allowed = None
         if self._restricts:
-            kept["allowed"][rows] = self.skills.mask(here)
+            kept["allowed"][rows] = self._allowed(rows, here)
             allowed = kept["allowed"]
         acted = self.acting.some(rows, self.obs, allowed, self.memory)
         choice = np.asarray(self.acting.to_env(acted.action))
@@ -139,6 +159,15 @@ class DecisionCollector(Collector):
                     self.open[name] = np.zeros((self.num_envs, *value.shape[1:]), value.dtype)
                 self.open[name][rows] = value
         self.skills.begin(self._calls, rows, choice)
+
+    def _allowed(self, rows: Array, here: Array) -> Array:
+        """Choices that are allowed in environments ``rows`` (k,), in observations ``here``."""
+        may = self.skills.mask(here, self.kept["age"][rows])
+        if self.guide is None:
+            assert may is not None
+            return may
+        may = self.skills.startable(here) if may is None else may
+        return self.guide.mask(self.kept, rows, here, may, self._greedy, self._rng)
 
     def _count(self, raw: RawStep) -> None:
         """Add a step to the open calls and episodes."""
@@ -200,7 +229,9 @@ class Decisions:
             values["head"] = opened["head"][ids]
         if "allowed" in kept:
             values["obs_mask"] = kept["allowed"][ids]
-            values["next_obs_mask"] = self._next_mask(collector, values)
+            values["next_obs_mask"] = self._next_mask(collector, values, ids)
+        if collector.guide is not None and collector.guide.tells:
+            values["guide"] = as_logits(kept["chances"][ids], values["obs_mask"])
         if "rewards" in opened:
             values["rewards"] = opened["rewards"][ids]
         self._found.append((self._count[ids], ids, values))
@@ -236,12 +267,14 @@ class Decisions:
         return whole
 
     @staticmethod
-    def _next_mask(collector: DecisionCollector, values: dict[str, Array]) -> Array:
+    def _next_mask(collector: DecisionCollector, values: dict[str, Array], ids: Array) -> Array:
         """Where skills may start in the true successors: all where that does not matter."""
         mask = np.ones_like(values["obs_mask"])
         on = np.flatnonzero(~values["terminated"])
         if len(on):
             found = collector.skills.startable(values["next_obs"][on])
+            if collector.guide is not None:
+                found = collector.guide.ahead(collector.kept, ids[on], found)
             mask[on] = found | ~found.any(axis=1, keepdims=True)
         return mask
 
@@ -251,6 +284,7 @@ class Decisions:
         obs, lead = collector.obs[None], (1, collector.num_envs)
         no = np.zeros(lead, bool)
         head, size = collector.open.get("head"), collector.acting.memory_size
+        tells = collector.guide is not None and collector.guide.tells
         return Experience(
             obs=obs, action=np.zeros(lead, np.int64), reward=np.zeros(lead, np.float32),
             steps=np.ones(lead, np.int64), terminated=no, truncated=no, next_obs=obs, valid=no,
@@ -258,4 +292,5 @@ class Decisions:
             memory=np.zeros((collector.num_envs, size), np.float32) if size else None,
             starts=no if size else None,
             rewards=np.zeros((*lead, 1), np.float32) if collector.keep_rewards else None,
+            guide=collector.kept["chances"][None] if tells else None,
         )  # fmt: skip

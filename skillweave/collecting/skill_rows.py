@@ -15,6 +15,7 @@ from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
 from skillweave.experience import Experience
+from skillweave.messages import shortened
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, SkillweaveError, Step
 
@@ -102,8 +103,10 @@ class SkillCollector(Collector):
             playing = None
         acted = self.acting.all(obs, mask, memory)
         action = self.acting.to_env(acted.action)
+        overridden = None
         if self.reflexes:
-            action = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
+            space = self.engine.action_space
+            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
         searching = np.zeros(0, np.int64) if playing is None else np.flatnonzero(~playing)
         if playing is not None:
             action = action.copy()
@@ -113,7 +116,8 @@ class SkillCollector(Collector):
         judged = self._judge(obs, action, raw, playing)
         ended = judged.terminated | judged.truncated
         if out is not None:
-            out.put(obs, mask, acted, judged, raw.next_obs, self.engine.mask(), playing)
+            next_mask = self.engine.mask()
+            out.put(obs, mask, acted, judged, raw.next_obs, next_mask, playing, overridden)
         self._count(raw, judged, playing)
         if memory is not None and acted.memory is not None:
             memory[:] = acted.memory
@@ -174,8 +178,10 @@ class SkillCollector(Collector):
         if self.kept["searched"].max() > PATIENCE and not self.kept["found"].any():
             raise SkillweaveError(
                 f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps "
-                f"{self._sought()}, so there is nothing to train on; widen it, or give an "
-                "environment that starts where it holds"
+                f"{self._sought()}, so there is nothing to train on; the latest observation was "
+                f"{shortened(np.array2string(self.obs[waiting[0]], precision=3), 300)}. Widen it; "
+                "or put the skills that lead to where it holds before it in skills, as skills are "
+                "trained in that order; or give an environment that starts where it holds"
             )
 
     def _sought(self) -> str:

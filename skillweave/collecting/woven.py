@@ -12,9 +12,10 @@ from skillweave.collecting.acting import Acted, Acting, Request
 from skillweave.collecting.calls import Interruption, SkillSet, Why, skill_step
 from skillweave.collecting.columns import stacked
 from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.guide import Guide
 from skillweave.envs.engine import Engine
 from skillweave.experience import Experience
-from skillweave.skills import asked
+from skillweave.skills import apply_reflexes, asked
 from skillweave.spaces import action_codec
 from skillweave.types import Array, Memory, Memoryless, SkillweaveError, Step
 
@@ -68,6 +69,7 @@ class WovenCollector(DecisionCollector):
         critic: of skills; None: nobody asks what they are worth.
         margin: calls are cut where the critic says that another skill is worth so much more; None:
             they are not.
+        guide: a ready selector that is asked wherever the selector decides.
     """
 
     def __init__(
@@ -78,13 +80,15 @@ class WovenCollector(DecisionCollector):
         learners: Mapping[int, Acting],
         critic: Acting | None = None,
         margin: float | None = None,
+        guide: Guide | None = None,
     ) -> None:
         self.learners = {i: LearningSkill(a) for i, a in learners.items()}
         self.critic = critic
         policies = [self.learners.get(i, p) for i, p in enumerate(skills.policies)]
         cuts = None if margin is None else Interruption(self._worth, margin)
-        skills = replace(skills, policies=tuple(policies), interruption=cuts)
-        super().__init__(engine, acting, skills)
+        self.reflexes, self._overridden = skills.reflexes, np.zeros(engine.num_envs, bool)
+        skills = replace(skills, policies=tuple(policies), interruption=cuts, reflexes=())
+        super().__init__(engine, acting, skills, guide=guide)
         self._watches = True
         self.kept["fresh"] = np.zeros(self.num_envs, bool)  # the skill that acts begins to
         self._rows: Rows | None = None
@@ -113,6 +117,13 @@ class WovenCollector(DecisionCollector):
         worth = self.critic.these(obs, None, None).head
         assert worth is not None
         return worth
+
+    def _act(self, obs: Array, mask: Array | None) -> Array:
+        action = super()._act(obs, mask)
+        if self.reflexes:
+            space = self.engine.action_space
+            action, self._overridden = apply_reflexes(self.reflexes, obs, action, space)
+        return action
 
     def _decide(self, rows: Array) -> None:
         """The selector chooses; a skill that is called again at once goes on."""
@@ -169,6 +180,7 @@ class Rows:
         self._owner = np.empty(lead, np.int64)
         self._fresh = np.empty(lead, bool)
         self._ended, self._cut = np.empty(lead, bool), np.empty(lead, bool)  # the episode
+        self._overridden = np.zeros(lead, bool) if collector.reflexes else None
         self._goes_on = np.zeros(n, bool)  # if the same skill is called again
         self._masks: list[Array | None] = []
         self._next_masks: list[Array | None] = []
@@ -193,6 +205,8 @@ class Rows:
         self._obs[at], self._next_obs[at], self._task[at] = step.obs, step.next_obs, step.reward
         self._owner[at], self._fresh[at] = collector._calls["skill"], collector.kept["fresh"]
         self._ended[at], self._cut[at] = step.terminated, step.truncated
+        if self._overridden is not None:
+            self._overridden[at] = collector._overridden
         self._masks.append(mask)
         self._next_masks.append(next_mask)
         self._goes_on[:] = False
@@ -231,7 +245,7 @@ class Rows:
                     terminated=self._terminated, truncated=self._truncated,
                     next_obs=self._next_obs, obs_mask=mask, next_obs_mask=next_mask,
                     valid=self._owner == i, head=self._heads.get(i), memory=memory,
-                    starts=None if memory is None else self._fresh,
+                    starts=None if memory is None else self._fresh, overridden=self._overridden,
                 )
             )  # fmt: skip
         if self._collector.critic is not None:

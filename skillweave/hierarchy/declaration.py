@@ -14,6 +14,7 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
+from skillweave.hierarchy.guidance import check_selection, fitted_guide
 from skillweave.messages import short
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
@@ -33,7 +34,6 @@ from skillweave.types import Policy, SkillweaveError
 
 TOGETHER = "together"
 """What the stage is named in which all learn together."""
-WAYS = ("apart", "together", "apart, then together")
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT, "flat")
 """Names of stages that are not skills; "flat" in runs of older versions."""
 
@@ -61,6 +61,12 @@ class Declaration:
     selector: AlgorithmConfig | ReadyValue = field(default_factory=PPO)
     """Trains the selector; its γ is that of one environment step, and so its n_steps. Or a ready
     selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
+    guide: ReadyValue | None = None
+    """A ready selector that a trained one keeps to."""
+    guide_restricts: bool = True
+    """Only what the guide may choose is called, in training and afterwards."""
+    guide_nats: float | None = None
+    """How far from the guide the selector may be while it learns, in nats of KL; None: freely."""
     skill_steps: int = 500_000
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000
@@ -87,7 +93,7 @@ class Declaration:
     greedy_skills: bool = True
     """Skills act greedily under the selector; else they sample."""
     reflexes_in_training: bool = True
-    """Reflexes are in force while skills train too: skills learn the body they will have."""
+    """Reflexes are in force while skills train, apart or together: the body they will have."""
     cut_every: int = 100_000
     """Environment steps between checkpoints."""
     eval_every: int | None = None
@@ -101,7 +107,7 @@ class Declaration:
         self.reflexes = checked_reflexes(self.reflexes)
         for name in ("algorithm", "flat"):
             check_algorithm(getattr(self, name), name, optional=name == "flat")
-        self._check_selector()
+        check_selection(self)
         target_of(self.selector_target_return, None, "selector")
         check_fields(self)
         check_calls(self.call_steps, self.skills)
@@ -115,24 +121,6 @@ class Declaration:
                 f"together is {short(self.together)}; write together=Together(floor=0.3)"
             )
 
-    def _check_selector(self) -> None:
-        if self.learn not in WAYS:
-            raise SkillweaveError(
-                f"learn is {short(self.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
-            )
-        if self.ready_selector is None:
-            check_algorithm(self.selector, "selector", also="function, Automaton or tree")
-            return
-        needs = {
-            "selector_target_return is given": self.selector_target_return is not None,
-            f"learn is {self.learn!r}": self.learn != "apart",
-            "interrupt is True": self.interrupt,
-            "call_steps are Lengths": isinstance(self.call_steps, Lengths),
-        }
-        for what, asked in needs.items():
-            if asked:
-                raise SkillweaveError(f"{what}, but the selector is ready: it does not learn")
-
     @property
     def spec(self) -> EnvSpec:
         """The environment, fully specified."""
@@ -143,7 +131,8 @@ class Declaration:
         """Whether acting needs none of the user's Python code, so a saved run says it all."""
         code = any(s.defines("termination") or s.defines("initiation") for s in self.skills)
         ready = any(s.policy is not None for s in self.skills) or self.ready_selector is not None
-        return not code and not ready and not self.reflexes and self.spec.is_data
+        own = bool(self.reflexes) or self.guide is not None
+        return not code and not ready and not own and self.spec.is_data
 
     @property
     def trains_from_data(self) -> bool:
@@ -248,6 +237,7 @@ class Declaration:
                 reflex.check(env.action_space)
             self._fitted(env)
             self.fitted_selector(env.observation_space)
+            fitted_guide(self, env.observation_space)
             return env.observation_space, env.action_space
         finally:
             env.close()

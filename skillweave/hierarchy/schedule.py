@@ -8,6 +8,7 @@ from typing import Any
 from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.guidance import who_guides
 from skillweave.skills import Skill
 from skillweave.training.scene import (
     Scene,
@@ -36,20 +37,28 @@ def _together(declaration: Declaration) -> Stage:
     def scene(policies: Policies) -> WovenScene:
         acts: Any = [None if s in learns else policies[s.name] for s in declaration.skills]
         numbers = tuple(i for i, s in enumerate(declaration.skills) if s in learns)
-        return woven_scene(declaration.spec, declaration.skill_set(acts), numbers)
+        skills = declaration.skill_set(acts)
+        if not declaration.reflexes_in_training:
+            skills = replace(skills, reflexes=())
+        return woven_scene(declaration.spec, skills, numbers, who_guides(declaration))
 
-    config: Any = declaration.selector
-    if isinstance(config, PPO) and not config.floor:
+    ready = declaration.ready_selector is not None
+    config: Any = declaration.algorithm if ready else declaration.selector
+    if not ready and isinstance(config, PPO) and not config.floor:
         config = replace(config, floor=how.floor, floor_final=how.floor_final)
     beside |= _critic(declaration) if how.task_weight or declaration.interrupt else {}
     target = target_of(declaration.selector_target_return, None, TOGETHER)
     budget, cuts = declaration.together_steps, declaration.interrupt
-    return Stage(TOGETHER, "together", config, budget, scene, target, beside, how, cuts)
+    return Stage(
+        TOGETHER, "together", config, budget, scene, target, beside, how, cuts, ready,
+        declaration.guide_nats,
+    )  # fmt: skip
 
 
 def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
     """The critic of skills, which sees and discounts as the selector does."""
     own: Any = declaration.selector
+    own = own if isinstance(own, AlgorithmConfig) else declaration.algorithm
     shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(own, PPO):
         shared |= {f: getattr(own, f) for f in ("n_steps", "gae_lambda", "network", "overlap")}
@@ -79,15 +88,16 @@ def _apart(declaration: Declaration) -> list[Stage]:
     def calls(policies: Policies) -> Scene:
         skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
         if declaration.interrupt:
-            return woven_scene(declaration.spec, skills, ())
-        return selector_scene(declaration.spec, skills)
+            return woven_scene(declaration.spec, skills, (), who_guides(declaration))
+        return selector_scene(declaration.spec, skills, who_guides(declaration))
 
     first = [skill_stage(s) for s in declaration.skills if s.policy is None]
     if not isinstance(config := declaration.selector, AlgorithmConfig):
         return first
     budget = declaration.selector_steps
     target = target_of(declaration.selector_target_return, None, SELECTOR)
-    last = Stage(SELECTOR, "selector", config, budget, calls, target)
+    nats = declaration.guide_nats
+    last = Stage(SELECTOR, "selector", config, budget, calls, target, guide_nats=nats)
     if declaration.interrupt:
         how, beside = declaration.together, _critic(declaration)
         last = replace(last, beside=beside, together=how, interrupt=True)

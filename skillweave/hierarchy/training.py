@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from skillweave.collecting.lengths import calls_to_json
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.guidance import fitted_guide, ready_guide
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.hierarchy.weights import check_parts
@@ -21,7 +22,7 @@ from skillweave.training.stage import CRITIC, SELECTOR, Policies
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, train_stages
 from skillweave.training.woven import agents_of
-from skillweave.types import Policy
+from skillweave.types import Policy, SkillweaveError
 
 
 def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
@@ -122,6 +123,11 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
     found = ready | _learnt(run)
+    if run.unjudged:
+        raise SkillweaveError(
+            f"{run.path}: all is learnt, but whether the hierarchy before or that after learning "
+            f"together is better was not judged yet; skillweave resume {run.path}"
+        )
     policy = _woven(declaration, run, found)
     check_parts(declaration, policy.skills.policies, policy.selector, str(run.path))
     return policy
@@ -144,7 +150,12 @@ def _woven(
     if declaration.interrupt:
         skills = with_interruption(skills, found[CRITIC], declaration.together.margin)
     selector = _ready_selector(declaration, run, skills.policies[0]) or found[SELECTOR]
-    return HierarchyPolicy(selector, skills)
+    guide = fitted_guide(declaration, selector.observation_space)
+    if guide is None or not guide.restricts:
+        return HierarchyPolicy(selector, skills)
+    told = run.manifest.get("guide")
+    as_recorded(cast(Policy, guide.selector), told, lambda: None, f"{run.path}: the guide")
+    return HierarchyPolicy(selector, skills, guide)
 
 
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
@@ -164,9 +175,12 @@ def _ready_selector(declaration: Declaration, run: RunDirectory, skill: Policy) 
 
 
 def _selector_entry(declaration: Declaration) -> dict[str, Any]:
-    """Where a ready selector comes from; nothing where it is trained."""
+    """Where a ready selector comes from, or the guide of a trained one."""
     selector = declaration.ready_selector
-    return {} if selector is None else {SELECTOR: source_of(selector)}
+    found: dict[str, Any] = {} if selector is None else {SELECTOR: source_of(selector)}
+    if (guide := ready_guide(declaration)) is not None:
+        found |= {"guide": source_of(guide), "guide_restricts": declaration.guide_restricts}
+    return found
 
 
 def _skill_entry(skill: Skill) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict, cast
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +16,7 @@ from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.guidance import check_guided, fitted_guide
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.messages import short
 from skillweave.reading import Positive, fit, shown
@@ -70,6 +71,8 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
         "parts": parts,
         "ready": ready,
     }
+    if policy.guide is not None:
+        header["guide"] = source_of(cast(Policy, policy.guide.selector))
     write_tensors(path, tensors, header)
 
 
@@ -86,6 +89,8 @@ class HierarchyHeader(TypedDict):
     interrupt: NotRequired[float | None]
     greedy_skills: bool
     parts: dict[str, dict[str, Any]]
+    guide: NotRequired[Source]
+    """Of the ready selector that restricts the trained one."""
     ready: NotRequired[dict[str, Source]]
     """Of skills by name, and of "selector"."""
 
@@ -178,7 +183,14 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     skills = declaration.skill_set(policies)
     if (margin := header.get("interrupt")) is not None:
         skills = with_interruption(skills, part(CRITIC), margin)
-    return HierarchyPolicy(selector, skills)
+    guide = fitted_guide(declaration, selector.observation_space)
+    restricts = guide is not None and guide.restricts
+    check_guided(restricts, "guide" in header, str(path))
+    if guide is None or not restricts:
+        return HierarchyPolicy(selector, skills)
+    own = cast(Policy, guide.selector)
+    as_recorded(own, header["guide"], lambda: None, f"{path}: the guide")
+    return HierarchyPolicy(selector, skills, guide)
 
 
 def check_selector(mine: bool, theirs: bool, where: str) -> None:

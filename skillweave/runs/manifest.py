@@ -102,6 +102,8 @@ class StageEntry(TypedDict):
     """Of the skills that learn together with the selector."""
     interrupt: NotRequired[bool]
     """The selector cuts calls."""
+    guide_nats: NotRequired[float]
+    """How far the selector may be from its guide."""
     kept: NotRequired[Kept]
     """Whether what was there before was better than what was learnt together."""
 
@@ -138,6 +140,9 @@ class HierarchyManifest(Manifest):
     greedy_skills: bool
     selector: NotRequired[Source]
     """Of a ready selector; absent where it is trained."""
+    guide: NotRequired[Source]
+    """Of the ready selector that a trained one keeps to."""
+    guide_restricts: NotRequired[bool]
     reflexes: NotRequired[list[str]]
     reflexes_in_training: NotRequired[bool]
     start_calls: NotRequired[int | None]

@@ -13,8 +13,9 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.collecting.calls import Why
+from skillweave.collecting.guide import LastCall
 from skillweave.messages import short
-from skillweave.selectors.base import LastCall, ReadySelector, function_name, listed, shown_obs
+from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.base import answer
 from skillweave.skills.foreign_policy import checksum
 from skillweave.types import Array, Memory, SkillweaveError, Step
@@ -116,15 +117,17 @@ class Automaton(ReadySelector):
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """A skill of each environment's state, (n,)."""
-        allowed = self.allowed(memory)
-        if mask is not None:
-            allowed &= mask
-        if not allowed.any(axis=1).all():
-            self._nothing_may_start(memory, obs, int(np.flatnonzero(~allowed.any(axis=1))[0]))
+        allowed = self._startable(memory, obs, mask)
         score = self.ranks[memory["state"]]
         if not deterministic:
             score = (rng or np.random.default_rng()).random(allowed.shape)
         return np.where(allowed, score, -1).argmax(axis=1), memory
+
+    def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
+        """All skills of the state that may start are equally likely, (n, S)."""
+        allowed = self._startable(memory, obs, mask)
+        found: Array = allowed / allowed.sum(axis=1, keepdims=True, dtype=np.float32)
+        return found, memory
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Take the transitions whose events have happened."""
@@ -151,6 +154,15 @@ class Automaton(ReadySelector):
         ]
         whole = json.dumps([self.start_state, states, arrows])
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
+
+    def _startable(self, memory: Memory, obs: Array, mask: Array | None) -> Array:
+        """The skills of the state that may start, (n, S) bool: at least one."""
+        allowed = self.allowed(memory)
+        if mask is not None:
+            allowed = allowed & mask
+        if not allowed.any(axis=1).all():
+            self._nothing_may_start(memory, obs, int(np.flatnonzero(~allowed.any(axis=1))[0]))
+        return allowed
 
     def _happened(self, event: Event, step: Step, last: LastCall) -> Array:
         """Whether an event has happened in this step, (n,) bool."""

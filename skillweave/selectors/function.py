@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.spaces import Discrete
 
 from skillweave.collecting.calls import Why
-from skillweave.selectors.base import LastCall, ReadySelector, function_name, listed, shown_obs
+from skillweave.collecting.guide import LastCall
+from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.ready import required_arguments

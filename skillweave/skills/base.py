@@ -178,11 +178,16 @@ class Reflex:
 
 def apply_reflexes(
     reflexes: tuple[Reflex, ...], obs: Array, action: Array, space: Space[Any]
-) -> Array:
-    """The actions with every reflex in force; where several hold, the last one counts."""
+) -> tuple[Array, Array]:
+    """The actions with every reflex in force, and (n,) bool: where one of them acted.
+
+    Where several hold, the last one counts.
+    """
+    overridden = np.zeros(len(obs), bool)
     for reflex in reflexes:
-        action, _ = reflex.apply(obs, action, space)
-    return action
+        action, holds = reflex.apply(obs, action, space)
+        overridden |= holds
+    return action, overridden
 
 
 def asked(

@@ -12,6 +12,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.guide import AskedElsewhere, Guide
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.engine import Engine
@@ -75,14 +76,14 @@ def skill_scene(
     return Scene(spec.name, *_spaces(spec), collector)
 
 
-def selector_scene(spec: EnvSpec, skills: SkillSet) -> Scene:
-    """The environments in which a selector calls skills."""
+def selector_scene(spec: EnvSpec, skills: SkillSet, guide: Guide | None = None) -> Scene:
+    """The environments in which a selector calls skills, perhaps guided by a ready one."""
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return DecisionCollector(engine, acting, skills, keep_rewards=shared)
+        return DecisionCollector(engine, acting, skills, keep_rewards=shared, guide=guide)
 
     observation_space, _ = _spaces(spec)
     choices = gym.spaces.Discrete(skills.choices)
@@ -100,11 +101,13 @@ class WovenScene(Scene):
     skill_space: gym.Space[Any] = field(kw_only=True)
     """What skills choose from."""
     spec: EnvSpec = field(kw_only=True)
+    guide: Guide | None = field(default=None, kw_only=True)
+    """A ready selector, which is asked wherever the selector decides, or decides itself."""
 
     def woven(
         self,
         engine: Engine,
-        acting: Acting,
+        acting: Acting | None,
         learners: Sequence[Acting],
         critic: Acting | None = None,
         margin: float | None = None,
@@ -112,21 +115,24 @@ class WovenScene(Scene):
         """A collector of these environments.
 
         Args:
-            acting: the selector.
+            acting: the selector; None: the guide decides.
             learners: the skills that learn, in their order.
             critic, margin: as of ``WovenCollector``.
         """
         by_number = dict(zip(self.learners, learners, strict=True))
-        return WovenCollector(engine, acting, self.skills, by_number, critic, margin)
+        decides: Any = acting or AskedElsewhere(engine.num_envs)
+        return WovenCollector(engine, decides, self.skills, by_number, critic, margin, self.guide)
 
 
-def woven_scene(spec: EnvSpec, skills: SkillSet, learners: tuple[int, ...]) -> WovenScene:
+def woven_scene(
+    spec: EnvSpec, skills: SkillSet, learners: tuple[int, ...], guide: Guide | None = None
+) -> WovenScene:
     """The environments in which a selector calls skills, and those of ``learners`` learn too."""
     plain = skill_scene(spec)
     return WovenScene(
         spec.name, plain.observation_space, gym.spaces.Discrete(skills.choices), plain.collector,
         skills.usual_steps or CALL, skills=skills, learners=learners,
-        skill_space=plain.action_space, spec=spec,
+        skill_space=plain.action_space, spec=spec, guide=guide,
     )  # fmt: skip
 
 

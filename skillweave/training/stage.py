@@ -128,14 +128,18 @@ class Stage:
     """How they learn together; None: one learns alone."""
     interrupt: bool = False
     """The selector cuts calls."""
+    ready: bool = False
+    """The selector does not learn: ``config`` says how many environments there are."""
+    guide_nats: float | None = None
+    """How far the selector may be from a ready one, in nats of KL; None: as far as it likes."""
 
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
         first = SELECTOR if self.together else self.name
-        entry = {
+        entry: dict[str, Any] = {
             "name": self.name,
             "kind": self.kind,
-            "learns": [first, *self.beside],
+            "learns": [*([] if self.ready else [first]), *self.beside],
             "decides": first if self.kind in ("selector", "together") else None,
             "budget": self.budget,
             "algorithm": config_to_json(self.config),
@@ -146,6 +150,8 @@ class Stage:
             entry["together"] = asdict(self.together)
             entry["algorithms"] = {k: config_to_json(v) for k, v in self.beside.items()}
             entry["interrupt"] = self.interrupt
+        if self.guide_nats is not None:
+            entry["guide_nats"] = self.guide_nats
         return entry
 
 
