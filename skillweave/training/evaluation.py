@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 from typing import Any
@@ -126,6 +126,7 @@ def evaluate(
     deterministic: bool = True,
     num_envs: int = 100,
     max_steps: int | None = None,
+    watch: Callable[[Played], None] | None = None,
 ) -> Evaluation:
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
@@ -135,6 +136,7 @@ def evaluate(
         num_envs: environments side by side; does not change the result of a greedy policy.
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
             as many as the environment's own time limit, or ``LONGEST_EPISODE``.
+        watch: is shown every step that is played.
 
     Raises:
         SkillweaveError: the policy was made for other spaces.
@@ -152,19 +154,29 @@ def evaluate(
     try:
         _check_spaces(policy, engine.observation_space, engine.action_space, env.name)
         engine.reset(0)
-        seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+        seeds = episode_seeds(seed, episodes)
         moments = play(
             policy,
             SeededEpisodes(engine, seeds, limit),
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
-        return replaced(_scored(policy, episodes, moments), threshold=threshold)
+        return replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
     finally:
         engine.close()
 
 
-def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluation:
+def episode_seeds(seed: int, episodes: int) -> list[int]:
+    """The seeds that an evaluation's episodes start from; training uses none of them."""
+    return [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+
+
+def _scored(
+    policy: Policy,
+    episodes: int,
+    moments: Iterator[Played],
+    watch: Callable[[Played], None] | None,
+) -> Evaluation:
     """The scores of episodes as they are played."""
     returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
     tally = SkillTally(policy, episodes)
@@ -173,6 +185,8 @@ def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluat
         lengths[played.episode] += played.lasted
         cut += int(played.cut.sum())
         tally.add(played)
+        if watch is not None:
+            watch(played)
     return Evaluation(tuple(returns.tolist()), tuple(lengths.tolist()), None, tally.reports(), cut)
 
 

@@ -70,6 +70,32 @@ class SkillReport:
         }
 
 
+@dataclass(frozen=True)
+class Judged:
+    """What the skills say of one step in each environment that acts."""
+
+    why: Array  # (k,) int8, ``Why`` its call has ended; RUNNING: it goes on
+    reward: Array  # (k,) the running skill's own; the environment's where it defines none
+    succeeded: Array  # (k,) bool, the call is over, and its skill's ``success`` says yes
+
+
+def judge(skills: SkillSet, played: Played) -> Judged:
+    """Ask the running skills about a step of a hierarchy."""
+    assert played.acting is not None
+    assert played.elapsed is not None
+    assert played.why is not None
+    acting, why = played.acting, played.why.copy()
+    why[(why == Why.RUNNING) & played.over] = Why.EPISODE
+    over = why != Why.RUNNING
+    own, succeeded = played.reward.copy(), np.zeros(len(acting), bool)
+    for i, skill in enumerate(skills.skills):
+        if skill.defines("reward") and len(rows := np.flatnonzero(acting == i)):
+            own[rows] = _ask(skills, i, "reward", played, played.elapsed, rows)
+        if skill.defines("success") and len(rows := np.flatnonzero(over & (acting == i))):
+            succeeded[rows] = _ask(skills, i, "success", played, played.elapsed, rows)
+    return Judged(why, own, succeeded)
+
+
 class SkillTally:
     """Counts what each skill of a policy does, as episodes are played."""
 
@@ -93,31 +119,12 @@ class SkillTally:
         self._calls += np.bincount(acting[played.begun], minlength=count)
         own = played.reward
         if self.skills is not None:
-            own = self._judge(self.skills, played, acting)
+            judged = judge(self.skills, played)
+            own = judged.reward
+            ended = np.flatnonzero(judged.why != Why.RUNNING)
+            np.add.at(self._ended, (acting[ended], judged.why[ended]), 1)
+            np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
         self._returns[played.episode, acting] += own
-
-    def _judge(self, skills: SkillSet, played: Played, acting: Array) -> Array:
-        """Count the calls that end here; the reward of each running skill, (k,)."""
-        assert played.elapsed is not None
-        assert played.why is not None
-        why = played.why.copy()
-        why[(why == Why.RUNNING) & played.over] = Why.EPISODE
-        ended = np.flatnonzero(why != Why.RUNNING)
-        pairs = acting[ended] * len(Why) + why[ended]
-        self._ended += np.bincount(pairs, minlength=self._ended.size).reshape(self._ended.shape)
-        own = played.reward
-        for i, skill in enumerate(skills.skills):
-            if skill.defines("reward"):
-                rows = np.flatnonzero(acting == i)
-                if len(rows):
-                    own = own.copy() if own is played.reward else own
-                    own[rows] = _ask(skills, i, "reward", played, played.elapsed, rows)
-            if skill.defines("success"):
-                rows = ended[acting[ended] == i]
-                if len(rows):
-                    found = _ask(skills, i, "success", played, played.elapsed, rows)
-                    self._succeeded[i] += int(found.sum())
-        return own
 
     def reports(self) -> dict[str, SkillReport]:
         """The report of each skill, by its name."""
