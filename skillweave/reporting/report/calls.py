@@ -1,0 +1,99 @@
+"""The calls of a report's episodes as plain data: timelines, transitions, choices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from skillweave.reporting.report.film import Film
+from skillweave.training.call_log import CallLog, EpisodeLog
+from skillweave.types import Array
+
+MOST_COORDINATES = 16
+LARGEST_VECTOR = 64  # numbers of an observation; of a larger one (an image) none is a coordinate
+MOST_DECISIONS = 2_000
+
+
+def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
+    """The numbers of ``count`` episodes, from the one with the least return to the best."""
+    order = np.argsort([e.total for e in episodes], kind="stable")
+    places = np.linspace(0, len(order) - 1, min(count, len(order))).round().astype(int)
+    return [int(i) for i in order[places]]
+
+
+def episode_data(log: CallLog, film: Film | None) -> list[dict[str, Any]]:
+    """Each episode with its calls; those in the film come first, in its order."""
+    first = {} if film is None else film.first
+    numbers = [*first, *(i for i in range(len(log.episodes)) if i not in first)]
+    return [_episode(log.episodes[i], i, first.get(i)) for i in numbers]
+
+
+def _episode(episode: EpisodeLog, number: int, first: int | None) -> dict[str, Any]:
+    totals = np.cumsum(episode.rewards).round(2).tolist() if first is not None else []
+    calls = [
+        [
+            c.skill, c.start, c.steps, c.why, round(c.reward, 2),
+            None if c.own is None else round(c.own, 2), c.succeeded,
+        ]
+        for c in episode.calls
+    ]  # fmt: skip
+    told = {"number": number + 1, "seed": episode.seed, "return": round(episode.total, 2)}
+    told |= {"steps": len(episode.rewards), "cut": episode.cut, "frame": first}
+    return told | {"totals": totals, "calls": calls}
+
+
+def transitions(log: CallLog) -> list[list[int]]:
+    """How often each skill followed another: (1 + S, S + 1).
+
+    The first row is an episode's start, the last column its end.
+    """
+    skills = len(log.labels)
+    counts = np.zeros((1 + skills, skills + 1), int)
+    for episode in log.episodes:
+        before = 0
+        for call in episode.calls:
+            counts[before, call.skill] += 1
+            before = 1 + call.skill
+        counts[before, skills] += 1
+    found: list[list[int]] = counts.tolist()
+    return found
+
+
+def decision_data(log: CallLog) -> dict[str, Any]:
+    """What was chosen at which observation: names of coordinates, and a row for each decision.
+
+    A row is the coordinates, then the skill, then whether its call succeeded (None: not known).
+    Only coordinates that vary are there; the episode's step is the last one.
+    """
+    calls = [call for episode in log.episodes for call in episode.calls]
+    every = -(-len(calls) // MOST_DECISIONS)
+    calls = calls[::every]
+    columns = coordinates(np.stack([call.obs for call in calls]))
+    columns = dict([(k, v) for k, v in columns.items() if np.ptp(v) > 0][:MOST_COORDINATES])
+    if columns:
+        columns["step of the episode"] = np.array([float(call.start) for call in calls])
+    table = [
+        [*(float(f"{v[i]:.5g}") for v in columns.values()), call.skill, call.succeeded]
+        for i, call in enumerate(calls)
+    ]
+    return {"names": list(columns), "rows": table if columns else [], "every": every}
+
+
+def coordinates(obs: Array) -> dict[str, Array]:
+    """The numbers of a batch of observations by name, (n,) each; none where they are images."""
+    if obs.dtype.names is not None:
+        parts = [(f'obs["{name}"]', obs[name]) for name in obs.dtype.names]
+    else:
+        parts = [("obs", obs)]
+    found: dict[str, Array] = {}
+    for name, part in parts:
+        if part.dtype.names is not None:
+            continue  # a Dict in a Dict
+        flat = np.asarray(part).reshape(len(part), -1)
+        if flat.shape[1] <= LARGEST_VECTOR:
+            alone = part.ndim == 1
+            for i in range(flat.shape[1]):
+                found[name if alone else f"{name}[{i}]"] = flat[:, i].astype(float)
+    return {k: v for k, v in found.items() if np.isfinite(v).all()}

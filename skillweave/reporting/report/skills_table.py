@@ -1,0 +1,56 @@
+"""What each skill did, and which skill followed which, as rows for the page's tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from skillweave.training.skill_report import SkillReport
+
+WHY = {
+    "own": "by itself",
+    "limit": "at a limit",
+    "interrupted": "cut by the selector",
+    "episode": "with the episode",
+}
+"""Why a call ended, as the page says it."""
+NOTHING = "–"
+
+
+def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
+    """A row for each skill."""
+    total = sum(report.steps for report in reports.values())
+    rows = []
+    for name, report in reports.items():
+        calls = report.calls
+        known = bool(report.ended and calls)
+        rows.append({
+            "name": name,
+            "share": report.steps / total if total else 0.0,
+            "calls": f"{calls:,}",
+            "length": number(report.length_mean),
+            "ends": [percent(report.ended[w] / calls if known else None) for w in WHY],
+            "success": percent(report.success_rate),
+            "return": number(report.return_mean),
+        })  # fmt: skip
+    return rows
+
+
+def transition_rows(labels: Sequence[str], counts: Sequence[Sequence[int]]) -> list[dict[str, Any]]:
+    """A row for each skill and for an episode's start: what followed, as counts and shares."""
+    rows = []
+    for name, row in zip(("start of an episode", *labels), counts, strict=True):
+        total = sum(row)
+        cells = [{"count": f"{n:,}", "share": n / total if total else 0.0} for n in row]
+        rows.append({"name": name, "total": total, "cells": cells})
+    return rows
+
+
+def percent(value: float | None) -> str:
+    """A share: 42 %."""
+    return NOTHING if value is None else f"{100 * value:.0f} %"
+
+
+def number(value: float | None) -> str:
+    """A number with one decimal."""
+    return NOTHING if value is None else f"{value:,.1f}".replace("-", "−")
