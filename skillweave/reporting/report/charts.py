@@ -33,7 +33,8 @@ def number_axis(field: str, title: str, **rest: Any) -> dict[str, Any]:
 
 def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
     """The encoding of steps: 200k, 1M."""
-    axis = {"format": "~s", "tickCount": 5, "labelOverlap": True}
+    label = "datum.value === 0 ? '0' : format(datum.value, '~s')"
+    axis = {"labelExpr": label, "tickCount": 5, "labelOverlap": True}
     return number_axis(field, title, axis=axis, scale={"zero": True, "nice": False})
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,9 +115,10 @@ def write_report(
         missing += played.missing
     if not all_curves:
         missing.append("There are no learning curves: no metrics were written yet.")
-    data = {"curves": curve_data(all_curves), "metrics": metrics_of(all_curves)}
+    colors = _colors(run, played)
+    data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
     context = _words(run, missing) | _scores(run, played, seed, deterministic)
-    context |= _lineages(run, data)
+    context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
     context |= {"episodes": 0, "filmed": 0, "legend": [], "transitions": [], "has_skills": False}
     if played is not None:
@@ -135,17 +136,32 @@ def _reached(all_curves: Sequence[Curves]) -> dict[str, int]:
     }
 
 
-def curve_data(all_curves: Sequence[Curves]) -> list[dict[str, Any]]:
+def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
+    """Colours by name: skills as in timelines, then the other agents that learnt."""
+    names = [skill["name"] for skill in run.manifest.get("skills", ())]
+    found = {name: color_of(i) for i, name in enumerate(names)}
+    if played is not None:
+        found |= dict(zip(played.log.labels, played.colors, strict=True))
+    for entry in run.manifest["stages"]:
+        for name in (entry["name"], *entry["learns"], *entry.get("algorithms", ())):
+            found.setdefault(name, color_of(len(found)))
+    return {name: charts.hex_of(color) for name, color in found.items()}
+
+
+def curve_data(
+    all_curves: Sequence[Curves], colors: Mapping[str, str]
+) -> list[dict[str, Any]]:
     """The curves with their charts, as plain JSON."""
+    usual = charts.hex_of(color_of(1))
     return [
         {
-            "spec": charts.curve(c.label, charts.hex_of(color_of(i + 1))),
+            "spec": charts.curve(c.label, colors.get(c.agent, usual)),
             "points": {
                 metric: [[x, float(f"{y:.5g}")] for x, y in thinned(points)]
                 for metric, points in c.points.items()
             },
         }
-        for i, c in enumerate(all_curves)
+        for c in all_curves
     ]
 
 
@@ -200,14 +216,16 @@ def _how(whose: str, seed: int, deterministic: bool) -> str:
     return f"{whose} ({'greedy' if deterministic else 'sampled'}, seed {seed})"
 
 
-def _lineages(run: RunDirectory, data: dict[str, Any]) -> dict[str, Any]:
+def _lineages(
+    run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
+) -> dict[str, Any]:
     """A section for each stage whose population evolved."""
     sections, data["trees"] = [], []
-    for i, entry in enumerate(run.manifest["stages"]):
+    for entry in run.manifest["stages"]:
         lineage = read_lineage(run, entry["name"])
         if lineage is None:
             continue
-        color = charts.hex_of(color_of(i + 1))
+        color = colors[entry["name"]]
         paths = charts.setting_paths(lineage, color)
         data["trees"].append(
             {"tree": charts.family_tree(lineage, color), "paths": [spec for _, spec in paths]}

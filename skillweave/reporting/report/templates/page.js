@@ -52,8 +52,10 @@
       element.nextElementSibling.hidden = Boolean(points);
       if (!points) return;
       const spec = structuredClone(curve.spec);
-      spec.data = { values: points.map(([x, y]) => ({ x, y })) };
-      spec.encoding.y.title = metric.replaceAll("_", " ");
+      // A run's points are steps and a value; a group's have an interval and the group's name, too.
+      spec.data = { values: points.map(([x, y, lo, hi, what]) => ({ x, y, lo, hi, what })) };
+      const title = metric.replaceAll("_", " ");
+      for (const part of [spec, ...(spec.layer ?? [])]) if (part.encoding?.y) part.encoding.y.title = title;
       draw(element, spec);
     });
   };
