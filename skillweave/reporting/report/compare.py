@@ -40,21 +40,21 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     saved = {run.path: load_evaluation(run) for run in runs}
     told = {run.path: read_curves(run) for run in runs}
     colors = [charts.hex_of(color_of(i)) for i in range(len(groups))]
-    names = [group.name for group in groups]
+    keys = [group.key for group in groups]
     curves = _curves(groups, told, colors)
     everything = [c for own in told.values() for c in own]
     data = {"curves": curves, "metrics": metrics_of(everything), "charts": {}}
     scores = [_scores(group, saved) for group in groups]
     if any(scores):
-        data["charts"] = {"scores-chart": group_charts.scores(names, colors, _score_rows(groups, saved, scores))}
+        data["charts"] = {"scores-chart": group_charts.scores(keys, colors, _score_rows(groups, saved, scores))}
     missing = _missing(runs, saved)
     differ = differences(groups)
     context = {
         "title": f"Comparison of {len(runs)} runs",
         "groups": [_group_words(g, s) for g, s in zip(groups, scores, strict=True)],
-        "colors": colors,
+        "legend": [(g.key, g.name, c) for g, c in zip(groups, colors, strict=True)],
         "has_scores": any(scores),
-        "skills": [(g.name, rows) for g in groups if (rows := _skill_rows(g, saved))],
+        "skills": [(g.key, g.name, rows) for g in groups if (rows := _skill_rows(g, saved))],
         "runs": [_run_row(g, run, saved[run.path]) for g in groups for run in g.runs],
         "differences": differ[:MOST_DIFFERENCES],
         "more_differences": max(0, len(differ) - MOST_DIFFERENCES),
@@ -94,7 +94,7 @@ def _scores(group: Group, saved: Saved) -> list[float]:
 
 def _group_words(group: Group, scores: list[float]) -> dict[str, Any]:
     seeds = ", ".join(str(run.manifest["seed"]) for run in group.runs)
-    words: dict[str, Any] = {"name": group.name, "seeds": seeds, "count": len(group.runs)}
+    words: dict[str, Any] = {"key": group.key, "name": group.name, "seeds": seeds, "count": len(group.runs)}
     if not scores:
         return words | {"iqm": None}
     found = over_seeds(np.array(scores))
@@ -115,13 +115,13 @@ def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) ->
         for run in group.runs:
             if (e := saved[run.path]) is not None:
                 seed = run.manifest["seed"]
-                dots.append({"group": group.name, "x": e.evaluation.mean, "seed": seed})
+                dots.append({"group": group.key, "x": e.evaluation.mean, "seed": seed})
         if own:
             found = over_seeds(np.array(own))
             ends = {} if found.low is None or found.high is None else {
                 "low": float(found.low), "high": float(found.high)
             }  # fmt: skip
-            bars.append({"group": group.name, "x": float(found.mean), **ends})
+            bars.append({"group": group.key, "x": float(found.mean), **ends})
     return {"dots": dots, "bars": bars}
 
 
@@ -157,7 +157,7 @@ def _run_row(group: Group, run: RunDirectory, saved: SavedEvaluation | None) -> 
     stages = run.manifest["stages"]
     return {
         "run": facts.name_of(run),
-        "group": group.name,
+        "group": group.key,
         "seed": str(run.manifest["seed"]),
         "status": "finished" if run.finished else "not finished",
         "steps": f"{sum(s.get('steps', 0) for s in stages):,}",
@@ -175,7 +175,7 @@ def _curves(
 ) -> list[dict[str, Any]]:
     """A chart for each agent of any group, with a line and a band for each group."""
     labels = list(dict.fromkeys(c.label for own in told.values() for c in own))
-    names = [group.name for group in groups]
+    keys = [group.key for group in groups]
     found = []
     for label in labels:
         points: dict[str, list[list[Any]]] = {}
@@ -183,8 +183,8 @@ def _curves(
             own = [c for run in group.runs for c in told[run.path] if c.label == label]
             for metric in dict.fromkeys(k for c in own for k in c.points):
                 curves = [c.points[metric] for c in own if metric in c.points]
-                points.setdefault(metric, []).extend(_line(group.name, curves))
-        spec = group_charts.group_curves(label, names, colors)
+                points.setdefault(metric, []).extend(_line(group.key, curves))
+        spec = group_charts.group_curves(label, keys, colors)
         found.append({"label": label, "spec": spec, "points": points})
     return found
 

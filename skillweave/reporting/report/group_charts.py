@@ -8,16 +8,17 @@ from typing import Any
 from skillweave.reporting.report.charts import STEPS, Spec, chart, number_axis, steps_axis
 
 
-def _color(field: str, names: Sequence[str], colors: Sequence[str], legend: Any) -> dict[str, Any]:
+def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str, Any]:
+    """Colours of groups by their letters; the page has the legend."""
     scale = {"domain": list(names), "range": list(colors)}
-    return {"field": field, "type": "nominal", "scale": scale, "legend": legend}
+    return {"field": field, "type": "nominal", "scale": scale, "legend": None}
 
 
 def scores(names: Sequence[str], colors: Sequence[str], rows: dict[str, Any]) -> Spec:
     """A dot for each run; of each group the interquartile mean and its interval."""
     y = {"field": "group", "type": "nominal", "title": None, "sort": list(names),
-         "axis": {"labelLimit": 170, "labelFontSize": 13}}  # fmt: skip
-    color = _color("group", names, colors, None)
+         "axis": {"labelFontSize": 14, "labelFontWeight": "bold"}}  # fmt: skip
+    color = _color("group", names, colors)
     x = number_axis("x", "mean return of a run")
     told = [
         {"field": "group"},
@@ -43,14 +44,12 @@ def scores(names: Sequence[str], colors: Sequence[str], rows: dict[str, Any]) ->
          "mark": {"type": "tick", "thickness": 4, "size": 22, "aria": False},
          "encoding": {"x": x, "y": y, "color": color, "tooltip": told}},
     ]  # fmt: skip
-    return chart("Scores by group", 60 + 48 * len(names), layer=layer)
+    return chart("Scores by group", 50 + 40 * len(names), layer=layer)
 
 
 def group_curves(label: str, names: Sequence[str], colors: Sequence[str]) -> Spec:
     """An agent's metric over its steps, a line and a band for each group."""
-    legend = None if len(names) == 1 else {"orient": "top", "title": None, "columns": 2,
-              "symbolType": "stroke", "labelLimit": 300}  # fmt: skip
-    color = _color("what", names, colors, legend)
+    color = _color("what", names, colors)
     told = [
         {"field": "what", "title": "group"},
         {"field": "x", "title": STEPS, "format": ",d"},

@@ -12,13 +12,12 @@ from skillweave.reporting.report import facts
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
-SAID = 3  # differences in a group's name
-
-
 @dataclass
 class Group:
     """Seeds of one recipe."""
 
+    key: str
+    """A letter, for charts and tables."""
     name: str
     runs: list[RunDirectory]
     settings: dict[str, Any]
@@ -36,7 +35,7 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
     for run in runs:
         own = facts.settings(run)
         key = json.dumps([run.manifest.get("recipe"), own], sort_keys=True, default=str)
-        group = found.setdefault(key, Group(_base(run), [], own))
+        group = found.setdefault(key, Group(_letter(len(found)), _base(run), [], own))
         for other in group.runs:
             if other.manifest["seed"] == run.manifest["seed"]:
                 raise SkillweaveError(
@@ -46,8 +45,10 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
         group.runs.append(run)
     groups = list(found.values())
     for group in groups:
-        same = [g for g in groups if _base(g.runs[0]) == _base(group.runs[0])]
-        group.name = ", ".join([_base(group.runs[0]), *_own(group, same)])
+        base = _base(group.runs[0])
+        same = [g for g in groups if _base(g.runs[0]) == base]
+        told = [f"{k} {_told(group, k)}" for k in _telling(same)]
+        group.name = ", ".join([base, *told])
     return groups
 
 
@@ -68,10 +69,23 @@ def _base(run: RunDirectory) -> str:
     return f"{name}, plain agent" if recipe and run.manifest["kind"] == "agent" else name
 
 
-def _own(group: Group, same: Sequence[Group]) -> list[str]:
-    """What sets a group apart from those of the same base, at most ``SAID`` settings."""
-    if len(same) < 2:
-        return []
-    names = [k for k, _ in differences(same)]
-    said = [f"{k} {_told(group, k)}" for k in names[:SAID]]
-    return [*said, "…"] if len(names) > SAID else said
+def _telling(groups: Sequence[Group]) -> list[str]:
+    """Few settings that tell the groups apart; each the one that parts them best."""
+    table = dict(differences(groups))
+    said: list[str] = []
+
+    def parts(names: Sequence[str]) -> int:
+        return len({tuple(table[k][i] for k in names) for i in range(len(groups))})
+
+    while table and parts(said) < len(groups):
+        best = max(table, key=lambda k: parts([*said, k]))  # the first of those that part as well
+        if parts([*said, best]) == parts(said):
+            break
+        said.append(best)
+    return said
+
+
+def _letter(number: int) -> str:
+    """A to Z, then A2, B2, …"""
+    turn, at = divmod(number, 26)
+    return chr(ord("A") + at) + (str(turn + 1) if turn else "")
