@@ -122,14 +122,17 @@ def _plot(command: commands.Plot) -> None:
 
 def _report(command: commands.Report) -> None:
     run, why_not, trained = RunDirectory.open(command.run), None, None
+    told = run.manifest.get("recipe")
+    # Code of our own is as good as told: with it, the skills' rewards and successes are known.
+    recipe = command.recipe or (told if told in recipes.names() else None)
     if run.finished:
         try:
-            trained = declared_by_run(command.run, command.recipe).load(command.run)
+            trained = declared_by_run(command.run, recipe).load(command.run)
         except SkillweaveError as error:
             if command.recipe is not None:
                 raise
             why_not = f"There are no episodes and no film: {error}."
-    told = write_report(
+    page = write_report(
         run,
         command.out or command.run / "report.html",
         None if trained is None else trained.policy,
@@ -140,7 +143,7 @@ def _report(command: commands.Report) -> None:
         seed=command.seed,
         deterministic=command.deterministic,
     )
-    _tell_page(command, told)
+    _tell_page(command, page)
 
 
 def _compare(command: commands.Compare) -> None:

@@ -31,6 +31,7 @@ from skillweave.reporting.report.skills_table import (
     transition_rows,
 )
 from skillweave.runs.directory import RunDirectory
+from skillweave.skills.base import RecordedSkill
 from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import load_evaluation
@@ -69,7 +70,13 @@ def play_episodes(
         except SkillweaveError as error:
             missing.append(f"There is no film: {error}.")
     found = getattr(policy, "skills", None)
-    wanted = [s.color for s in found.skills] if isinstance(found, SkillSet) else [None]
+    skills = found.skills if isinstance(found, SkillSet) else ()
+    if any(isinstance(skill, RecordedSkill) for skill in skills):
+        missing.append(
+            "Of the calls, neither the skills' own rewards nor their successes are known, as the "
+            "run was loaded without the code of its skills: --recipe FILE.py gives it."
+        )
+    wanted = [skill.color for skill in skills]
     wanted += [None] * (len(log.labels) - len(wanted))
     colors = [color_of(i, color) for i, color in enumerate(wanted)]
     return Played(score, log, film, missing, colors)
