@@ -66,6 +66,7 @@ class CallLog:
         self.labels = policy.labels or (AGENT,)
         found = getattr(policy, "skills", None)
         self._skills = found if isinstance(found, SkillSet) else None
+        self.skills = () if self._skills is None else self._skills.skills
         self.episodes = [EpisodeLog(seed) for seed in seeds]
 
     def add(self, played: Played) -> None:

@@ -9,22 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 from reporting.walkway import CALLS, declare
+
 from skillweave.cli import main
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.film import HOLD
 from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser here: apt-get install chromium")
 pytest.importorskip("vl_convert")
 pytest.importorskip("imageio_ffmpeg")
 playwright = pytest.importorskip("playwright.sync_api")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 
-RECIPE = '''
+RECIPE = """
 from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill
 
 class Left(Skill):
@@ -40,7 +42,7 @@ hierarchy = Hierarchy(
     env=EnvSpec("CartPole-v1", engine="sync"), skills=[Left(), Balance()], call_steps=5,
     algorithm=small, selector=small, skill_steps=512, selector_steps=512,
 )
-'''
+"""
 EVOLVE = ("left.population=2", "left.generations=2", "left.episodes=1")
 
 
@@ -91,8 +93,8 @@ class Opened:
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(path.as_uri())
         # All charts that are to be seen are drawn.
-        drawn = "[...document.querySelectorAll('.chart:not([hidden])')].every(c => c.querySelector('svg'))"
-        self.page.wait_for_function(drawn)
+        charts = "[...document.querySelectorAll('.chart:not([hidden])')]"
+        self.page.wait_for_function(f"{charts}.every(chart => chart.querySelector('svg'))")
         self.own = path.as_uri()
 
     def foreign(self) -> list[str]:
@@ -117,7 +119,9 @@ def shown_frame(page: Any) -> float:
 
 
 def selected(page: Any) -> list[str]:
-    found: list[str] = page.eval_on_selector_all("[aria-selected=true]", "all => all.map(e => e.id)")
+    found: list[str] = page.eval_on_selector_all(
+        "[aria-selected=true]", "all => all.map(e => e.id)"
+    )
     return found
 
 
@@ -131,7 +135,9 @@ def test_it_opens_without_errors_and_network_at_any_width(
         opened.page.set_viewport_size({"width": width, "height": 800})
         opened.page.wait_for_timeout(100)  # charts follow their frames
         assert opened.page.evaluate("document.documentElement.scrollWidth") <= width
-        for summary in opened.page.query_selector_all("details:not([open]):not([hidden]) > summary"):
+        for summary in opened.page.query_selector_all(
+            "details:not([open]):not([hidden]) > summary"
+        ):
             summary.click()
         assert opened.page.evaluate("document.documentElement.scrollWidth") <= width
         if width in (400, 1000):
@@ -177,7 +183,13 @@ def test_the_picture_is_that_of_the_step(film: Any) -> None:
 
 def test_keys_go_from_call_to_call_and_play(film: Any) -> None:
     film.focus("#timelines .track")
-    for key, call in (("Home", 0), ("ArrowRight", 1), ("End", 3), ("ArrowRight", 3), ("ArrowLeft", 2)):
+    for key, call in (
+        ("Home", 0),
+        ("ArrowRight", 1),
+        ("End", 3),
+        ("ArrowRight", 3),
+        ("ArrowLeft", 2),
+    ):
         film.keyboard.press(key)
         assert selected(film) == [f"call-0-{call}"]
     assert shown_frame(film) == pytest.approx(3)
@@ -199,7 +211,9 @@ def test_an_episode_without_film_is_told_and_the_film_stays(film: Any) -> None:
     film.click("#table summary")
     film.click("#calls button[aria-label='Show call 4']")
     assert selected(film) == ["call-3-3"]
-    cells = film.eval_on_selector_all("#calls tbody tr:nth-child(4) td", "all => all.map(e => e.innerText)")
+    cells = film.eval_on_selector_all(
+        "#calls tbody tr:nth-child(4) td", "all => all.map(e => e.innerText)"
+    )
     assert cells == ["4", "go", "7", "2", "with the episode", "+11", "+4", "yes"]
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from reporting.walkway import CALLS, Moody, Walkway, declare
+
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
 from skillweave.reporting.report import calls, charts
@@ -21,7 +21,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.training.call_log import CallLog, EpisodeLog
 from skillweave.training.evaluation import episode_seeds, evaluate
 
-RECIPE = '''
+RECIPE = """
 from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill
 
 class Left(Skill):
@@ -44,7 +44,7 @@ hierarchy = Hierarchy(
     skill_steps=256,
     selector_steps=512,
 )
-'''
+"""
 
 
 def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> CallLog:
@@ -58,7 +58,9 @@ def test_calls_by_hand(tmp_path: Path) -> None:
     log = logged(tmp_path)
     assert log.labels == ("go", "stay")
     for i, episode in enumerate(log.episodes):
-        told = [(c.skill, c.start, c.steps, c.why, c.reward, c.own, c.succeeded) for c in episode.calls]
+        told = [
+            (c.skill, c.start, c.steps, c.why, c.reward, c.own, c.succeeded) for c in episode.calls
+        ]
         assert told == CALLS
         assert [c.obs.tolist() for c in episode.calls] == [[0, 0], [2, 2], [2, 5], [4, 7]]
         assert episode.rewards == [1, 2, 2, 2, 2, 3, 4, 5, 6]

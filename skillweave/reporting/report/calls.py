@@ -39,7 +39,11 @@ def _episode(episode: EpisodeLog, number: int, first: int | None) -> dict[str, A
         ]
         for c in episode.calls
     ]  # fmt: skip
-    told = {"number": number + 1, "seed": episode.seed, "return": round(episode.total, 2)}
+    told: dict[str, Any] = {
+        "number": number + 1,
+        "seed": episode.seed,
+        "return": round(episode.total, 2),
+    }
     told |= {"steps": len(episode.rewards), "cut": episode.cut, "frame": first}
     return told | {"totals": totals, "calls": calls}
 

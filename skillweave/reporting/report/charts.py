@@ -21,7 +21,11 @@ COMPLEMENT = ("gamma", "gae_lambda")
 def chart(description: str, height: int, **rest: Any) -> Spec:
     """What all charts have in common; as wide as the page lets it be."""
     schema = "https://vega.github.io/schema/vega-lite/v6.json"
-    size = {"width": "container", "height": height, "autosize": {"type": "fit", "contains": "padding"}}
+    size = {
+        "width": "container",
+        "height": height,
+        "autosize": {"type": "fit", "contains": "padding"},
+    }
     return {"$schema": schema, "description": description, **size, **rest}
 
 
@@ -70,13 +74,13 @@ def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
     shape = {"domain": list(skills), "range": [shapes[i % len(shapes)] for i in range(len(skills))]}
     legend = {"orient": "top", "title": None, "symbolOpacity": 1}
     encoding = {
-        "x": number_axis("x", ""), "y": number_axis("y", ""),
+        "x": number_axis("x", "", axis={"tickCount": 8}), "y": number_axis("y", ""),
         "color": {"field": "what", "type": "nominal", "scale": scale, "legend": legend},
         "shape": {"field": "what", "type": "nominal", "scale": shape},
         "tooltip": [{"field": "what", "title": "chosen"}, {"field": "x", "format": ".4~g"},
                     {"field": "y", "format": ".4~g"}],
     }  # fmt: skip
-    mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.7, "aria": False}
+    mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}
     return chart("What the selector chose over two coordinates", 360, mark=mark, encoding=encoding)
 
 
@@ -87,13 +91,17 @@ def family_tree(lineage: Lineage, color: str) -> Spec:
     for key, born in lineage.born.items():
         if born.fitness is None:
             continue
-        told = {"x": born.generation + 1, "y": round(born.fitness, 3), "won": key in path}
+        told: dict[str, Any] = {
+            "x": born.generation + 1,
+            "y": round(born.fitness, 3),
+            "won": key in path,
+        }
         what = "winner's line" if key in path else "other members"
         told |= {"member": born.member, "how": what_changed(born), "what": what}
         dots.append(told)
         parent = lineage.parent(born)
         if parent is not None and parent.fitness is not None:
-            ends = {"x2": parent.generation + 1, "y2": round(parent.fitness, 3)}
+            ends: dict[str, Any] = {"x2": parent.generation + 1, "y2": round(parent.fitness, 3)}
             lines.append({k: told[k] for k in ("x", "y", "won", "what")} | ends)
     axis = {"tickMinStep": 1, "format": "d"}
     x = number_axis("x", "generation", axis=axis)
@@ -146,7 +154,13 @@ def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: s
     rows = [{"x": b.generation + 1, "y": value(b)} for b in everyone]
     line = [{"x": b.generation + 1, "y": value(b)} for b in path]
     faint = {"type": "circle", "size": 20, "color": "#8d8d97", "aria": False}
-    bold = {"type": "line", "point": {"size": 35}, "strokeWidth": 2, "color": color, "aria": False}
+    bold = {
+        "type": "line",
+        "point": {"size": 35, "color": color},
+        "strokeWidth": 2,
+        "color": color,
+        "aria": False,
+    }
     layer = [{"data": {"values": rows}, "mark": faint}, {"data": {"values": line}, "mark": bold}]
     return chart(f"{setting_title(name)} by generation", 150, encoding=encoding, layer=layer)
 
@@ -161,7 +175,9 @@ def setting_title(name: str) -> str:
 def what_changed(born: Born) -> str:
     """What a member's mutation did, in words."""
     if not born.changes:
-        return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(born.mutation, born.mutation)
+        return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(
+            born.mutation, born.mutation
+        )
     return ", ".join(
         f"{k.removeprefix('network.')} {short(old)} → {short(new)}"
         for k, (old, new) in born.changes.items()

@@ -46,7 +46,9 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     data = {"curves": curves, "metrics": metrics_of(everything), "charts": {}}
     scores = [_scores(group, saved) for group in groups]
     if any(scores):
-        data["charts"] = {"scores-chart": group_charts.scores(keys, colors, _score_rows(groups, saved, scores))}
+        data["charts"] = {
+            "scores-chart": group_charts.scores(keys, colors, _score_rows(groups, saved, scores))
+        }
     missing = _missing(runs, saved)
     differ = differences(groups)
     context = {
@@ -54,7 +56,7 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
         "groups": [_group_words(g, s) for g, s in zip(groups, scores, strict=True)],
         "legend": [(g.key, g.name, c) for g, c in zip(groups, colors, strict=True)],
         "has_scores": any(scores),
-        "skills": [(g.key, g.name, rows) for g in groups if (rows := _skill_rows(g, saved))],
+        "skills": [(g.key, g.name, own) for g in groups if (own := _skill_rows(g, saved))],
         "runs": [_run_row(g, run, saved[run.path]) for g in groups for run in g.runs],
         "differences": differ[:MOST_DIFFERENCES],
         "more_differences": max(0, len(differ) - MOST_DIFFERENCES),
@@ -75,9 +77,13 @@ def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
         if not run.finished:
             found.append(f"{run.path} is not finished; to finish it: skillweave resume {run.path}")
         elif saved[run.path] is None:
-            found.append(f"{run.path} has no evaluation; to make one: skillweave evaluate {run.path}")
+            found.append(
+                f"{run.path} has no evaluation; to make one: skillweave evaluate {run.path}"
+            )
     played = {
-        (e.seed, e.deterministic, len(e.evaluation.returns)) for e in saved.values() if e is not None
+        (e.seed, e.deterministic, len(e.evaluation.returns))
+        for e in saved.values()
+        if e is not None
     }
     if len(played) > 1:
         found.append(
@@ -94,7 +100,12 @@ def _scores(group: Group, saved: Saved) -> list[float]:
 
 def _group_words(group: Group, scores: list[float]) -> dict[str, Any]:
     seeds = ", ".join(str(run.manifest["seed"]) for run in group.runs)
-    words: dict[str, Any] = {"key": group.key, "name": group.name, "seeds": seeds, "count": len(group.runs)}
+    words: dict[str, Any] = {
+        "key": group.key,
+        "name": group.name,
+        "seeds": seeds,
+        "count": len(group.runs),
+    }
     if not scores:
         return words | {"iqm": None}
     found = over_seeds(np.array(scores))

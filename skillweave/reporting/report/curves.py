@@ -39,7 +39,7 @@ def read_curves(run: RunDirectory) -> list[Curves]:
     found: dict[tuple[str, str], Curves] = {}
     stages = {entry["name"]: entry for entry in run.manifest["stages"]}
     for line in run.metrics():
-        stage = line.get("stage")
+        stage = str(line.get("stage"))
         if stage not in stages or "steps" not in line:
             continue
         for key, value in line.items():
@@ -47,8 +47,8 @@ def read_curves(run: RunDirectory) -> list[Curves]:
             if key in TOLD_BY_ALL or not number or not math.isfinite(value):
                 continue
             agent, dot, metric = key.rpartition(".")
-            at = stage, (agent if dot else stage)
-            curves = found.setdefault(at, Curves(*at))
+            agent = agent if dot else stage
+            curves = found.setdefault((stage, agent), Curves(stage, agent))
             curves.points.setdefault(metric, []).append((int(line["steps"]), float(value)))
     order = list(stages)
     return sorted(found.values(), key=lambda c: (order.index(c.stage), c.agent != c.stage, c.agent))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from skillweave.collecting.lengths import calls_from_json
 from skillweave.runs.directory import RunDirectory
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
@@ -28,7 +27,7 @@ def facts(run: RunDirectory) -> list[tuple[str, str]]:
     found += [("Seed", str(m["seed"])), ("Made", m["created"].replace("T", " "))]
     if m["kind"] == "hierarchy":
         found.append(("Skills", ", ".join(s["name"] for s in m["skills"])))
-        found.append(("A call lasts at most", f"{calls_from_json(m)} steps"))
+        found.append(("A call lasts", _call_length(m)))
         selector = m.get("selector")
         found.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
         found.append(("Learning", m.get("learn", "apart")))
@@ -37,6 +36,13 @@ def facts(run: RunDirectory) -> list[tuple[str, str]]:
         if m.get("reflexes"):
             found.append(("Reflexes", ", ".join(m["reflexes"])))
     return found
+
+
+def _call_length(m: Mapping[str, Any]) -> str:
+    if "call_lengths" in m:
+        return f"{plain(m['call_lengths'])} steps at most, as the selector chooses"
+    most = m["call_steps"]
+    return "until the skill stops" if most is None else f"at most {most} steps"
 
 
 def stage_rows(run: RunDirectory) -> list[dict[str, str]]:
@@ -74,7 +80,9 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
             found.append(f"The stage {name!r} has not begun.")
         elif entry["status"] == "training":
             far = f"after {steps[name]:,}" if name in steps else "before the first line of metrics"
-            found.append(f"The stage {name!r} is not finished: it stands {far} of {budget:,} steps.")
+            found.append(
+                f"The stage {name!r} is not finished: it stands {far} of {budget:,} steps."
+            )
     if found:
         found.append(
             "Only a finished run can be played, so there are no episodes and no film. To finish "
@@ -87,7 +95,14 @@ def settings(run: RunDirectory) -> dict[str, Any]:
     """Every setting of a run by its dotted name; neither its seed nor what came of it."""
     m = run.manifest
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
-    told = ("kind", "learn", "call_steps", "call_lengths", "interrupt", "greedy_skills")
+    told: tuple[str, ...] = (
+        "kind",
+        "learn",
+        "call_steps",
+        "call_lengths",
+        "interrupt",
+        "greedy_skills",
+    )
     told += ("reflexes", "reflexes_in_training", "cut_every", "eval_every", "eval_episodes")
     found |= {k: m[k] for k in told if k in m}
     for skill in m.get("skills", ()):

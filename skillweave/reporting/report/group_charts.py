@@ -19,7 +19,7 @@ def scores(names: Sequence[str], colors: Sequence[str], rows: dict[str, Any]) ->
     y = {"field": "group", "type": "nominal", "title": None, "sort": list(names),
          "axis": {"labelFontSize": 14, "labelFontWeight": "bold"}}  # fmt: skip
     color = _color("group", names, colors)
-    x = number_axis("x", "mean return of a run")
+    x = number_axis("x", "mean return of a run", axis={"tickCount": 8})
     told = [
         {"field": "group"},
         {"field": "x", "title": "interquartile mean", "format": ",.1f"},

@@ -12,6 +12,7 @@ from skillweave.reporting.report import facts
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
+
 @dataclass
 class Group:
     """Seeds of one recipe."""

@@ -51,5 +51,5 @@ def on_one_grid(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[Array, A
     if last < first:
         return None
     grid = np.unique(np.linspace(first, last, GRID).round())
-    table = [np.interp(grid, *zip(*curve, strict=True)) for curve in curves]
+    table = [np.interp(grid, *np.array(curve, float).T) for curve in curves]
     return grid, np.stack(table)

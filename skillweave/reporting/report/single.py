@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from skillweave.collecting.calls import SkillSet
 from skillweave.envs.make import EnvSpec
 from skillweave.messages import whole_number
 from skillweave.reporting.lineage import read_lineage
@@ -69,14 +68,12 @@ def play_episodes(
             film = make_film(spec, log.episodes, chosen_episodes(log.episodes, filmed))
         except SkillweaveError as error:
             missing.append(f"There is no film: {error}.")
-    found = getattr(policy, "skills", None)
-    skills = found.skills if isinstance(found, SkillSet) else ()
-    if any(isinstance(skill, RecordedSkill) for skill in skills):
+    if any(isinstance(skill, RecordedSkill) for skill in log.skills):
         missing.append(
             "Of the calls, neither the skills' own rewards nor their successes are known, as the "
             "run was loaded without the code of its skills: --recipe FILE.py gives it."
         )
-    wanted = [skill.color for skill in skills]
+    wanted = [skill.color for skill in log.skills]
     wanted += [None] * (len(log.labels) - len(wanted))
     colors = [color_of(i, color) for i, color in enumerate(wanted)]
     return Played(score, log, film, missing, colors)
@@ -155,9 +152,7 @@ def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     return {name: charts.hex_of(color) for name, color in found.items()}
 
 
-def curve_data(
-    all_curves: Sequence[Curves], colors: Mapping[str, str]
-) -> list[dict[str, Any]]:
+def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
     """The curves with their charts, as plain JSON."""
     usual = charts.hex_of(color_of(1))
     return [
@@ -223,9 +218,7 @@ def _how(whose: str, seed: int, deterministic: bool) -> str:
     return f"{whose} ({'greedy' if deterministic else 'sampled'}, seed {seed})"
 
 
-def _lineages(
-    run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
-) -> dict[str, Any]:
+def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
     """A section for each stage whose population evolved."""
     sections, data["trees"] = [], []
     for entry in run.manifest["stages"]:
@@ -241,7 +234,9 @@ def _lineages(
             (b.generation + 1, b.member, charts.what_changed(b), number(b.fitness))
             for b in lineage.path(lineage.winner)
         ]
-        names = [(charts.setting_title(k), charts.short(lineage.winner.settings[k])) for k, _ in paths]
+        names = [
+            (charts.setting_title(k), charts.short(lineage.winner.settings[k])) for k, _ in paths
+        ]
         sections.append({"stage": entry["name"], "line": line, "settings": names})
     return {"lineages": sections}
 

@@ -54,6 +54,8 @@
       const spec = structuredClone(curve.spec);
       // A run's points are steps and a value; a group's have an interval and the group's name, too.
       spec.data = { values: points.map(([x, y, lo, hi, what]) => ({ x, y, lo, hi, what })) };
+      // A line of one point is not to be seen.
+      if (points.length < 3) for (const { mark } of spec.layer) if (mark.type === "line") mark.point = true;
       const title = metric.replaceAll("_", " ");
       for (const part of [spec, ...(spec.layer ?? [])]) if (part.encoding?.y) part.encoding.y.title = title;
       draw(element, spec);
@@ -117,7 +119,11 @@
 
   if (!data.episodes) return;
   const video = $("video");
-  const longest = Math.max(...data.episodes.map((e) => e.steps));
+  const shownFirst = (e, place) => (data.episodes[0].frame === null ? place < 3 : e.frame !== null);
+  // Bars of one list have one scale.
+  const longest = [true, false].map((first) =>
+    Math.max(1, ...data.episodes.filter((e, place) => shownFirst(e, place) === first).map((e) => e.steps)));
+  const room = (name) => (name.length < 6 ? "few" : name.length < 11 ? "some" : "many");
   const tracks = []; // by place in data.episodes: the listbox and its options
   let chosen = { episode: -1, call: -1 };
 
@@ -139,7 +145,7 @@
       `${called ? ` (${called})` : ""}: return ${signed(episode.return)}, ${episode.steps} steps, ${count}${cut}`);
     const track = make("div", {
       class: "track", role: "listbox", tabindex: 0, "aria-labelledby": `episode-${place}`,
-      "aria-orientation": "horizontal", style: `width:${(100 * episode.steps) / longest}%`,
+      "aria-orientation": "horizontal", style: `width:${(100 * episode.steps) / longest[shownFirst(episode, place) ? 0 : 1]}%`,
     });
     const options = episode.calls.map((call, i) => {
       const [skill, start, steps] = call;
@@ -148,7 +154,7 @@
         "aria-label": words(call, i),
         style: `left:${(100 * start) / episode.steps}%;width:${(100 * steps) / episode.steps}%`,
       }, make("span", { style: `background:${data.colors[skill]};color:${data.inks[skill]}` },
-        make("b", {}, data.labels[skill])));
+        make("b", { class: room(data.labels[skill]) }, data.labels[skill])));
       option.addEventListener("click", () => choose(place, i));
       return option;
     });
@@ -219,8 +225,7 @@
   };
 
   data.episodes.forEach((episode, place) => {
-    const first = data.episodes[0].frame === null ? place < 3 : episode.frame !== null;
-    (first ? $("timelines") : $("more-timelines")).append(timeline(episode, place));
+    (shownFirst(episode, place) ? $("timelines") : $("more-timelines")).append(timeline(episode, place));
   });
   const more = $("more-timelines").children.length;
   $("more").hidden = !more;
