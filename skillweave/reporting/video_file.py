@@ -86,7 +86,8 @@ class _Mp4:
             raw = f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {size} -r {self._fps} -i -"
             coded = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
             if self._most_bits is not None:
-                coded += f" -maxrate {self._most_bits} -bufsize {self._most_bits}"
+                most = self._most_bits
+                coded += f" -preset veryfast -maxrate {most} -bufsize {most // 2}"
             command = [self._ffmpeg, *raw.split(), *coded.split(), str(self._path)]
             self._process = subprocess.Popen(command, stdin=PIPE, stderr=PIPE)
         try:
