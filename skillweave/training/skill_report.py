@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,11 @@ class SkillReport:
     return_sum: float | None
     """Sum of its own reward over its steps, not discounted; of the environment's reward where the
     skill defines none. None: not known."""
+    first: Count = field(default=0, compare=False)
+    """Calls with which an episode began."""
+    followed: dict[str, Count] = field(default_factory=dict, compare=False)
+    """How many of its calls a call of each skill followed; the others were the last of an episode.
+    Empty: not known, as in files of older versions."""
 
     @property
     def length_mean(self) -> float | None:
@@ -107,6 +112,9 @@ class SkillTally:
         self._steps, self._calls = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._ended = np.zeros((count, len(Why)), np.int64)
         self._succeeded = np.zeros(count, np.int64)
+        # By skill before (the first row: none) and skill after.
+        self._next = np.zeros((1 + count, count), np.int64)
+        self._before = np.zeros(episodes, np.int64)
         # One sum for each episode, so the result does not depend on which are played together.
         self._returns = np.zeros((episodes, count))
 
@@ -116,7 +124,10 @@ class SkillTally:
         if acting is None:
             return
         self._steps += np.bincount(acting, minlength=count)
-        self._calls += np.bincount(acting[played.begun], minlength=count)
+        called, whose = acting[played.begun], played.episode[played.begun]
+        self._calls += np.bincount(called, minlength=count)
+        np.add.at(self._next, (self._before[whose], called), 1)
+        self._before[whose] = 1 + called
         own = played.reward
         if self.skills is not None:
             judged = judge(self.skills, played)
@@ -132,7 +143,8 @@ class SkillTally:
         return {
             name: SkillReport(
                 int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
-                float(returns[i]) if self._known(i) else None,
+                float(returns[i]) if self._known(i) else None, int(self._next[0, i]),
+                dict(zip(self.labels, self._next[1 + i].tolist(), strict=True)),
             )
             for i, name in enumerate(self.labels)
         }  # fmt: skip

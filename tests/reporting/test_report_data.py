@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from skillweave.reporting.report.curves import read_curves, thinned
 from skillweave.reporting.report.film import HOLD, make_film
 from skillweave.reporting.report.groups import grouped
 from skillweave.reporting.report.seeds import on_one_grid, over_seeds
+from skillweave.reporting.report.skills_table import transition_rows, transitions
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.call_log import CallLog, EpisodeLog
 from skillweave.training.evaluation import episode_seeds, evaluate
@@ -47,6 +49,18 @@ hierarchy = Hierarchy(
 """
 
 
+def test_transitions_by_hand(tmp_path: Path) -> None:
+    run = declare().train(tmp_path / "run", quiet=True)
+    skills = run.evaluate(2).skills
+    assert transitions(skills) == [[2, 0, 0], [2, 2, 2], [2, 0, 0]]
+    older = {name: replace(report, first=0, followed={}) for name, report in skills.items()}
+    assert transitions(older) is None
+    start, go, stay = transition_rows(("go", "stay"), transitions(skills) or [])
+    assert [cell["share"] for cell in start["cells"]] == [1, 0, 0]
+    assert [cell["count"] for cell in go["cells"]] == ["2", "2", "2"]
+    assert (stay["name"], stay["total"]) == ("stay", 2)
+
+
 def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> CallLog:
     run = declare(env).train(tmp_path / "run", quiet=True)
     log = CallLog(run.policy, episode_seeds(0, episodes))
@@ -65,7 +79,6 @@ def test_calls_by_hand(tmp_path: Path) -> None:
         assert [c.obs.tolist() for c in episode.calls] == [[0, 0], [2, 2], [2, 5], [4, 7]]
         assert episode.rewards == [1, 2, 2, 2, 2, 3, 4, 5, 6]
         assert (episode.total, episode.seed, episode.cut) == (27, episode_seeds(0, 2)[i], False)
-    assert calls.transitions(log) == [[2, 0, 0], [2, 2, 2], [2, 0, 0]]
 
 
 def test_decisions_are_coordinates_the_skill_and_its_success(tmp_path: Path) -> None:

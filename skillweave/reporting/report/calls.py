@@ -48,23 +48,6 @@ def _episode(episode: EpisodeLog, number: int, first: int | None) -> dict[str, A
     return told | {"totals": totals, "calls": calls}
 
 
-def transitions(log: CallLog) -> list[list[int]]:
-    """How often each skill followed another: (1 + S, S + 1).
-
-    The first row is an episode's start, the last column its end.
-    """
-    skills = len(log.labels)
-    counts = np.zeros((1 + skills, skills + 1), int)
-    for episode in log.episodes:
-        before = 0
-        for call in episode.calls:
-            counts[before, call.skill] += 1
-            before = 1 + call.skill
-        counts[before, skills] += 1
-    found: list[list[int]] = counts.tolist()
-    return found
-
-
 def decision_data(log: CallLog) -> dict[str, Any]:
     """What was chosen at which observation: names of coordinates, and a row for each decision.
 

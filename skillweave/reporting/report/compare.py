@@ -15,7 +15,13 @@ from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
 from skillweave.reporting.report.groups import Group, differences, grouped
 from skillweave.reporting.report.page import library, write_page
 from skillweave.reporting.report.seeds import OverSeeds, on_one_grid, over_seeds
-from skillweave.reporting.report.skills_table import NOTHING, number, percent
+from skillweave.reporting.report.skills_table import (
+    NOTHING,
+    number,
+    percent,
+    transition_rows,
+    transitions,
+)
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
@@ -56,7 +62,11 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
         "groups": [_group_words(g, s) for g, s in zip(groups, scores, strict=True)],
         "legend": [(g.key, g.name, c) for g, c in zip(groups, colors, strict=True)],
         "has_scores": any(scores),
-        "skills": [(g.key, g.name, own) for g in groups if (own := _skill_rows(g, saved))],
+        "skills": [
+            (g.key, g.name, own, _followed(g, saved))
+            for g in groups
+            if (own := _skill_rows(g, saved))
+        ],
         "runs": [_run_row(g, run, saved[run.path]) for g in groups for run in g.runs],
         "differences": differ[:MOST_DIFFERENCES],
         "more_differences": max(0, len(differ) - MOST_DIFFERENCES),
@@ -151,6 +161,17 @@ def _skill_rows(group: Group, saved: Saved) -> list[dict[str, str]]:
             "return": _told([o["return_mean"] for o in own], number),
         })  # fmt: skip
     return rows
+
+
+def _followed(group: Group, saved: Saved) -> list[dict[str, Any]]:
+    """Transitions between skills, summed over the group's seeds; none where one does not know."""
+    reports = [e.evaluation.skills for run in group.runs if (e := saved[run.path])]
+    counts = [transitions(skills) for skills in reports]
+    known = [c for c in counts if c is not None]
+    if not known or len(known) < len(counts):
+        return []
+    rows: list[list[int]] = np.sum(known, axis=0).tolist()
+    return transition_rows(list(reports[0]), rows)
 
 
 def _told(values: Sequence[float | None], say: Any) -> str:

@@ -17,7 +17,6 @@ from skillweave.reporting.report.calls import (
     chosen_episodes,
     decision_data,
     episode_data,
-    transitions,
 )
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves, thinned
 from skillweave.reporting.report.film import Film, make_film
@@ -28,6 +27,7 @@ from skillweave.reporting.report.skills_table import (
     percent,
     skill_rows,
     transition_rows,
+    transitions,
 )
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill
@@ -124,7 +124,7 @@ def write_report(
     context = _words(run, missing) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
-    context |= {"episodes": 0, "filmed": 0, "legend": [], "transitions": [], "has_skills": False}
+    context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False}
     if played is not None:
         context |= _skills(played)
         data |= _episodes(played)
@@ -195,8 +195,9 @@ def _scores(
         score = saved.evaluation
         words = _how("of the run's evaluation", saved.seed, saved.deterministic)
     if score is None:
-        return {"score": None, "skill_table": []}
+        return {"score": None, "skill_table": [], "transitions": []}
     told = score.to_json()
+    counts = transitions(score.skills)
     return {
         "score": {
             "mean": number(told["mean"]),
@@ -211,6 +212,7 @@ def _scores(
             "of": f"{told['episodes']} episodes {words}",
         },
         "skill_table": skill_rows(score.skills),
+        "transitions": [] if counts is None else transition_rows(list(score.skills), counts),
     }
 
 
@@ -246,14 +248,11 @@ def _skills(played: Played) -> dict[str, Any]:
     log = played.log
     named = zip(log.labels, played.colors, strict=True)
     legend = [(k, charts.hex_of(c), charts.ink_on(c)) for k, c in named]
-    has_skills = log.labels != (AGENT,)
-    rows = transition_rows(log.labels, transitions(log)) if has_skills else []
     return {
         "legend": legend,
-        "transitions": rows,
         "episodes": len(log.episodes),
         "filmed": 0 if played.film is None else len(played.film.first),
-        "has_skills": has_skills,
+        "has_skills": log.labels != (AGENT,),
     }
 
 

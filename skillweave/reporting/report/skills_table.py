@@ -36,12 +36,29 @@ def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
     return rows
 
 
-def transition_rows(labels: Sequence[str], counts: Sequence[Sequence[int]]) -> list[dict[str, Any]]:
+def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
+    """How often each skill followed another: (1 + S, S + 1); None: not known.
+
+    The first row is an episode's start, the last column its end.
+    """
+    names = list(reports)
+    if not names or not all(set(r.followed) == set(names) for r in reports.values()):
+        return None
+    rows = [[reports[name].first for name in names] + [0]]
+    for report in reports.values():
+        after = [report.followed[name] for name in names]
+        rows.append([*after, report.calls - sum(after)])
+    return rows
+
+
+def transition_rows(
+    labels: Sequence[str], counts: Sequence[Sequence[float]]
+) -> list[dict[str, Any]]:
     """A row for each skill and for an episode's start: what followed, as counts and shares."""
     rows = []
     for name, row in zip(("start of an episode", *labels), counts, strict=True):
         total = sum(row)
-        cells = [{"count": f"{n:,}", "share": n / total if total else 0.0} for n in row]
+        cells = [{"count": f"{n:,.0f}", "share": n / total if total else 0.0} for n in row]
         rows.append({"name": name, "total": total, "cells": cells})
     return rows
 
