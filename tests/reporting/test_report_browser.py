@@ -223,6 +223,10 @@ def test_charts_follow_what_is_chosen(browser: Any, pages: dict[str, Path]) -> N
     page.wait_for_function("document.getElementById('choices').textContent.includes('obs[2]')")
     page.select_option("#hue", "success")
     page.wait_for_function("document.getElementById('choices').textContent.includes('no success')")
+    page.locator("#curve-2 svg").scroll_into_view_if_needed()
+    page.hover("#curve-2 svg", position={"x": 150, "y": 60})
+    page.wait_for_selector("#vg-tooltip-element.visible")
+    assert "environment steps" in page.inner_text("#vg-tooltip-element")
     page.select_option("#metric", "entropy")
     page.wait_for_function("document.getElementById('curve-0').textContent.includes('entropy')")
     ink = "getComputedStyle(document.querySelector('#choices .role-axis-label text')).fill"

@@ -122,6 +122,28 @@ def test_an_environment_that_does_not_repeat_itself_is_told(tmp_path: Path) -> N
         make_film(EnvSpec(Moody, engine="sync"), log.episodes, [0])
 
 
+class Unseen(Walkway):
+    """Has no pictures."""
+
+    metadata: dict[str, Any] = {}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+
+
+def test_an_environment_without_pictures_has_no_film_and_all_the_rest(tmp_path: Path) -> None:
+    pytest.importorskip("vl_convert")
+    run = declare(Unseen).train(tmp_path / "run", quiet=True)
+    told = run.report(episodes=2)
+    (missing,) = told["missing"]
+    assert missing.startswith("There is no film: ")
+    assert told["path"] == str(tmp_path / "run" / "report.html")
+    text = (tmp_path / "run" / "report.html").read_text()
+    assert "Episodes, call by call" in text
+    with pytest.raises(SkillweaveError, match="episodes is 0"):
+        run.report(episodes=0)
+
+
 def test_interquartile_means_and_intervals_over_seeds() -> None:
     alone = over_seeds(np.array([[1.0, 2.0]]))
     assert (alone.mean.tolist(), alone.low, alone.high) == ([1, 2], None, None)

@@ -57,8 +57,6 @@ def play_episodes(
     policy: Policy, spec: EnvSpec, episodes: int, filmed: int, seed: int, deterministic: bool
 ) -> Played:
     """Play episodes with seeds that training never used, and film some of them."""
-    episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
-    filmed = whole_number(filmed, "films", 0)
     log = CallLog(policy, episode_seeds(seed, episodes))
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
     score = evaluate(policy, spec, watch=log.add, **how)
@@ -67,7 +65,7 @@ def play_episodes(
         try:
             film = make_film(spec, log.episodes, chosen_episodes(log.episodes, filmed))
         except SkillweaveError as error:
-            missing.append(f"There is no film: {error}.")
+            missing.append(f"There is no film: {_sentence(error)}")
     if any(isinstance(skill, RecordedSkill) for skill in log.skills):
         missing.append(
             "Of the calls, neither the skills' own rewards nor their successes are known, as the "
@@ -109,15 +107,20 @@ def write_report(
         MissingExtra: the extra 'report' is not installed.
     """
     began = time.perf_counter()
+    episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
+    filmed = whole_number(filmed, "films", 0)
     library()  # a missing extra is said before anything is played
     all_curves = read_curves(run)
     missing = facts.missing_stages(run, _reached(all_curves))
     missing += [why_not] if why_not and run.finished else []
     played = None
     if policy is not None and spec is not None:
-        played = play_episodes(policy, spec, episodes, filmed, seed, deterministic)
-        missing += played.missing
-    if not all_curves:
+        try:
+            played = play_episodes(policy, spec, episodes, filmed, seed, deterministic)
+            missing += played.missing
+        except SkillweaveError as error:
+            missing.append(f"There are no episodes and no film: {_sentence(error)}")
+    if not all_curves and run.manifest["stages"]:
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
     data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
@@ -131,6 +134,10 @@ def write_report(
     film = None if played is None else played.film
     told = write_page(path, "report.html", context, {**data, "why": WHY}, film)
     return told | {"seconds": round(time.perf_counter() - began, 2), "missing": missing}
+
+
+def _sentence(error: SkillweaveError) -> str:
+    return f"{str(error).rstrip('.')}."
 
 
 def _reached(all_curves: Sequence[Curves]) -> dict[str, int]:
