@@ -16,6 +16,7 @@ from skillweave.cli import main
 from skillweave.reporting.report import calls, charts
 from skillweave.reporting.report.curves import read_curves, thinned
 from skillweave.reporting.report.film import HOLD, make_film
+from skillweave.reporting.report.group_charts import scores
 from skillweave.reporting.report.groups import grouped
 from skillweave.reporting.report.seeds import on_one_grid, over_seeds
 from skillweave.reporting.report.skills_table import transition_rows, transitions
@@ -160,6 +161,14 @@ def test_interquartile_means_and_intervals_over_seeds() -> None:
     assert ((width > 0.2) & (width < 0.6)).all()
     same = over_seeds(np.full(5, 3.0))
     assert (same.mean, same.low, same.high) == (3, 3, 3)
+
+
+def test_groups_of_one_seed_have_no_interval_to_draw() -> None:
+    dot, bar = {"group": "A", "x": 1.0, "seed": 0}, {"group": "A", "x": 1.0}
+    alone = scores("A", ["#000"], {"dots": [dot], "bars": [bar]})
+    assert [layer["mark"]["type"] for layer in alone["layer"]] == ["point", "tick"]
+    several = scores("A", ["#000"], {"dots": [dot], "bars": [bar | {"low": 0.0, "high": 2.0}]})
+    assert [layer["mark"]["type"] for layer in several["layer"]] == ["rule", "point", "tick"]
 
 
 def test_curves_of_several_seeds_on_one_grid() -> None:

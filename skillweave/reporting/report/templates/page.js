@@ -49,7 +49,7 @@
       const element = $(`curve-${i}`);
       const points = curve.points[metric];
       element.hidden = !points;
-      element.nextElementSibling.hidden = Boolean(points);
+      element.parentElement.hidden = !points; // this agent has no such metric
       if (!points) return;
       const spec = structuredClone(curve.spec);
       // A run's points are steps and a value; a group's have an interval and the group's name, too.
