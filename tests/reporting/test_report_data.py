@@ -82,6 +82,21 @@ def test_calls_by_hand(tmp_path: Path) -> None:
         assert (episode.total, episode.seed, episode.cut) == (27, episode_seeds(0, 2)[i], False)
 
 
+def test_many_calls_are_shown_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = logged(tmp_path, 3)
+    shown, missing = calls.episode_data(log, None)
+    assert ([e["number"] for e in shown], missing) == ([1, 2, 3], [])
+    assert shown[0]["calls"] == [list(call) for call in CALLS]
+    monkeypatch.setattr(calls, "MOST_CALLS", 5)
+    monkeypatch.setattr(calls, "MOST_CALLS_OF_ONE", 3)
+    shown, missing = calls.episode_data(log, None)
+    assert [len(e["calls"]) for e in shown] == [3]
+    assert missing == [
+        "Of the 4 calls of episode 1, 3 are shown.",
+        "1 of 3 episodes are shown, as all have too many calls.",
+    ]
+
+
 def test_decisions_are_coordinates_the_skill_and_its_success(tmp_path: Path) -> None:
     found = calls.decision_data(logged(tmp_path, 1))
     assert found["names"] == ["obs[0]", "obs[1]", "step of the episode"]

@@ -14,6 +14,7 @@ from skillweave.types import Array
 MOST_COORDINATES = 16
 LARGEST_VECTOR = 64  # numbers of an observation; of a larger one (an image) none is a coordinate
 MOST_DECISIONS = 2_000
+MOST_CALLS, MOST_CALLS_OF_ONE = 6_000, 1_500  # on the page: of all episodes, and of each
 
 
 def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
@@ -23,11 +24,30 @@ def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
     return [int(i) for i in order[places]]
 
 
-def episode_data(log: CallLog, film: Film | None) -> list[dict[str, Any]]:
-    """Each episode with its calls; those in the film come first, in its order."""
+def episode_data(log: CallLog, film: Film | None) -> tuple[list[dict[str, Any]], list[str]]:
+    """Each episode with its calls, and sentences on what is left out.
+
+    Those in the film come first, in its order.
+    """
     first = {} if film is None else film.first
     numbers = [*first, *(i for i in range(len(log.episodes)) if i not in first)]
-    return [_episode(log.episodes[i], i, first.get(i)) for i in numbers]
+    shown: list[dict[str, Any]] = []
+    missing: list[str] = []
+    left = MOST_CALLS
+    for i in numbers:
+        count = len(log.episodes[i].calls)
+        part = min(count, MOST_CALLS_OF_ONE)
+        if part > left and shown:
+            continue
+        left -= part
+        shown.append(_episode(log.episodes[i], i, first.get(i)))
+        if part < count:
+            missing.append(f"Of the {count:,} calls of episode {i + 1}, {part:,} are shown.")
+    if len(shown) < len(numbers):
+        missing.append(
+            f"{len(shown)} of {len(numbers)} episodes are shown, as all have too many calls."
+        )
+    return shown, missing
 
 
 def _episode(episode: EpisodeLog, number: int, first: int | None) -> dict[str, Any]:
@@ -37,7 +57,7 @@ def _episode(episode: EpisodeLog, number: int, first: int | None) -> dict[str, A
             c.skill, c.start, c.steps, c.why, round(c.reward, 2),
             None if c.own is None else round(c.own, 2), c.succeeded,
         ]
-        for c in episode.calls
+        for c in episode.calls[:MOST_CALLS_OF_ONE]
     ]  # fmt: skip
     told: dict[str, Any] = {
         "number": number + 1,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from skillweave.envs.checks import LONGEST_FILM
 from skillweave.envs.make import EnvSpec
 from skillweave.messages import whole_number
 from skillweave.reporting.lineage import read_lineage
@@ -47,6 +48,8 @@ class Played:
     score: Evaluation
     log: CallLog
     film: Film | None
+    shown: list[dict[str, Any]]
+    """The episodes as plain JSON."""
     missing: list[str]
     """Sentences on what there is not."""
     colors: list[RGB]
@@ -59,7 +62,7 @@ def play_episodes(
     """Play episodes with seeds that training never used, and film some of them."""
     log = CallLog(policy, episode_seeds(seed, episodes))
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
-    score = evaluate(policy, spec, watch=log.add, **how)
+    score = evaluate(policy, spec, watch=log.add, max_steps=LONGEST_FILM, **how)
     film, missing = None, []
     if filmed:
         try:
@@ -74,7 +77,8 @@ def play_episodes(
     wanted = [skill.color for skill in log.skills]
     wanted += [None] * (len(log.labels) - len(wanted))
     colors = [color_of(i, color) for i, color in enumerate(wanted)]
-    return Played(score, log, film, missing, colors)
+    shown, left_out = episode_data(log, film)
+    return Played(score, log, film, shown, missing + left_out, colors)
 
 
 def write_report(
@@ -271,7 +275,7 @@ def _episodes(played: Played) -> dict[str, Any]:
         "labels": list(log.labels),
         "colors": colors,
         "inks": [charts.ink_on(c) for c in played.colors],
-        "episodes": episode_data(log, played.film),
+        "episodes": played.shown,
     }
     if played.film is not None:
         found["film"] = {"fps": played.film.fps, "every": played.film.every}
