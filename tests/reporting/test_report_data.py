@@ -261,6 +261,7 @@ def test_an_unfinished_run_is_shown_as_far_as_it_is(
     text = out.read_text()
     assert told["bytes"] == len(text.encode())
     assert 'id="curve-0"' in text
+    assert "256 of 256" in text  # the steps of the stage under way
     assert 'id="video"' not in text
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from skillweave.reporting.report.skills_table import number
 from skillweave.runs.directory import RunDirectory
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
@@ -42,11 +43,13 @@ def _call_length(m: Mapping[str, Any]) -> str:
     if "call_lengths" in m:
         return f"{plain(m['call_lengths'])} steps at most, as the selector chooses"
     most = m["call_steps"]
-    return "until the skill stops" if most is None else f"at most {most} steps"
+    if most is None:
+        return "until the skill stops"
+    return "1 step" if most == 1 else f"at most {most:,} steps"
 
 
-def stage_rows(run: RunDirectory) -> list[dict[str, str]]:
-    """A row for each stage: how long it took, and how it ended."""
+def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, str]]:
+    """A row for each stage: how long it took, and how it ended; ``steps``: how far it is."""
     rows = []
     for entry in run.manifest["stages"]:
         final = (entry.get("final") or {}).get("return")
@@ -58,14 +61,15 @@ def stage_rows(run: RunDirectory) -> list[dict[str, str]]:
             notes.append(f"return {before:.1f} before, {after:.1f} after: kept {kept['kept']}")
         if winner := entry.get("winner"):
             notes.append(f"winner: member {winner['member']}, fitness {winner['fitness']:.1f}")
-        done = "steps" in entry
+        done = entry["status"] == "done"
+        far = f"{steps.get(entry['name'], 0):,} of {entry['budget']:,}"
         rows.append({
             "name": entry["name"], "kind": entry["kind"],
             "algorithm": entry["algorithm"].get("algorithm", "?"), "status": entry["status"],
-            "steps": f"{entry['steps']:,}" if done else f"– of {entry['budget']:,}",
+            "steps": f"{entry['steps']:,}" if done else far,
             "seconds": f"{entry['seconds']:,.1f}" if done else "–",
             "speed": f"{entry['steps_per_second']:,.0f}" if "steps_per_second" in entry else "–",
-            "return": "–" if final is None else f"{final:,.1f}",
+            "return": number(final),
             "notes": "; ".join(notes),
         })  # fmt: skip
     return rows

@@ -115,7 +115,8 @@ def write_report(
     filmed = whole_number(filmed, "films", 0)
     library()  # a missing extra is said before anything is played
     all_curves = read_curves(run)
-    missing = facts.missing_stages(run, _reached(all_curves))
+    reached = _reached(all_curves)
+    missing = facts.missing_stages(run, reached)
     missing += [why_not] if why_not and run.finished else []
     played = None
     if policy is not None and spec is not None:
@@ -128,7 +129,7 @@ def write_report(
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
     data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
-    context = _words(run, missing) | _scores(run, played, seed, deterministic)
+    context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
     context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False}
@@ -178,17 +179,17 @@ def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[
     ]
 
 
-def _words(run: RunDirectory, missing: list[str]) -> dict[str, Any]:
+def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) -> dict[str, Any]:
     m = run.manifest
     return {
         "title": facts.name_of(run),
         "kind": "hierarchy" if m["kind"] == "hierarchy" else "plain agent",
         "env": m["env"],
         "facts": facts.facts(run),
-        "stages": facts.stage_rows(run),
+        "stages": facts.stage_rows(run, reached),
         "settings": [(k, facts.plain(v)) for k, v in facts.settings(run).items()],
         "versions": list(m["versions"].items()),
-        "steps": sum(entry.get("steps", 0) for entry in m["stages"]),
+        "steps": sum(e.get("steps", reached.get(e["name"], 0)) for e in m["stages"]),
         "training_seconds": sum(entry.get("seconds", 0.0) for entry in m["stages"]),
         "missing": missing,
         "finished": run.finished,

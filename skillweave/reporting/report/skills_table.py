@@ -70,4 +70,4 @@ def percent(value: float | None) -> str:
 
 def number(value: float | None) -> str:
     """A number with one decimal."""
-    return NOTHING if value is None else f"{value:,.1f}".replace("-", "−")
+    return NOTHING if value is None else f"{round(value, 1) + 0.0:,.1f}".replace("-", "−")
