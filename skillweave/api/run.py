@@ -12,6 +12,7 @@ from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
 from skillweave.messages import short, whole_number
+from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import color_of, render_policy
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
@@ -155,6 +156,42 @@ class Run:
             SkillweaveError: a part cannot be exported; the message says which, and what to do.
         """
         return write_export(as_path(path, "path"), self.policy, self.declaration.spec.name)
+
+    def report(
+        self,
+        path: str | Path | None = None,
+        *,
+        episodes: int = 20,
+        films: int = 3,
+        seed: int = 0,
+        deterministic: bool = True,
+    ) -> dict[str, Any]:
+        """Write one HTML file about the run: film, calls, skills, curves, settings.
+
+        Args:
+            path: the file; None: ``report.html`` in the run.
+            episodes: to play, with seeds that training never used.
+            films: how many of them to film, from the worst to the best.
+            seed: picks the episodes.
+            deterministic: act greedily, else sample.
+
+        Returns:
+            ``path``, ``bytes``, ``seconds``, and ``missing``: sentences on what is not in it.
+
+        Raises:
+            SkillweaveError: this is no run but a weights file, or the file cannot be written.
+        """
+        run = RunDirectory.open(self.path)
+        return write_report(
+            run,
+            run.path / "report.html" if path is None else as_path(path, "path"),
+            self.policy,
+            self.declaration.spec,
+            episodes=episodes,
+            filmed=films,
+            seed=seed,
+            deterministic=deterministic,
+        )
 
     def save_weights(self, path: str | Path) -> Path:
         """Write every policy into one file for ``Hierarchy.load_weights``."""

@@ -112,11 +112,17 @@ class Evaluation:
 
 def interquartile_mean(values: Array) -> float:
     """Mean of the middle half (Agarwal et al. 2021); the ends of the half count in part."""
-    x = np.sort(np.asarray(values, float))
+    return float(interquartile_means(values))
+
+
+def interquartile_means(values: Array) -> Array:
+    """The same over the first axis of an array (n, …): (…)."""
+    x = np.sort(np.asarray(values, float), axis=0)
     n = len(x)
     cut = n / 4
     weight = np.clip(np.minimum(np.arange(1, n + 1) - cut, n - cut - np.arange(n)), 0.0, 1.0)
-    return float((weight * x).sum() / weight.sum())
+    found: Array = np.tensordot(weight, x, axes=1) / weight.sum()
+    return found
 
 
 def evaluate(
@@ -128,6 +134,7 @@ def evaluate(
     deterministic: bool = True,
     num_envs: int = 100,
     max_steps: int | None = None,
+    watch: Callable[[Played], None] | None = None,
 ) -> Evaluation:
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
@@ -139,6 +146,7 @@ def evaluate(
         num_envs: environments side by side; does not change the result of a greedy policy.
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
             as many as the environment's own time limit, or ``LONGEST_EPISODE``.
+        watch: is shown every step that is played.
 
     Raises:
         SkillweaveError: the policy was made for other spaces.
@@ -160,19 +168,29 @@ def evaluate(
             policy = policy.bind(*spaces, "the policy")
         _check_spaces(policy, *spaces, spec.name)
         engine.reset(0)
-        seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+        seeds = episode_seeds(seed, episodes)
         moments = play(
             policy,
             SeededEpisodes(engine, seeds, limit),
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
-        return replaced(_scored(policy, episodes, moments), threshold=threshold)
+        return replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
     finally:
         engine.close()
 
 
-def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluation:
+def episode_seeds(seed: int, episodes: int) -> list[int]:
+    """The seeds that an evaluation's episodes start from; training uses none of them."""
+    return [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+
+
+def _scored(
+    policy: Policy,
+    episodes: int,
+    moments: Iterator[Played],
+    watch: Callable[[Played], None] | None,
+) -> Evaluation:
     """The scores of episodes as they are played."""
     returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
     tally = SkillTally(policy, episodes)
@@ -181,6 +199,8 @@ def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluat
         lengths[played.episode] += played.lasted
         cut += int(played.cut.sum())
         tally.add(played)
+        if watch is not None:
+            watch(played)
     return Evaluation(tuple(returns.tolist()), tuple(lengths.tolist()), None, tally.reports(), cut)
 
 
