@@ -2,9 +2,10 @@
 
     python -m benchmarks.together [CASE …] [--seeds 0 1 2 3 4] [--size 8x8] [--steps 500000]
 
-Every case has the same number of environment steps in all. Scores are 100 sampled episodes with
-seeds that training never saw. Two runs go side by side (``--processes``), so the seconds are those
-of a busy machine.
+Every case has the same number of environment steps in all. Scores are 100 sampled episodes of
+MiniGrid's own environment, with seeds that training never saw. Training steps EnvPool's, or with
+``--engine sync`` MiniGrid's own. Two runs go side by side (``--processes``), so the seconds are
+those of a busy machine.
 """
 
 from __future__ import annotations
@@ -26,21 +27,22 @@ from skillweave import Hierarchy, Lengths, SkillweaveError, Together
 
 FLOOR = Together(floor=1.0, floor_final=0.1)
 
+FLOORS = {"floor": FLOOR.floor, "floor_final": FLOOR.floor_final}
 declare = functools.partial(doorkey.declare, workers=1)  # runs go side by side
 
 
-def apart(size: str, steps: int) -> Hierarchy:
-    """Three skills apart, then the selector."""
-    selector = doorkey.algorithm(floor=FLOOR.floor, floor_final=FLOOR.floor_final)
+def apart(size: str, steps: int, **how: Any) -> Hierarchy:
+    """Three skills apart, each after calls of those before, then the selector."""
+    asked = {"start_calls": 8, "selector": doorkey.algorithm(**FLOORS)} | how
     return declare(
-        size, learn="apart", skill_steps=steps // 5, selector_steps=2 * steps // 5,
-        selector=selector,
-    )  # fmt: skip
+        size, learn="apart", skill_steps=steps // 5, selector_steps=2 * steps // 5, **asked
+    )
 
 
-CASES: dict[str, Callable[[str, int], Hierarchy]] = {
+CASES: dict[str, Callable[..., Hierarchy]] = {
     "together": declare,
     "apart": apart,
+    "no start calls": functools.partial(apart, start_calls=None),
     "low floor": functools.partial(declare, together=Together(floor=0.3, floor_final=0.02)),
     "no floor": functools.partial(declare, together=Together(floor=0.0, floor_final=0.0)),
     "no call cost": functools.partial(declare, call_cost=0.0),
@@ -52,11 +54,11 @@ CASES: dict[str, Callable[[str, int], Hierarchy]] = {
 """By name, a hierarchy of this size of the task, with so many steps."""
 
 
-def one(case: str, size: str, steps: int, seed: int) -> dict[str, Any]:
+def one(case: str, size: str, steps: int, engine: str, seed: int) -> dict[str, Any]:
     """Train and score in this process."""
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        hierarchy = CASES[case](size, steps)
+        hierarchy = CASES[case](size, steps, engine=engine)
         run = hierarchy.train(Path(folder) / "run", seed=seed, quiet=True, flat=case == "flat")
         seconds = time.perf_counter() - started
         found = run.evaluate(100, deterministic=False)
@@ -72,6 +74,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--size", default="8x8")
     parser.add_argument("--steps", type=int, default=500_000)
+    parser.add_argument("--engine", choices=("auto", "sync"), default="auto")
     parser.add_argument("--processes", type=int, default=2)
     asked = parser.parse_args()
     unknown = [c for c in asked.cases if c not in CASES]
@@ -80,11 +83,18 @@ def main() -> None:
     rows, found = [], {}
     with workers(asked.processes) as pool:
         futures = {
-            case: [pool.submit(one, case, asked.size, asked.steps, s) for s in asked.seeds]
+            case: [
+                pool.submit(one, case, asked.size, asked.steps, asked.engine, s)
+                for s in asked.seeds
+            ]
             for case in asked.cases
         }
         for case, pending in futures.items():
-            found[case] = runs = [f.result() for f in pending]
+            found[case] = runs = []
+            for future in pending:
+                runs.append(future.result())
+                told = runs[-1]
+                print(f"{case}, seed {told['seed']}: {told['solved']:.0%} solved", flush=True)
             solved = [r["solved"] for r in runs]
             seconds = f"{median(r['seconds'] for r in runs):.0f}"
             steps = f"{median(r['steps'] for r in runs):,.0f}"
