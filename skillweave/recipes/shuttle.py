@@ -116,6 +116,8 @@ def effort(step: Step) -> Array:
 class Forward(Skill):
     """Run forwards."""
 
+    max_steps = 100
+
     def reward(self, step: Step) -> Array:
         """The speed, less the effort."""
         return moved(step) - effort(step)
@@ -123,6 +125,8 @@ class Forward(Skill):
 
 class Backward(Skill):
     """Run backwards."""
+
+    max_steps = 100
 
     def reward(self, step: Step) -> Array:
         """The speed backwards, less the effort."""
@@ -132,24 +136,27 @@ class Backward(Skill):
 class Stop(Skill):
     """Stand still."""
 
+    max_steps = 100
+
     def reward(self, step: Step) -> Array:
         """As little speed as possible."""
         return -np.abs(moved(step)) - effort(step)
 
 
+RELU = Network(hidden=(64, 64), activation="relu")  # tanh costs more than all the rest of it
 RUNNER = PPO(
-    num_envs=32,
-    n_steps=128,
-    batch_size=512,
+    num_envs=64,
+    n_steps=64,
+    batch_size=256,
     update_epochs=8,
-    learning_rate=1e-3,
+    learning_rate=7e-4,
     gamma=0.98,
-    gae_lambda=0.95,
+    gae_lambda=0.92,
     ent_coef=0.0,
-    network=Network(hidden=(128, 64)),
+    network=RELU,
 )
 SELECTOR = PPO(
-    num_envs=32, n_steps=128, batch_size=256, gamma=0.995, gae_lambda=0.95, ent_coef=0.01
+    num_envs=64, n_steps=64, batch_size=128, gamma=0.995, gae_lambda=0.95, network=RELU
 )
 
 

@@ -1,0 +1,266 @@
+"""Pick and place: a robot's arm grasps a block and brings it to a goal, in spite of disturbances.
+
+FetchPickAndPlace-v4 (Plappert et al. 2018, Gymnasium-Robotics). Four skills are functions of one
+line each; a fifth, ``recover``, is learnt. A selector learns when to use which; ``rule`` and
+``behaviour_tree`` choose by hand.
+
+An episode pays 1 and ends when the block has been within 5 cm of the goal for five steps, so a mean
+return is the share of episodes that succeed. It lasts 50 steps at most, as Gymnasium-Robotics', or
+100 where there are disturbances: the gripper slips, somebody nudges the block, the goal moves.
+
+Observations: the gripper's place (0 to 2), the block's (3 to 5), the block as seen from the gripper
+(6 to 8), the fingers (9, 10), angles and velocities (11 to 24), the goal (25 to 27); in metres.
+
+    skillweave train pick-and-place
+
+Needs gymnasium-robotics: ``pip install 'skillweave[robotics]'``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import skillweave as sw
+from skillweave import PPO, Array, EnvSpec, Hierarchy, Network, Skill, SkillweaveError, Step
+
+GRIPPER, BLOCK, OFFSET, FINGERS, GOAL = (
+    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(25, 28)
+)  # fmt: skip
+NEAR = 0.05
+"""Metres from the goal at which the block is there, as Gymnasium-Robotics has it."""
+HOLD = 5
+"""Steps for which the block must be there."""
+TABLE = 0.425
+"""Height of a block's middle that lies on the table, in metres."""
+LIFTED = 0.02
+"""Metres above the table from which on a block counts as lifted."""
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """How often something goes wrong, as chances in each step."""
+
+    slip: float = 0.04
+    """The fingers of a gripper that has lifted the block open for a while."""
+    nudge: float = 0.04
+    """The block on the table is pushed."""
+    move: float = 0.01
+    """The goal moves to another place."""
+
+
+CALM = Disturbances(0.0, 0.0, 0.0)
+
+
+class Place(gym.Wrapper[Any, Any, Any, Any]):
+    """The task: pays 1 and ends when the block has been at the goal for a while.
+
+    Args:
+        env: Gymnasium-Robotics' environment.
+        disturbances: what goes wrong.
+    """
+
+    slip_steps = 5
+    """Steps for which fingers that slip are open."""
+    push = 1.2
+    """Speed of a block that is nudged, in metres a second; friction stops it after 5 to 10 cm."""
+
+    def __init__(self, env: gym.Env[Any, Any], disturbances: Disturbances = CALM) -> None:
+        super().__init__(env)
+        self.disturbances = disturbances
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (28,), np.float32)
+        self.held = self.slipping = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin anew."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.held = self.slipping = 0
+        return _flat(obs), info
+
+    def step(self, action: Any) -> Any:
+        """1 where the block has been at the goal for five steps, which ends the episode; else 0."""
+        self._disturb()
+        if self.slipping:
+            self.slipping -= 1
+            action = np.append(action[:3], np.float32(1.0))
+        obs, _, terminated, truncated, info = self.env.step(action)
+        distance = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"])
+        self.held = self.held + 1 if distance < NEAR else 0
+        placed = self.held >= HOLD
+        info["success"] = placed
+        return _flat(obs), float(placed), terminated or placed, truncated and not placed, info
+
+    def _disturb(self) -> None:
+        """Let this step's disturbances happen."""
+        world, chance = self.env.unwrapped, self.disturbances
+        if chance == CALM:
+            return
+        rng = self.env.unwrapped.np_random
+        slip, nudge, move = rng.random(3) < (chance.slip, chance.nudge, chance.move)
+        place = block_place(world)
+        lifted = place[2] > TABLE + LIFTED
+        if slip and lifted and not self.slipping:
+            self.slipping = self.slip_steps
+        if nudge and not lifted:
+            nudge_block(world, place, rng, self.push)
+        if move:
+            world.goal = world._sample_goal()  # type: ignore[attr-defined]
+
+
+def block_place(world: Any) -> Array:
+    """Where the block is, (3,)."""
+    place: Array = world._utils.get_site_xpos(world.model, world.data, "object0")
+    return place
+
+
+def nudge_block(world: Any, place: Array, rng: np.random.Generator, speed: float) -> None:
+    """Push the block somewhere; back to the middle where it lies at the edge of what is reached."""
+    angle = rng.uniform(-np.pi, np.pi)
+    way = np.array([np.cos(angle), np.sin(angle)])
+    inwards = world.initial_gripper_xpos[:2] - place[:2]
+    if np.linalg.norm(inwards) > 0.12:
+        way = inwards / np.linalg.norm(inwards)
+    joint = "object0:joint"
+    velocity = world._utils.get_joint_qvel(world.model, world.data, joint).copy()
+    velocity[:2] += speed * way
+    world._utils.set_joint_qvel(world.model, world.data, joint, velocity)
+
+
+def _flat(obs: dict[str, Array]) -> Array:
+    return np.concatenate([obs["observation"], obs["desired_goal"]]).astype(np.float32)
+
+
+def make(
+    disturbances: Disturbances = CALM, render_mode: str | None = None
+) -> gym.Env[Any, Any]:
+    """The arm, with or without disturbances.
+
+    Raises:
+        SkillweaveError: gymnasium-robotics is missing.
+    """
+    try:
+        import gymnasium_robotics
+        import mujoco  # noqa: F401
+    except ImportError as error:
+        raise SkillweaveError(
+            "the robot's arm needs the extra 'robotics': pip install 'skillweave[robotics]'"
+        ) from error
+    gym.register_envs(gymnasium_robotics)
+    arm = gym.make(
+        "FetchPickAndPlace-v4",
+        max_episode_steps=50 if disturbances == CALM else 100,
+        render_mode=render_mode,
+        disable_env_checker=True,
+    )
+    return Place(arm, disturbances)
+
+
+def towards(way: Array, fingers: float) -> Array:
+    """The action (n, 4) that moves the gripper this way, (n, 3) metres; fingers: 1 opens them."""
+    speed = np.clip(10.0 * way, -1.0, 1.0)
+    return np.column_stack([speed, np.full(len(way), fingers)]).astype(np.float32)
+
+
+def above(obs: Array) -> Array:
+    """To a place above the block, with open fingers."""
+    return towards(obs[:, OFFSET] + (0.0, 0.0, 0.1), 1.0)
+
+
+def descend(obs: Array) -> Array:
+    """Down around the block, with open fingers."""
+    return towards(obs[:, OFFSET], 1.0)
+
+
+def close(obs: Array) -> Array:
+    """Close the fingers."""
+    return towards(np.zeros((len(obs), 3)), -1.0)
+
+
+def carry(obs: Array) -> Array:
+    """To the goal, with closed fingers."""
+    return towards(obs[:, GOAL] - obs[:, BLOCK], -1.0)
+
+
+def is_above(obs: Array) -> Array:
+    """The gripper is straight above the block, or around it, (N,) bool."""
+    aligned: Array = np.abs(obs[:, OFFSET][:, :2]).max(axis=1) < 0.015
+    return aligned
+
+
+def is_around(obs: Array) -> Array:
+    """The block is between the fingers, (N,) bool."""
+    around: Array = is_above(obs) & (np.abs(obs[:, OFFSET][:, 2]) < 0.012)
+    return around
+
+
+def is_grasped(obs: Array) -> Array:
+    """The block is between the fingers, and these are closed, (N,) bool."""
+    closed: Array = obs[:, FINGERS].sum(axis=1) < 0.053
+    return closed & (np.abs(obs[:, OFFSET]).max(axis=1) < 0.03)
+
+
+def rule(obs: Array) -> Array:
+    """What an engineer would write: which skill, (N,) by name."""
+    free = np.where(is_around(obs), "close", np.where(is_above(obs), "descend", "above"))
+    return np.where(is_grasped(obs), "carry", free)
+
+
+class Above(Skill):
+    """Go above the block."""
+
+    def policy(self, obs: Array) -> Array:
+        """The function of this name."""
+        return above(obs)
+
+
+class Descend(Skill):
+    """Go down around the block."""
+
+    def policy(self, obs: Array) -> Array:
+        """The function of this name."""
+        return descend(obs)
+
+
+class Close(Skill):
+    """Close the fingers."""
+
+    def policy(self, obs: Array) -> Array:
+        """The function of this name."""
+        return close(obs)
+
+
+class Carry(Skill):
+    """Bring what is between the fingers to the goal."""
+
+    def policy(self, obs: Array) -> Array:
+        """The function of this name."""
+        return carry(obs)
+
+
+class Recover(Skill):
+    """Get the block between the open fingers, wherever it is now. It is learnt."""
+
+    max_steps = 25
+
+    def initiation(self, obs: Array) -> Array:
+        """Where it is not grasped."""
+        return ~is_grasped(obs)
+
+    def reward(self, step: Step) -> Array:
+        """Progress of the fingers to the block, in decimetres; 1 for having it between them."""
+        before = np.linalg.norm(step.obs[:, OFFSET], axis=1)
+        after = np.linalg.norm(step.next_obs[:, OFFSET], axis=1)
+        return 10.0 * (before - after) + self.success(step)
+
+    def termination(self, step: Step) -> Array:
+        """It is between them."""
+        return is_around(step.next_obs)
+
+    def success(self, step: Step) -> Array:
+        """It is between them."""
+        return is_around(step.next_obs)
