@@ -52,7 +52,8 @@ class Bench:
     # The hierarchy, and what needs its skills
 
     def _hierarchy(self, tasks: Sequence[Task]) -> None:
-        source, budgets = self.suite.tasks[0], dict(zip(self._names(), self.suite.steps()))
+        source = self.suite.tasks[0]
+        budgets = dict(zip(self._names(), self.suite.steps(), strict=True))
         for task in self._with_source(tasks):
             skills = None if task is source else self._skills()
             self._weave(task, HIERARCHY, skills, budgets[task.name], keep=task is source)

@@ -40,7 +40,9 @@ class Flat(Agent):
     def stages(self, name: str = "agent") -> list[Stage]:
         """Its only stage."""
         spec, skill = self.learns_in or self.spec, self.learns
-        return [Stage(name, "agent", self.algorithm, self.steps, lambda _: skill_scene(spec, skill))]
+        return [
+            Stage(name, "agent", self.algorithm, self.steps, lambda _: skill_scene(spec, skill))
+        ]
 
     def run(self, path: Path, seed: int) -> Run:
         """Train it, or finish what was begun there."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -84,8 +85,8 @@ class Suite:
     def steps(self) -> list[int]:
         """What the hierarchy takes for each task; its skills are in the first."""
         first, *others = self.tasks
-        ready = {s.name: _nobody for s in self.skills()}
-        further = [self.hierarchy(t, ready).total_steps for t in others]  # type: ignore[arg-type]
+        ready: Any = {s.name: _nobody for s in self.source(first).skills}
+        further = [self.hierarchy(t, ready).total_steps for t in others]
         return [self.hierarchy(first, None).total_steps, *further]
 
     def steps_flat(self) -> list[int]:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -135,9 +134,7 @@ def _flat(obs: dict[str, Array]) -> Array:
     return np.concatenate([obs["observation"], obs["desired_goal"]]).astype(np.float32)
 
 
-def make(
-    disturbances: Disturbances = CALM, render_mode: str | None = None
-) -> gym.Env[Any, Any]:
+def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> gym.Env[Any, Any]:
     """The arm, with or without disturbances.
 
     Raises:
@@ -264,3 +261,77 @@ class Recover(Skill):
     def success(self, step: Step) -> Array:
         """It is between them."""
         return is_around(step.next_obs)
+
+
+script = sw.Automaton(
+    states={"above": "above", "descend": "descend", "close": "close", "carry": "carry"},
+    transitions={
+        ("above", "descend"): lambda step: is_above(step.next_obs),
+        ("descend", "close"): lambda step: is_around(step.next_obs),
+        ("close", "carry"): lambda step: is_grasped(step.next_obs),
+    },
+)
+"""The four steps in their order, each until it is done: all one needs where nothing goes wrong."""
+
+behaviour_tree = sw.tree.Sequence(
+    sw.tree.Fallback(
+        is_grasped,
+        sw.tree.Sequence(
+            sw.tree.Fallback(is_above, "above"), sw.tree.Fallback(is_around, "descend"), "close"
+        ),
+    ),
+    "carry",
+)
+"""The same as ``rule``, as a tree: it begins anew after each call that has not succeeded."""
+
+RELU = Network(hidden=(64, 64), activation="relu")
+LEARNER = PPO(
+    num_envs=16,
+    n_steps=128,
+    batch_size=256,
+    update_epochs=8,
+    gamma=0.98,
+    gae_lambda=0.95,
+    network=RELU,
+)
+SELECTOR = PPO(
+    num_envs=16,
+    n_steps=256,
+    batch_size=128,
+    update_epochs=8,
+    gamma=0.98,
+    gae_lambda=0.95,
+    network=RELU,
+)
+BY_HAND = (Above, Descend, Close, Carry)
+
+
+def spec(disturbances: Disturbances = CALM) -> EnvSpec:
+    """The task, for ``Hierarchy(env=...)``."""
+
+    def arm(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return make(disturbances, render_mode)
+
+    arm.__name__ = "PickAndPlace" if disturbances == CALM else "PickAndPlaceDisturbed"
+    return EnvSpec(arm)
+
+
+def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
+    """The hierarchy whose selector is learnt; ``how`` changes any of its settings."""
+    settings: dict[str, Any] = {
+        "call_steps": 5,
+        "algorithm": LEARNER,
+        "selector": SELECTOR,
+        "skill_steps": 60_000,
+        "selector_steps": 140_000,
+    } | how
+    return Hierarchy(spec(disturbances), [*(s() for s in BY_HAND), Recover()], **settings)
+
+
+def by_hand(selector: Any, disturbances: Disturbances = CALM, call_steps: int = 1) -> Hierarchy:
+    """The four skills under ``rule``, ``script`` or ``behaviour_tree``: nothing is learnt."""
+    skills: Sequence[Skill] = [s() for s in BY_HAND]
+    return Hierarchy(spec(disturbances), skills, selector=selector, call_steps=call_steps)
+
+
+hierarchy = declare()

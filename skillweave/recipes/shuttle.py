@@ -15,13 +15,26 @@ Needs mujoco: ``pip install 'skillweave[mujoco]'``.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from skillweave import PPO, Array, EnvSpec, Hierarchy, Network, Skill, SkillweaveError, Step
+from skillweave import (
+    PPO,
+    Array,
+    Automaton,
+    EnvSpec,
+    Hierarchy,
+    Lengths,
+    Network,
+    Skill,
+    SkillweaveError,
+    Step,
+    Together,
+)
 
 UNIT = 1000.0
 """A score is a return divided by this: the mean reward of a step."""
@@ -31,7 +44,7 @@ LEGS = 3
 """The most points that a patrol has."""
 SECONDS = 0.05
 """Of a step."""
-X = 0
+X, SPEED, LEG = 0, 9, slice(18, 21)
 
 
 class Patrol(gym.Wrapper[Any, Any, Any, Any]):
@@ -155,26 +168,58 @@ RUNNER = PPO(
     ent_coef=0.0,
     network=RELU,
 )
-SELECTOR = PPO(
-    num_envs=64, n_steps=64, batch_size=128, gamma=0.995, gae_lambda=0.95, network=RELU
-)
+SELECTOR = PPO(num_envs=64, n_steps=64, batch_size=128, gamma=0.995, gae_lambda=0.95, network=RELU)
 
 
-def spec(*points: float) -> EnvSpec:
+def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
     """The half-cheetah with a patrol of these points, for ``Hierarchy(env=...)``."""
-    return EnvSpec(partial(make, points))
+
+    def cheetah(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return make(points, render_mode)
+
+    cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)})"
+    return EnvSpec(cheetah)
 
 
 def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
     """The hierarchy on a patrol; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
-        "call_steps": 10,
+        "call_steps": Lengths(10, 20, 40),
         "learn": "together",
         "together_steps": 3_000_000,
+        # At first nearly all calls are drawn by lot: the selector knows no reward yet but what
+        # effort costs, and would stand still, and skills learn to turn where others have run.
+        "together": Together(floor=0.95, floor_final=0.0),
         "algorithm": RUNNER,
         "selector": SELECTOR,
     } | how
-    return Hierarchy(spec(*points), [Forward(), Backward(), Stop()], **settings)
+    return Hierarchy(spec(points), [Forward(), Backward(), Stop()], **settings)
+
+
+def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any) -> Hierarchy:
+    """The hierarchy on a patrol with skills that are there already, by name."""
+    found = declare(points, **{"learn": "apart"} | how)
+    for skill in found.skills:
+        skill.policy = skills[skill.name]
+    return found
+
+
+def by_automaton(points: tuple[float, ...], skills: Mapping[str, Any]) -> Hierarchy:
+    """The same skills under the task's own automaton: each leg is run in its direction."""
+    ways, legs = np.sign(np.subtract(points, np.roll(points, 1))), range(len(points))
+    states = {f"leg {i}": "forward" if ways[i] > 0 else "backward" for i in legs}
+    transitions = {
+        (f"leg {i}", f"leg {j}"): partial(on_leg, j)
+        for i, j in zip(legs, np.roll(legs, -1), strict=True)
+    }
+    automaton = Automaton(states=states, transitions=transitions)
+    return with_skills(points, skills, selector=automaton, call_steps=1)
+
+
+def on_leg(leg: int, step: Step) -> Array:
+    """This leg is run now, (N,) bool."""
+    there: Array = step.next_obs[:, LEG][:, leg] == 1.0
+    return there
 
 
 hierarchy = declare()
