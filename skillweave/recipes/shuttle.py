@@ -28,7 +28,6 @@ from skillweave import (
     Automaton,
     EnvSpec,
     Hierarchy,
-    Lengths,
     Network,
     Skill,
     SkillweaveError,
@@ -42,6 +41,9 @@ ROUND = 1000.0
 """What a finished round pays."""
 LEGS = 3
 """The most points that a patrol has."""
+ARRIVAL = 100.0
+"""What the end of a leg is worth to a skill. Its value ends there: who were not paid for it would
+rather not arrive."""
 SECONDS = 0.05
 """Of a step."""
 X, SPEED, LEG = 0, 9, slice(18, 21)
@@ -126,30 +128,44 @@ def effort(step: Step) -> Array:
     return cost
 
 
+def arrived(step: Step) -> Array:
+    """The leg of the patrol is done, (N,) bool."""
+    done: Array = (step.next_obs[:, LEG] != step.obs[:, LEG]).any(axis=1)
+    return done
+
+
 class Forward(Skill):
-    """Run forwards."""
+    """Run forwards, until the leg of the patrol is done."""
 
-    max_steps = 100
-
-    def reward(self, step: Step) -> Array:
-        """The speed, less the effort."""
-        return moved(step) - effort(step)
-
-
-class Backward(Skill):
-    """Run backwards."""
-
-    max_steps = 100
+    way = 1.0
 
     def reward(self, step: Step) -> Array:
-        """The speed backwards, less the effort."""
-        return -moved(step) - effort(step)
+        """The speed, less the effort; and for the end of a leg what running on would have paid."""
+        return self.way * moved(step) - effort(step) + ARRIVAL * arrived(step)
+
+    def termination(self, step: Step) -> Array:
+        """The leg is done."""
+        return arrived(step)
+
+    def success(self, step: Step) -> Array:
+        """The leg is done."""
+        return arrived(step)
+
+
+class Backward(Forward):
+    """Run backwards, until the leg of the patrol is done."""
+
+    way = -1.0
 
 
 class Stop(Skill):
     """Stand still."""
 
-    max_steps = 100
+    max_steps = 20
+
+    def initiation(self, obs: Array) -> Array:
+        """Where it moves: who stands has nothing to do."""
+        return np.abs(obs[:, SPEED]) > 1.0
 
     def reward(self, step: Step) -> Array:
         """As little speed as possible."""
@@ -184,7 +200,7 @@ def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
 def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
     """The hierarchy on a patrol; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
-        "call_steps": Lengths(10, 20, 40),
+        "call_steps": 40,
         "learn": "together",
         "together_steps": 3_000_000,
         # At first nearly all calls are drawn by lot: the selector knows no reward yet but what
