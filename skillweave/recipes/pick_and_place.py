@@ -197,8 +197,9 @@ def is_around(obs: Array) -> Array:
 
 def is_grasped(obs: Array) -> Array:
     """The block is between the fingers, and these are closed, (N,) bool."""
-    closed: Array = obs[:, FINGERS].sum(axis=1) < 0.053
-    return closed & (np.abs(obs[:, OFFSET]).max(axis=1) < 0.03)
+    closed = obs[:, FINGERS].sum(axis=1) < 0.053
+    grasped: Array = closed & (np.abs(obs[:, OFFSET]).max(axis=1) < 0.03)
+    return grasped
 
 
 def rule(obs: Array) -> Array:
@@ -210,33 +211,25 @@ def rule(obs: Array) -> Array:
 class Above(Skill):
     """Go above the block."""
 
-    def policy(self, obs: Array) -> Array:
-        """The function of this name."""
-        return above(obs)
+    policy = above
 
 
 class Descend(Skill):
     """Go down around the block."""
 
-    def policy(self, obs: Array) -> Array:
-        """The function of this name."""
-        return descend(obs)
+    policy = descend
 
 
 class Close(Skill):
     """Close the fingers."""
 
-    def policy(self, obs: Array) -> Array:
-        """The function of this name."""
-        return close(obs)
+    policy = close
 
 
 class Carry(Skill):
     """Bring what is between the fingers to the goal."""
 
-    def policy(self, obs: Array) -> Array:
-        """The function of this name."""
-        return carry(obs)
+    policy = carry
 
 
 class Recover(Skill):
@@ -252,7 +245,8 @@ class Recover(Skill):
         """Progress of the fingers to the block, in decimetres; 1 for having it between them."""
         before = np.linalg.norm(step.obs[:, OFFSET], axis=1)
         after = np.linalg.norm(step.next_obs[:, OFFSET], axis=1)
-        return 10.0 * (before - after) + self.success(step)
+        reward: Array = 10.0 * (before - after) + self.success(step)
+        return reward
 
     def termination(self, step: Step) -> Array:
         """It is between them."""

@@ -90,7 +90,10 @@ class Patrol(gym.Wrapper[Any, Any, Any, Any]):
         return self._with_leg(obs), reward, terminated, truncated, info
 
     def _with_leg(self, obs: Any) -> Array:
-        return np.append(obs, np.arange(LEGS) == self.leg).astype(np.float32)
+        found = np.zeros(len(obs) + LEGS, np.float32)
+        found[: len(obs)] = obs
+        found[len(obs) + self.leg] = 1.0
+        return found
 
 
 def make(
