@@ -8,9 +8,10 @@ import numpy as np
 
 from benchmarks.pay.suite import Policies, Suite, Task
 from skillweave import Array, Hierarchy
+from skillweave.recipes import _arm as world
 from skillweave.recipes import pick_and_place as arm
 
-DISTURBANCES = {"calm": arm.CALM, "disturbed": arm.Disturbances()}
+DISTURBANCES = {"calm": world.CALM, "disturbed": world.Disturbances()}
 SOLVED = {"calm": 0.95, "disturbed": 0.85}
 FURTHER_STEPS = 140_000
 
@@ -46,7 +47,7 @@ def suite() -> Suite:
     """Two tasks: nothing goes wrong, and something does."""
     return Suite(
         name="pick-and-place",
-        tasks=[Task(name, arm.spec(d), SOLVED[name]) for name, d in DISTURBANCES.items()],
+        tasks=[Task(name, world.spec(d), SOLVED[name]) for name, d in DISTURBANCES.items()],
         unit=1.0,
         source=source,
         further=further,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from skillweave import SkillweaveError, Step
+from skillweave.recipes import _arm as world
 from skillweave.recipes import pick_and_place as arm
 
 
@@ -37,7 +38,7 @@ class Distances(gym.Env):
 
 
 def play(distances):
-    env = arm.Place(Distances(distances))
+    env = world.Place(Distances(distances))
     env.reset()
     found = []
     for _ in distances:
@@ -126,7 +127,7 @@ def disturbed():
 
     def make(**chances):
         none = {"slip": 0.0, "nudge": 0.0, "move": 0.0}
-        env = arm.make(arm.Disturbances(**none | chances))
+        env = world.make(world.Disturbances(**none | chances))
         return env, env.reset(seed=1)[0]
 
     return make
@@ -139,12 +140,12 @@ def test_a_nudge_moves_the_block_some_centimetres_and_leaves_it_on_the_table(dis
     env, obs = disturbed(nudge=1.0)
     before = obs[arm.BLOCK]
     obs, *_ = env.step(STILL)
-    env.disturbances = arm.CALM  # once is enough
+    env.disturbances = world.CALM  # once is enough
     for _ in range(10):
         obs, *_ = env.step(STILL)
     moved = np.linalg.norm(obs[arm.BLOCK][:2] - before[:2])
     assert 0.03 < moved < 0.15
-    assert obs[arm.BLOCK][2] == pytest.approx(arm.TABLE, abs=0.01)
+    assert obs[arm.BLOCK][2] == pytest.approx(world.TABLE, abs=0.01)
 
 
 def test_a_goal_that_moves_is_elsewhere_in_the_observation(disturbed):
@@ -158,12 +159,12 @@ def test_a_gripper_that_slips_drops_the_block(disturbed):
     for _ in range(40):  # the rule lifts it
         name = str(arm.rule(obs[None])[0])
         obs = env.step(getattr(arm, name)(obs[None])[0])[0]
-        if obs[arm.BLOCK][2] > arm.TABLE + 0.05:
+        if obs[arm.BLOCK][2] > world.TABLE + 0.05:
             break
-    assert obs[arm.BLOCK][2] > arm.TABLE + 0.05
-    env.disturbances = arm.Disturbances(slip=1.0, nudge=0.0, move=0.0)
+    assert obs[arm.BLOCK][2] > world.TABLE + 0.05
+    env.disturbances = world.Disturbances(slip=1.0, nudge=0.0, move=0.0)
     obs, *_ = env.step(arm.close(obs[None])[0])
     assert env.slipping == env.slip_steps - 1
     for _ in range(6):
         obs, *_ = env.step(arm.close(obs[None])[0])
-    assert obs[arm.BLOCK][2] < arm.TABLE + 0.03
+    assert obs[arm.BLOCK][2] < world.TABLE + 0.03
