@@ -32,14 +32,12 @@ SUITES: dict[str, Callable[[], Suite]] = {
     "shuttle": shuttle.suite,
     "pick-and-place": pick_and_place.suite,
 }
-QUICK, QUICK_EPISODES = 0.01, 4
-"""``--quick``: budgets are multiplied by this, and so many episodes are played for a score."""
 
 
 def suite_of(name: str, quick: bool) -> Suite:
     """A suite by its name."""
     found = SUITES[name]()
-    return found.scaled(QUICK, QUICK_EPISODES) if quick else found
+    return found.quick() if quick else found
 
 
 def chosen(asked: list[str]) -> dict[str, list[str] | None]:

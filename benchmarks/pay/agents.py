@@ -21,8 +21,6 @@ HIERARCHY, RANDOM, SINGLE = "hierarchy", "F4-random-skills", "F4-best-skill"
 FLAT, SHAPED, BONUS, TUNED = "F0-flat", "F1-skill-rewards", "F2-bonus", "F3-fine-tuned"
 CHAINS = ("hierarchy", "flat", "shaped", "bonus")
 """What can be run on its own: agents of one chain need what others of it have learnt."""
-EVALUATIONS, EVALUATED = 12, 10
-"""Of each training, and episodes of each."""
 TUNING_SEED = 100
 """Weights of F1 are chosen on this one, which is never reported."""
 
@@ -67,8 +65,8 @@ class Bench:
             return
         path, started = self._path(task, agent), time.perf_counter()
         hierarchy = self.suite.hierarchy(task, skills)
-        hierarchy.eval_every = max(1, budget // EVALUATIONS)
-        hierarchy.eval_episodes = EVALUATED
+        hierarchy.eval_every = max(1, budget // self.suite.evaluations)
+        hierarchy.eval_episodes = self.suite.evaluated
         if path.exists():
             run = hierarchy.resume(path, quiet=True)
         else:
@@ -168,7 +166,7 @@ class Bench:
         budget = self._flat_budgets()[task.name]
         return Flat(
             task.env, self.suite.flat, budget,
-            eval_every=max(1, budget // EVALUATIONS), eval_episodes=EVALUATED,
+            eval_every=max(1, budget // self.suite.evaluations), eval_episodes=self.suite.evaluated,
         )  # fmt: skip
 
     def _learn(self, agent: Flat, task: Task, name: str, keep: bool = False) -> Result:
