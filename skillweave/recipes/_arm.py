@@ -24,11 +24,11 @@ LIFTED = 0.02
 class Disturbances:
     """How often something goes wrong, as chances in each step."""
 
-    slip: float = 0.04
+    slip: float = 0.08
     """The fingers of a gripper that has lifted the block open for a while."""
-    nudge: float = 0.04
+    nudge: float = 0.08
     """The block on the table is pushed."""
-    move: float = 0.01
+    move: float = 0.02
     """The goal moves to another place."""
 
 
