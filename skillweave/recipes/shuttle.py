@@ -41,9 +41,10 @@ ROUND = 1000.0
 """What a finished round pays."""
 LEGS = 3
 """The most points that a patrol has."""
-ARRIVAL = 100.0
-"""What the end of a leg is worth to a skill. Its value ends there: who were not paid for it would
-rather not arrive."""
+ARRIVAL, HASTE = 200.0, 20.0
+"""What the end of a leg is worth to a skill, and what is taken off for each metre a second at which
+it is passed. A call ends there, and its value: who were not paid for it would rather not arrive.
+Who passes a point at full speed runs on for four metres more."""
 SECONDS = 0.05
 """Of a step."""
 X, SPEED, LEG = 0, 9, slice(18, 21)
@@ -143,8 +144,9 @@ class Forward(Skill):
     way = 1.0
 
     def reward(self, step: Step) -> Array:
-        """The speed, less the effort; and for the end of a leg what running on would have paid."""
-        return self.way * moved(step) - effort(step) + ARRIVAL * arrived(step)
+        """The speed, less the effort; and for the end of a leg a prize, the slower the higher."""
+        speed = self.way * moved(step)
+        return speed - effort(step) + arrived(step) * (ARRIVAL - HASTE * np.abs(speed))
 
     def termination(self, step: Step) -> Array:
         """The leg is done."""
