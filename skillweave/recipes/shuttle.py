@@ -41,7 +41,7 @@ ROUND = 1000.0
 """What a finished round pays."""
 LEGS = 3
 """The most points that a patrol has."""
-ARRIVAL, HASTE = 200.0, 20.0
+ARRIVAL, HASTE = 300.0, 40.0
 """What the end of a leg is worth to a skill, and what is taken off for each metre a second at which
 it is passed. A call ends there, and its value: who were not paid for it would rather not arrive.
 Who passes a point at full speed runs on for four metres more."""
