@@ -16,6 +16,7 @@ Needs mujoco: ``pip install 'skillweave[mujoco]'``.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -191,6 +192,10 @@ RUNNER = PPO(
 )
 SELECTOR = PPO(num_envs=64, n_steps=64, batch_size=128, gamma=0.995, gae_lambda=0.95, network=RELU)
 
+# At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort costs,
+# and would stand still; and skills learn to turn where others have run.
+FLOOR = Together(floor=0.95, floor_final=0.0)
+
 
 def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
     """The half-cheetah with a patrol of these points, for ``Hierarchy(env=...)``."""
@@ -208,9 +213,7 @@ def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
         "call_steps": 40,
         "learn": "together",
         "together_steps": 3_000_000,
-        # At first nearly all calls are drawn by lot: the selector knows no reward yet but what
-        # effort costs, and would stand still, and skills learn to turn where others have run.
-        "together": Together(floor=0.95, floor_final=0.0),
+        "together": FLOOR,
         "algorithm": RUNNER,
         "selector": SELECTOR,
     } | how
@@ -219,7 +222,8 @@ def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
 
 def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """The hierarchy on a patrol with skills that are there already, by name."""
-    found = declare(points, **{"learn": "apart"} | how)
+    selector = replace(SELECTOR, floor=FLOOR.floor, floor_final=FLOOR.floor_final)
+    found = declare(points, **{"learn": "apart", "selector": selector} | how)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found
