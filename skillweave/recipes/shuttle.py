@@ -192,8 +192,8 @@ RUNNER = PPO(
 )
 SELECTOR = PPO(num_envs=64, n_steps=64, batch_size=128, gamma=0.995, gae_lambda=0.95, network=RELU)
 
-# At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort costs,
-# and would stand still; and skills learn to turn where others have run.
+# At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort
+# costs, and would stand still; and skills learn to turn where others have run.
 FLOOR = Together(floor=0.95, floor_final=0.0)
 
 
