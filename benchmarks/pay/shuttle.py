@@ -45,7 +45,7 @@ def by_automaton(task: Task, skills: Policies) -> Hierarchy:
 
 
 def cells(obs: Array) -> Array:
-    """Where it is in metres, how fast in 2 metres a second, and on which leg, (n, 3)."""
+    """How far the point is in metres, how fast in 2 metres a second, and on which leg, (n, 3)."""
     leg = obs[:, shuttle.LEG].argmax(axis=1)
     return np.stack([np.floor(obs[:, shuttle.X]), np.floor(obs[:, shuttle.SPEED] / 2.0), leg], 1)
 

@@ -5,7 +5,8 @@ run to x > 2, then to x < −2, and so on, for 1,000 steps. A finished round pay
 step costs 0.1·‖action‖². Their scores are returns divided by 1,000, and so are ours
 (``UNIT``): a round counts about 1, so 8.31 (their best median after 3M steps) are about nine.
 
-Observations: x, z and the angles (0 to 8), their velocities (9 to 17), the leg of the patrol that
+Observations: x as seen from the point that is run to, so that skills serve other points, too; z and
+the angles (1 to 8), velocities (9 to 17), the leg of the patrol that
 is run now, one-hot (18 to 20; the paper's task has two legs, so the last number is always 0).
 
     skillweave train shuttle
@@ -46,8 +47,6 @@ ARRIVAL, HASTE = 300.0, 40.0
 """What the end of a leg is worth to a skill, and what is taken off for each metre a second at which
 it is passed. A call ends there, and its value: who were not paid for it would rather not arrive.
 Who passes a point at full speed runs on for four metres more."""
-SECONDS = 0.05
-"""Of a step."""
 X, SPEED, LEG = 0, 9, slice(18, 21)
 
 
@@ -94,6 +93,7 @@ class Patrol(gym.Wrapper[Any, Any, Any, Any]):
     def _with_leg(self, obs: Any) -> Array:
         found = np.zeros(len(obs) + LEGS, np.float32)
         found[: len(obs)] = obs
+        found[X] -= self.points[self.leg]
         found[len(obs) + self.leg] = 1.0
         return found
 
@@ -123,7 +123,7 @@ def make(
 
 def moved(step: Step) -> Array:
     """Metres a second, (N,)."""
-    speed: Array = (step.next_obs[:, X] - step.obs[:, X]) / SECONDS
+    speed: Array = step.next_obs[:, SPEED]
     return speed
 
 

@@ -83,7 +83,7 @@ def test_points_that_make_no_patrol_are_refused(points):
 
 def step_of(x, next_x, leg, next_leg, action=0.5):
     def obs(x, leg):
-        return np.array([[x, *np.zeros(17), *(np.arange(3) == leg)]], np.float32)
+        return np.array([[x, *np.zeros(8), 2.0, *np.zeros(8), *(np.arange(3) == leg)]], np.float32)
 
     no, one = np.zeros(1, bool), np.ones(1, np.int64)
     actions = np.full((1, 6), action, np.float32)
@@ -91,7 +91,7 @@ def step_of(x, next_x, leg, next_leg, action=0.5):
 
 
 def test_skills_are_paid_for_speed_less_effort_and_for_the_end_of_a_leg():
-    # 0.1 m in 0.05 s are 2 m/s; the effort is 0.1·6·0.5² = 0.15.
+    # At 2 m/s; the effort is 0.1·6·0.5² = 0.15.
     going = step_of(1.0, 1.1, 0, 0)
     assert shuttle.Forward().reward(going) == pytest.approx(2.0 - 0.15, abs=1e-4)
     assert shuttle.Backward().reward(going) == pytest.approx(-2.0 - 0.15, abs=1e-4)
@@ -117,11 +117,16 @@ def test_the_half_cheetah_itself_has_the_papers_observations_rewards_and_length(
     assert obs.shape == (21,)
     action = np.full(6, 0.5, np.float32)
     for i in range(1, 1001):
-        before = obs
         obs, reward, terminated, truncated, info = env.step(action)
-        assert obs[shuttle.X] == pytest.approx(info["x_position"], abs=1e-5)
+        point = (2.0, -2.0)[int(obs[shuttle.LEG].argmax())]
+        assert obs[shuttle.X] == pytest.approx(info["x_position"] - point, abs=1e-5)
         assert (truncated, terminated) == (i == 1000, False)
         if reward < 500:
             assert reward == pytest.approx(-0.15)  # 0.1·6·0.5²
-    speed = (obs[shuttle.X] - before[shuttle.X]) / shuttle.SECONDS
-    assert speed == pytest.approx(info["x_velocity"], abs=1e-3)
+
+
+def test_x_is_seen_from_the_point_that_is_run_to():
+    env = shuttle.Patrol(Runner([1.0, 3.0, -1.0]), (2.0, -2.0))
+    seen = [env.reset()[0], *(env.step(np.zeros(6))[0] for _ in range(3))]
+    # 2 is run to from 0 and 1; from 3 and −1 it is −2.
+    assert [float(obs[shuttle.X]) for obs in seen] == [-2.0, -1.0, 5.0, 1.0]
