@@ -57,6 +57,8 @@ class Skill:
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
 
+    _path: str = ""
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "name" not in cls.__dict__:
@@ -104,6 +106,11 @@ class Skill:
                 raise SkillweaveError(
                     f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
+
+
+def path_of(skill: Skill) -> str:
+    """What messages call a skill: its name, after those of the hierarchies that it is in."""
+    return skill._path or skill.name
 
 
 class RecordedSkill(Skill):
@@ -194,7 +201,7 @@ def asked(
         SkillweaveError: as of ``answer``.
     """
     dtype = np.float32 if method == "reward" else bool
-    who = f"skill {skill.name!r}"
+    who = f"skill {path_of(skill)!r}"
     return answer(getattr(skill, method), about, n, dtype, who, method, elapsed, ids)
 
 
