@@ -12,7 +12,7 @@ from skillweave.collecting.calls import Interruption, SkillSet, Why
 from skillweave.selectors import LastCall, ReadySelector
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
-from skillweave.types import Array, Memory, Policy, Step
+from skillweave.types import Array, Memory, Policy, Step, unprefixed
 
 _SELECTOR = "selector."
 
@@ -96,6 +96,14 @@ class HierarchyPolicy:
     def acting(self, memory: Memory) -> Array | None:
         """(n,) int64, the running skill."""
         return memory["skill"]
+
+    def acts(self, memory: Memory, row: int = 0) -> str:
+        """The path of the skill that acts in one environment: ``inner/skill`` for example."""
+        i = int(memory["skill"][row])
+        name, policy = self.labels[i], self.skills.policies[i]
+        if not isinstance(policy, HierarchyPolicy):
+            return name
+        return f"{name}/{policy.acts(unprefixed(str(i), memory), row)}"
 
     def _selectors(self, memory: Memory) -> Memory:
         """What the selector remembers."""

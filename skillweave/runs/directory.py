@@ -49,6 +49,11 @@ from skillweave.types import SkillweaveError, unprefixed
 S = TypeVar("S")
 
 
+def file_name(path: str) -> str:
+    """The name of a file for who has this path: ``inner.skill`` for ``inner/skill``."""
+    return path.replace("/", ".")
+
+
 class RunDirectory:
     """One run on disk. ``manifest`` is the content of ``run.json``."""
 
@@ -253,7 +258,7 @@ class RunDirectory:
     def policy_path(self, stage: str, name: str | None = None) -> Path:
         """Where the policy of a stage lies, or of one who learns in it."""
         file = stage if name in (None, stage) else f"{stage}.{name}"
-        return self.path / "policies" / f"{file}.safetensors"
+        return self.path / "policies" / f"{file_name(file)}.safetensors"
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""

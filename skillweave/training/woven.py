@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm, state_to
-from skillweave.algorithms.config import AlgorithmConfig, config_from_json
+from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Acting, Request
@@ -39,12 +38,13 @@ class WovenLearner:
     """A selector and skills, each with a learner of its own; nobody learns from others' rows.
 
     Args:
-        parts: by name, the selector first, then the skills in their order.
+        parts: by path, the selector first, then all others who learn.
+        critic: the path of who tells the task's advantage.
         how: how much the task counts, and how far skills may move from their anchors.
     """
 
-    def __init__(self, parts: Mapping[str, Learner], how: Together) -> None:
-        self.parts, self._how, self._weight = dict(parts), how, 0.0
+    def __init__(self, parts: Mapping[str, Learner], critic: str, how: Together) -> None:
+        self.parts, self._critic, self._how, self._weight = dict(parts), critic, how, 0.0
         self.stacks: Sequence[Stack] = [s for part in parts.values() for s in part.stacks]
         self.overlap = all(part.overlap for part in parts.values())
         self.report_every = max(part.report_every for part in parts.values())
@@ -58,17 +58,19 @@ class WovenLearner:
 
     def take(self, experience: Experience) -> None:
         """Give each its own rows, and skills the task's advantage in them, if it counts."""
+        found = (replace(experience, parts=()), *experience.parts)
+        own = dict(zip(self.parts, found, strict=True))
         if self._how.task_weight > 0.0:
-            advantage = self._weight * self._task_advantage(experience.parts[-1])
-            for rows in experience.parts[:-1]:
-                rows.advantage = advantage
-        own = (replace(experience, parts=()), *experience.parts)
-        for part, rows in zip(self.parts.values(), own, strict=True):
-            part.take(rows)
+            advantage = self._weight * self._task_advantage(own[self._critic])
+            for name, rows in own.items():
+                if not decides(name):
+                    rows.advantage = advantage
+        for name, rows in own.items():
+            self.parts[name].take(rows)
 
     def _task_advantage(self, rows: Experience) -> Array:
         """What each step did for the task, (T, N) float32, with deviation 1."""
-        (stack,) = self.parts[CRITIC].stacks
+        (stack,) = self.parts[self._critic].stacks
         store = RolloutStore(1, device=stack.state.params.device)
         store.add(rows)
         rollout = store.rollout(stack.state.gamma)
@@ -115,6 +117,11 @@ class WovenLearner:
             part.load(own)
 
 
+def decides(path: str) -> bool:
+    """Whether it is the path of a selector or a critic of skills: they are no skills."""
+    return path.rpartition("/")[2] in (SELECTOR, CRITIC)
+
+
 def adapted(coef: Tensor, kl: Tensor, nats: float | None) -> Tensor:
     """What a nat of KL costs from now on, so that KL comes near ``nats``; (P,) each.
 
@@ -137,23 +144,23 @@ class WovenAgents(OneAgent):
 
     def make_agents(self) -> None:
         """Make who learns; checkpoints hold their states under ``extra``."""
-        scene = self.scene
-        self.together = Together(**self.stage.entry["together"])
-        told = self.stage.entry["algorithms"]
-        configs: dict[str, AlgorithmConfig] = {SELECTOR: self.stage.config}
-        configs |= {name: config_from_json(told[name]) for name in told}
-        spaces = {
-            SELECTOR: scene.action_space,
-            CRITIC: gym.spaces.Discrete(len(scene.skills.skills)),
-        }
+        entry, scene = self.stage.entry, self.scene
+        self.together = Together(**entry["together"])
+        self.first: str = entry["learns"][0]
+        self.node = self.first.removesuffix(SELECTOR)
+        told = {name: config_from_json(own) for name, own in entry["algorithms"].items()}
         self.algorithms: dict[str, Algorithm] = {
             name: make_algorithm(
                 self._as_grown(name, config),
                 scene.observation_space,
-                spaces.get(name, scene.skill_space),
+                scene.chooses_from(self._below(name)),
             )
-            for name, config in configs.items()
+            for name, config in ({self.first: self.stage.config} | told).items()
         }
+
+    def _below(self, path: str) -> str:
+        """A path as it is in the hierarchy that this stage is of."""
+        return path.removeprefix(self.node)
 
     def _as_grown(self, name: str, config: Any) -> Any:
         """The settings, with the networks that ``name`` has grown in a population."""
@@ -178,10 +185,14 @@ class WovenAgents(OneAgent):
     def woven(self, engine: Engine) -> WovenCollector:
         """A collector of these environments in which all act."""
         n = engine.num_envs
-        acting = {name: Acting([(a, 1)], n) for name, a in self.algorithms.items()}
-        selector, critic = acting.pop(SELECTOR), acting.pop(CRITIC, None)
-        margin = self.together.margin if self.stage.entry.get("interrupt") else None
-        return self.scene.woven(engine, selector, list(acting.values()), critic, margin)
+        acting = {self._below(k): Acting([(a, 1)], n) for k, a in self.algorithms.items()}
+        selector = acting.pop(SELECTOR)
+        return self.scene.woven(engine, selector, acting, self._margins())
+
+    def _margins(self) -> dict[str, float]:
+        """By the paths of critics, where calls are cut."""
+        own = {CRITIC: self.together.margin} if self.stage.entry.get("interrupt") else {}
+        return own | self.scene.margins
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """All learners, from a checkpoint, from what they learnt in earlier stages, or fresh."""
@@ -200,13 +211,13 @@ class WovenAgents(OneAgent):
             if isinstance(part, RolloutLearner):
                 part.anchor = anchor
             parts[name] = part
-        return WovenLearner(parts, self.together)
+        return WovenLearner(parts, self.node + CRITIC, self.together)
 
     def _anchor(
         self, name: str, algorithm: Algorithm, state: Any, device: torch.device
     ) -> Anchor | None:
         """What a skill that was trained before is to stay near: this state."""
-        near = self.together.anchor_nats is not None and name not in (SELECTOR, CRITIC)
+        near = self.together.anchor_nats is not None and not decides(name)
         if not near or algorithm.memory_size:  # what an anchor would remember is not known
             return None
         params = algorithm.acting_params(state, device=device)
@@ -215,13 +226,12 @@ class WovenAgents(OneAgent):
     def _part(self, name: str, stack: Stack, log: StageLog) -> Learner:
         """The learner of the selector, or of a skill."""
         num_envs, seeds = self.stage.config.num_envs, self.stage.seeds / name
-        config = stack.algorithm.config
+        config, row_steps = stack.algorithm.config, self.scene.steps_of_row(self._below(name))
         if stack.algorithm.store == "rollout":
             rows = num_envs * int(getattr(self.stage.config, "n_steps", config.n_steps))
-            whole = name in (SELECTOR, CRITIC)
-            quota = 0 if whole else max(1, round(rows * self.together.quota))
+            whole = self._below(name) in (SELECTOR, CRITIC)
+            quota = 0 if whole else max(1, round(rows * self.together.quota / row_steps))
             return RolloutLearner(stack, seeds, quota)
-        row_steps = self.scene.row_steps if name == SELECTOR else 1
         store = store_of(stack.algorithm, num_envs)
         found = ReplayLearner(
             [stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"]
@@ -246,7 +256,7 @@ class WovenAgents(OneAgent):
         requests = [
             Request(
                 0, (s.algorithm.acting_params(s.state),), s.state.gamma.cpu().numpy(),
-                seeds / name, greedy=name == SELECTOR or self.scene.skills.greedy,
+                seeds / name, greedy=self.scene.is_greedy(self._below(name)),
             )
             for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
         ]  # fmt: skip
