@@ -146,7 +146,9 @@ class Run:
         self.hierarchy.skill(skill)
         *nodes, name = skill.split("/")
         for node in nodes:
-            policy = policy.skills.policies[policy.labels.index(node)]
+            below = policy.skills.policies[policy.labels.index(node)]
+            assert isinstance(below, HierarchyPolicy)
+            policy = below
         return SkillAlone(policy.skills, name)
 
 

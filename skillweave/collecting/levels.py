@@ -136,7 +136,7 @@ class Level:
         self.below: dict[int, Inside] = {}
         self.leaves: dict[int, int] = {}  # by the skill's number, the leaf's, from 1
         self.learning: dict[int, LearningSkill] = {}
-        at = first
+        at: int = first
         for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
             name = path + skill.name
             below = skills_below(policy)
@@ -149,7 +149,7 @@ class Level:
             self.leaves[i], at = at, at + 1
             if isinstance(policy, LearningSkill):
                 self.learning[i] = policy
-        self.end = at
+        self.end: int = at
         """The number after that of the last leaf."""
 
     def all(self) -> Iterator[Level]:

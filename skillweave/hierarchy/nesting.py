@@ -7,7 +7,7 @@ is in it has a path: ``inner/skill``, ``inner/selector``.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from skillweave.messages import short
 from skillweave.skills import Skill
@@ -51,8 +51,7 @@ class Nestable:
 
 def inner_of(skill: Skill) -> Declaration | None:
     """The hierarchy that a skill is; None: it is none, or one that was trained elsewhere."""
-    found: Any = skill.policy
-    return found if isinstance(found, Nestable) else None
+    return cast("Declaration", skill.policy) if isinstance(skill.policy, Nestable) else None
 
 
 def inner_hierarchies(skills: Iterable[Skill]) -> Iterator[tuple[Skill, Declaration]]:

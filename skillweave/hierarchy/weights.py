@@ -53,14 +53,14 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
         if isinstance(own, Foreign) and (content := own.content()) is not None:
             tensors[f"{name}/content"] = torch.tensor(np.frombuffer(content, np.uint8))
     skills = dict(every_skill(declaration.skills))
-    inner = {name: own for name, skill in skills.items() if (own := inner_of(skill)) is not None}
+    inner = {k: found for k, skill in skills.items() if (found := inner_of(skill)) is not None}
     header = {
         "kind": "hierarchy",
         "recipe": getattr(declaration, "recipe", None),
         **place,
         "skills": list(skills),
         **_how(declaration),
-        "hierarchies": {name: _how(own) for name, own in inner.items()},
+        "hierarchies": {name: _how(found) for name, found in inner.items()},
         "parts": parts,
         "ready": ready,
     }

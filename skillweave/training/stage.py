@@ -138,8 +138,9 @@ class Stage:
 
         path = f"{name}/"
         beside = {path + k: v for k, v in self.beside.items()}
-        found = {"name": path + self.name, "node": path + self.node, "beside": beside}
-        return replace(self, **found, scene=scene)
+        return replace(
+            self, name=path + self.name, node=path + self.node, beside=beside, scene=scene
+        )
 
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""

@@ -192,7 +192,7 @@ class WovenAgents(OneAgent):
     def _margins(self) -> dict[str, float]:
         """By the paths of critics, where calls are cut."""
         own = {CRITIC: self.together.margin} if self.stage.entry.get("interrupt") else {}
-        return own | self.scene.margins
+        return own | dict(self.scene.margins)
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """All learners, from a checkpoint, from what they learnt in earlier stages, or fresh."""

@@ -207,7 +207,7 @@ def test_the_table_for_people():
     ]
 
 
-def test_a_hierarchy_as_a_skill_counts_as_one_and_alone_reports_its_own():
+def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():
     inner = woven(Paid, Zigzag)
 
     class Nested(Skill):
@@ -219,7 +219,11 @@ def test_a_hierarchy_as_a_skill_counts_as_one_and_alone_reports_its_own():
 
     outer = woven(Nested, Right, call_steps=None)
     found = evaluate(outer, EnvSpec(Walk), episodes=20).skills
-    assert set(found) == {"nested", "right"}
+    assert list(found) == ["nested", "nested/paid", "nested/zigzag", "right"]
+    below = found["nested/paid"], found["nested/zigzag"]
+    assert sum(x.steps for x in below) == found["nested"].steps
+    for report in below:
+        assert sum(report.ended.values()) == report.calls > 0
     assert found["nested"].return_sum == 2.0 * found["nested"].steps > 0
     assert sum(found["nested"].ended.values()) == found["nested"].calls
     alone = evaluate(SkillAlone(outer.skills, "nested"), EnvSpec(Walk), episodes=20)
