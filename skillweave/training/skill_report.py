@@ -25,8 +25,8 @@ class SkillReport:
 
     A skill that is a hierarchy has a report, and each of its own skills has one, under its path. A
     call in it goes on where the hierarchy is called again at once; where another skill follows, it
-    has ended by the limit. What needs the skills' declarations is not known of a policy that is no hierarchy,
-    and its reward and success not of a run that was loaded without its code.
+    has ended by the limit. What needs the skills' declarations is not known of a policy that is no
+    hierarchy, and its reward and success not of a run that was loaded without its code.
     """
 
     steps: Count
