@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from test_resume import assert_same, lines, policies, stopped_run
@@ -10,6 +12,7 @@ from skillweave import (
     DQN,
     PPO,
     RNN,
+    TD3,
     EnvSpec,
     Hierarchy,
     Lengths,
@@ -19,17 +22,17 @@ from skillweave import (
     Together,
 )
 from skillweave.cli import main
+from skillweave.envs.make import make_engine
 from skillweave.hierarchy.nesting import every_skill
 from skillweave.runs.directory import RunDirectory
+from skillweave.training.play import SeededEpisodes, play
 
 SMALL = Network(hidden=(8,))
 ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
 OFF = DQN(
     num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
 )
-MEMORY = PPO(
-    num_envs=4, n_steps=16, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6))
-)
+MEMORY = PPO(num_envs=4, n_steps=16, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6)))
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
 
@@ -148,8 +151,10 @@ def whole(tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("tick", [3, 8])
+LATER = [("apart", 12), ("apart", 22), ("then", 32), ("inside, then", 7), ("three", 8)]
+
+
+@pytest.mark.parametrize(("kind", "tick"), [*((k, t) for k in KINDS for t in (3, 5)), *LATER])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, tick):
     run = stopped_run(KINDS[kind](), tmp_path / "run", tick)
     assert not run.finished
@@ -192,11 +197,11 @@ def test_a_run_has_everyones_file_with_a_checksum(whole):
 
 
 def test_a_policy_in_anothers_place_is_refused(tmp_path, whole):
-    run = stopped_run(declare(), tmp_path / "run", 10_000, may_end=True)
-    one, other = (run.policy_path(f"inner/{k}") for k in ("balance", "right"))
+    copy = RunDirectory.open(shutil.copytree(whole("apart")[1], tmp_path / "run"))
+    one, other = (copy.policy_path(f"inner/{k}") for k in ("balance", "right"))
     one.write_bytes(other.read_bytes())
-    with pytest.raises(SkillweaveError, match="inner/right|another checksum"):
-        declare().load(run.path)
+    with pytest.raises(SkillweaveError, match="holds the policy of stage 'inner/right'"):
+        declare().load(copy.path)
 
 
 def test_info_names_all_levels(whole, capsys):
@@ -215,11 +220,19 @@ def test_a_skill_of_a_hierarchy_below_acts_alone(whole):
         run.evaluate(2, skill="inner/nobody")
 
 
-def test_captions_name_the_path(tmp_path, whole):
+def test_captions_name_the_path(whole):
     run, _ = whole("together")
-    told = run.render(tmp_path / "a.gif", deterministic=False, seed=1)
-    paths = {name for name, s in every_skill(run.hierarchy.skills)} - {"inner"}
-    assert set(told["skills"]) <= paths
+    seen = set()
+
+    def name(memory):
+        seen.add(run.policy.acts(memory))
+
+    engine = make_engine(CARTPOLE, 1)
+    engine.reset(0)
+    rng = np.random.default_rng(0)
+    episodes = SeededEpisodes(engine, range(9), 100)
+    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=name))
+    assert {"left", "inner/right"} <= seen <= {"left", "inner/right", "inner/balance", "push"}
 
 
 def test_budgets_of_all_levels_count_and_are_scaled():
@@ -249,6 +262,12 @@ def gains_itself():
     return found.train("never", quiet=True)
 
 
+def trained_twice():
+    found = careful()
+    found.algorithm = ON
+    return found
+
+
 WRONG = {
     "another environment": (
         lambda: declare(inside(env="Acrobot-v1")),
@@ -266,23 +285,20 @@ WRONG = {
         lambda: declare(call_steps=None),
         "skill 'inner' never stops|skill 'left'",
     ),
-    "lengths of zero": (lambda: declare(inside().as_skill(call_steps=0)), "'inner'.*call_steps is 0"),
+    "lengths of zero": (
+        lambda: declare(inside().as_skill(call_steps=0)),
+        "'inner'.*call_steps is 0",
+    ),
     "an algorithm": (
-        lambda: declare(inside().as_skill(algorithm=ON)),
-        "skill 'inner' is a hierarchy, so it has no algorithm",
+        lambda: declare(trained_twice()),
+        "skill 'careful' is a hierarchy, so it has no algorithm",
     ),
     "no such attribute": (lambda: inside().as_skill(cal_steps=3), "cal_steps"),
     "an algorithm that cannot": (
-        lambda: declare(inside(algorithm=_sac())).check_spaces(),
+        lambda: declare(inside(algorithm=TD3(num_envs=4))).check_spaces(),
         "'inner/balance'",
     ),
 }
-
-
-def _sac():
-    from skillweave import SAC
-
-    return SAC(num_envs=4)
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -24,6 +24,7 @@ _ELSEWHERE = {
     "target_success": "selector_target_return=",
 }
 """What of a skill a hierarchy says by itself, and where."""
+_ATTRIBUTES = ("call_steps", "max_steps", "color")
 
 
 class Nestable:
@@ -41,11 +42,18 @@ class Nestable:
             name: of the skill; None: the hierarchy's.
             attributes: of the skill: ``call_steps=30``, ``max_steps=100``. A subclass of ``Skill``
                 with ``policy = inner`` may have methods, too: a reward, an end.
+
+        Raises:
+            SkillweaveError: a skill has no such attribute.
         """
-        kind = type("Hierarchy", (Skill,), {"name": name or self.name, "policy": self})
-        for field, value in attributes.items():
-            setattr(kind, field, value)
-        skill: Skill = kind()
+        for field in attributes:
+            if field not in _ATTRIBUTES:
+                raise SkillweaveError(
+                    f"{self.name}.as_skill(): a skill that is a hierarchy takes no {short(field)}; "
+                    f"it takes {', '.join(_ATTRIBUTES)}"
+                )
+        own = {"name": name or self.name, "policy": self}
+        skill: Skill = type("Hierarchy", (Skill,), own | attributes)()
         return skill
 
 
