@@ -33,6 +33,7 @@ ALL = (
     ["search"],
     ["four_rooms"],
     ["together"],
+    ["nested"],
 )
 
 

@@ -99,7 +99,7 @@ class Deliver(OfErrand):
         return self.state(step.next_obs) == DELIVERED
 
 
-def declare(steps: int = 300_000, **how: Any) -> sw.Hierarchy:
+def declare(steps: int = 150_000, **how: Any) -> sw.Hierarchy:
     """The hierarchy of both errands; ``how`` changes any setting of the upper one."""
     env = sw.EnvSpec(Errands, workers=1)
     learner = sw.PPO(num_envs=16, n_steps=128, gamma=0.97, network=sw.Network(hidden=(64, 64)))
@@ -120,7 +120,7 @@ hierarchy = declare()
 def main() -> None:
     """Train it, and say how many episodes it solves."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=300_000)
+    parser.add_argument("--steps", type=int, default=150_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default="runs/nested")
     asked = parser.parse_args()
