@@ -1,4 +1,4 @@
-"""A hierarchy of two hierarchies (``examples/nested.py``): how it learns, and that a kill is no harm.
+"""A hierarchy of two hierarchies (``examples/nested.py``): how it learns; killed and resumed, too.
 
     python -m benchmarks.nested [CASE …] [--seeds 0 1 2 3 4] [--steps 150000]
 
@@ -46,7 +46,7 @@ def train(case: str, steps: int, seed: int, path: Path) -> None:
 def killed(case: str, steps: int, seed: int, path: Path) -> RunDirectory:
     """A run whose process was killed in the middle of its last stage, and that was resumed."""
     process = multiprocessing.get_context("spawn").Process(
-        target=train, args=(case, steps, seed, path)
+        target=train, args=(case, steps, seed, path), daemon=True
     )
     process.start()
     while process.is_alive() and not _half_done(path):

@@ -235,6 +235,49 @@ def test_captions_name_the_path(whole):
     assert {"left", "inner/right"} <= seen <= {"left", "inner/right", "inner/balance", "push"}
 
 
+class Task(Skill):
+    """Has no code of its own."""
+
+
+class Short(Skill):
+    """Has no code of its own either."""
+
+    max_steps = 4
+
+
+def test_a_run_without_code_is_loaded_from_its_own_record(tmp_path, capsys):
+    plain = options(env="CartPole-v1", call_steps=3)
+    inner = Hierarchy(skills=[Short(), Task()], **plain | {"name": "inner", "call_steps": 2})
+    found = Hierarchy(skills=[Task(), inner], **plain | {"learn": "together"})
+    run = found.train(tmp_path / "run", quiet=True)
+    assert not run.info()["needs_recipe"]
+    again = Hierarchy.from_manifest(run.info()).load(run.path)
+    assert again.evaluate(3).returns == run.evaluate(3).returns
+    assert [name for name, _ in every_skill(again.hierarchy.skills)] == [
+        "task", "inner", "inner/short", "inner/task",
+    ]  # fmt: skip
+    assert main(["evaluate", str(run.path), "--episodes", "2"]) == 0
+    assert "inner/short" in capsys.readouterr().out
+
+
+def test_a_run_of_other_levels_is_refused(whole):
+    _, path = whole("apart")
+    for other in (declare(inside(Right(), Balance())), declare(inside(name="other"))):
+        with pytest.raises(SkillweaveError, match="inner/balance, inner/right"):
+            other.load(path)
+    with pytest.raises(SkillweaveError, match=r"inner has a trained selector, but .* a ready one"):
+        declare(inside(selector=ready)).load(path)
+
+
+def test_a_hierarchy_of_a_run_can_be_a_skill_beside_one_that_is_trained(tmp_path, whole):
+    run, _ = whole("apart")
+    both = [run.as_skill("done"), inside()]
+    found = Hierarchy(skills=both, **options(call_steps=5, learn="together"))
+    made = found.train(tmp_path / "run", quiet=True)
+    assert {k.partition("/")[0] for k in made.evaluate(2).skills} == {"done", "inner"}
+    assert found.load(tmp_path / "run").evaluate(2) == made.evaluate(2)
+
+
 def test_budgets_of_all_levels_count_and_are_scaled():
     found = declare()
     assert found.total_steps == (300 + 300 + 300) + 300 + 300

@@ -88,7 +88,7 @@ class DecisionCollector(Collector):
         raw = self.engine.step(action)
         seen = self._seen(obs, action, raw) if self._watches else None
         why = self.skills.observe(self._calls, self._all, seen)
-        counts = raw if self.seen_as is None else self._judged(self.seen_as, seen, raw)
+        counts = raw if self.seen_as is None else self._judged(self.seen_as, seen, raw, why)
         self._count(counts)
         ended = counts.terminated | counts.truncated
         why[ended] = Why.EPISODE
@@ -118,12 +118,19 @@ class DecisionCollector(Collector):
             self._never, self._calls["elapsed"], raw.info,
         )  # fmt: skip
 
-    def _judged(self, skill: Skill, seen: Step | None, raw: RawStep) -> RawStep:
-        """A step with the reward and the ends of the skill that all of it is."""
+    def _judged(self, skill: Skill, seen: Step | None, raw: RawStep, why: Array) -> RawStep:
+        """A step with the reward and the ends of the skill that all of it is.
+
+        Where a call is over (``why``) and no skill may start, it ends, too; its value goes on.
+        """
         assert seen is not None
         step = skill_step(seen, self._all, self.kept["age"] + 1, skill.max_steps)
         reward, terminated = judged(skill, step, self._all)
-        truncated = (raw.truncated | step.timed_out) & ~terminated
+        truncated = raw.truncated | step.timed_out
+        if self.skills.restricts:
+            waits = np.flatnonzero(why != Why.RUNNING)
+            truncated[waits] |= ~self.skills.startable(raw.next_obs[waits]).any(axis=1)
+        truncated &= ~terminated
         return RawStep(raw.next_obs, reward, terminated, truncated, raw.info)
 
     def _row(self, ids: Array, raw: RawStep) -> dict[str, Array]:

@@ -13,6 +13,7 @@ from test_woven import Learner, Values
 from toy_acting import Again, Choices, Counts, requests, valid_rows
 
 from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.levels import Inner
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.make import EnvSpec, make_engine
@@ -303,3 +304,29 @@ def test_a_collector_goes_on_where_a_state_was_taken():
         for mine, theirs in zip((a, *a.parts), (b, *b.parts), strict=True):
             for name in ("obs", "action", "reward", "steps", "terminated", "truncated", "valid"):
                 np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
+
+
+class Early(Skill):
+    """May start in the first steps of an episode only."""
+
+    policy = scripted(1)
+
+    def initiation(self, obs):
+        return obs[:, T] < 2
+
+
+@pytest.mark.parametrize("call_steps", [1, 3])
+def test_apart_a_hierarchy_is_judged_as_the_skill_that_it_is(call_steps):
+    skills = SkillSet((Early(),), (Early.policy,), call_steps=call_steps)
+    engine = make_engine(EnvSpec(Walk, engine="sync"), N)
+    collector = DecisionCollector(engine, Choices(N, 1), skills, seen_as=Paid())
+    collector.start(Seeds(7))
+    rows = collector.collect(next(requests(60, GAMMA))).experience
+    for n in range(N):
+        for row in _rows(rows, n):
+            t, tau = row["obs"][T], row["steps"]
+            assert t + tau <= max(2, call_steps) and tau <= call_steps
+            told = [row["obs"][POSITION] + 0.5 * (t + k + 1) for k in range(int(tau))]
+            assert row["reward"] == pytest.approx(sum(GAMMA**k * r for k, r in enumerate(told)))
+            if not row["terminated"]:
+                assert row["truncated"] == (t + tau >= 2), "then none may start: its value goes on"
