@@ -325,7 +325,8 @@ def test_apart_a_hierarchy_is_judged_as_the_skill_that_it_is(call_steps):
     for n in range(N):
         for row in _rows(rows, n):
             t, tau = row["obs"][T], row["steps"]
-            assert t + tau <= max(2, call_steps) and tau <= call_steps
+            assert t + tau <= max(2, call_steps)
+            assert tau <= call_steps
             told = [row["obs"][POSITION] + 0.5 * (t + k + 1) for k in range(int(tau))]
             assert row["reward"] == pytest.approx(sum(GAMMA**k * r for k, r in enumerate(told)))
             if not row["terminated"]:
