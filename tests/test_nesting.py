@@ -128,6 +128,9 @@ KINDS = {
     "inside, then": lambda: declare(
         inside(learn="apart, then together", skill_steps=100, selector_steps=100)
     ),
+    "inside, then, in some places": lambda: declare(
+        inside(Balance(), learn="apart, then together", together_steps=200)
+    ),
     "three": three,
 }
 

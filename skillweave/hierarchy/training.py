@@ -102,9 +102,18 @@ def _trained(
     if len(apart) == len(stages):
         return before
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
-    if not apart:
+    if not apart or (nodes and not _plays_alone(declaration)):
         return after
     return _better(declaration, run, listeners, before, after, nodes)
+
+
+def _plays_alone(declaration: Declaration) -> bool:
+    """Whether a hierarchy can play whole episodes by itself: some skill may start everywhere."""
+    for skill in declaration.skills:
+        inner = inner_of(skill)
+        if not skill.defines("initiation") and (inner is None or _plays_alone(inner)):
+            return True
+    return False
 
 
 def _better(
