@@ -8,6 +8,7 @@ from benchmarks.common import run_command
 
 QUICK = (
     ["startup"],
+    ["report"],
     ["updates"],
     ["replay"],
     ["speed", "--seeds", "0"],
@@ -17,6 +18,7 @@ QUICK = (
 )
 ALL = (
     ["startup"],
+    ["report"],
     ["updates"],
     ["speed"],
     ["flat"],
@@ -34,6 +36,7 @@ ALL = (
     ["four_rooms"],
     ["together"],
     ["nested"],
+    ["export"],
 )
 
 

@@ -24,7 +24,7 @@ from benchmarks.common import median, report, table, workers
 from examples import doorkey
 from skillweave import Hierarchy, Lengths, SkillweaveError, Together
 
-FLOOR = Together(floor=0.6, floor_final=0.2)
+FLOOR = Together(floor=1.0, floor_final=0.1)
 
 declare = functools.partial(doorkey.declare, workers=1)  # runs go side by side
 
@@ -41,7 +41,7 @@ def apart(size: str, steps: int) -> Hierarchy:
 CASES: dict[str, Callable[[str, int], Hierarchy]] = {
     "together": declare,
     "apart": apart,
-    "low floor": functools.partial(declare, together=Together()),
+    "low floor": functools.partial(declare, together=Together(floor=0.3, floor_final=0.02)),
     "no floor": functools.partial(declare, together=Together(floor=0.0, floor_final=0.0)),
     "no call cost": functools.partial(declare, call_cost=0.0),
     "task advantage": functools.partial(declare, together=replace(FLOOR, task_weight=1.0)),

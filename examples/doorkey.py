@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -27,6 +27,22 @@ def make(render_mode: str | None = None, size: str = "8x8") -> gym.Env[Any, Any]
     from minigrid.wrappers import ImgObsWrapper
 
     return ImgObsWrapper(gym.make(f"MiniGrid-DoorKey-{size}-v0", render_mode=render_mode))
+
+
+class Image(sw.PoolWrapper):
+    """Observations of EnvPool's DoorKey as those of ``make``: the image alone."""
+
+    def __init__(self, pool: Any) -> None:
+        super().__init__(pool, pool.observation_space["image"])
+
+    def see(self, obs: Any, ids: sw.Array) -> sw.Array:
+        image: sw.Array = obs["image"]
+        return image
+
+
+def many(num_envs: int, threads: int, seed: int, size: str = "8x8") -> Image:
+    """The same DoorKey in EnvPool, ten times as fast."""
+    return Image(sw.envpool(f"MiniGrid-DoorKey-{size}-v0", num_envs, threads, seed))
 
 
 def carrying(obs: sw.Array) -> sw.Array:
@@ -84,21 +100,30 @@ def algorithm(**how: Any) -> sw.PPO:
 
 
 def declare(
-    size: str = "8x8", steps: int = 500_000, workers: int | None = None, **how: Any
+    size: str = "8x8",
+    steps: int = 500_000,
+    workers: int | None = None,
+    engine: Literal["auto", "sync"] = "auto",
+    **how: Any,
 ) -> sw.Hierarchy:
-    """The hierarchy; ``how`` changes any of its settings."""
+    """The hierarchy; ``how`` changes any of its settings.
+
+    Args:
+        engine: auto: in EnvPool, where it is installed; sync: in Python.
+    """
     settings = {
         "call_steps": 32,
         "learn": "together",
         "together_steps": steps,
-        # A floor under every skill's share of calls: one that may start anywhere takes them all.
-        "together": sw.Together(floor=0.6, floor_final=0.2),
+        # At first any skill that may start is called: else one that may start anywhere takes all.
+        "together": sw.Together(floor=1.0, floor_final=0.1),
         "call_cost": 0.01,  # a call that ends at once is not worth as much as one that does not
         "greedy_skills": False,
         "algorithm": algorithm(),
         "selector": algorithm(),
     } | how
-    env = sw.EnvSpec(make if size == "8x8" else partial(make, size=size), workers=workers)
+    one = make if size == "8x8" else partial(make, size=size)
+    env = sw.EnvSpec(one, pool=partial(many, size=size), engine=engine, workers=workers)
     return sw.Hierarchy(env, [GetKey(), OpenDoor(), Goal()], **settings)
 
 

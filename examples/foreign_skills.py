@@ -18,8 +18,7 @@ import stable_baselines3 as sb3
 import torch
 from onnx import TensorProto, helper
 
-from skillweave import PPO, Hierarchy, Skill, from_onnx, from_sb3
-from skillweave.types import Array
+from skillweave import PPO, Array, Hierarchy, Skill, from_onnx, from_sb3
 
 ENV = "CartPole-v1"
 

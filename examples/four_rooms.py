@@ -15,8 +15,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import DQN, Hierarchy, Network, Skill
-from skillweave.types import Array
+from skillweave import DQN, Array, Hierarchy, Network, Skill
 
 PLAN = [
     "#############",

@@ -13,18 +13,27 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave import ActingParams, Algorithm, Report, Rollout, register_algorithm, train_agent
-from skillweave.algorithms.base import AgentState
-from skillweave.algorithms.config import OnPolicy
-from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.networks.heads import ActionHead
-from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout
-from skillweave.ops.distributions import mask_logits
-from skillweave.ops.moments import masked_mean, normalise
-from skillweave.ops.optim import adam_, clip_grad_norm_
-from skillweave.ops.returns import gae
-from skillweave.seeding import Seeds
+from skillweave import (
+    ActingParams,
+    ActionHead,
+    AgentState,
+    Algorithm,
+    Layout,
+    Net,
+    OnPolicy,
+    ParameterGroup,
+    Report,
+    Rollout,
+    Seeds,
+    adam_,
+    clip_grad_norm_,
+    gae,
+    mask_logits,
+    masked_mean,
+    normalise,
+    register_algorithm,
+    train_agent,
+)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Ready selectors: a function, an automaton and a behaviour tree choose skills; nothing is trained.
 
+In the end an automaton guides a selector that is trained: it says what may be called in each state.
+
 The task is a corridor: get the key at its left end, open the door at its right end, leave. Skills
 may be trained as in any hierarchy; here they are short functions, so the example takes a second.
 
@@ -16,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave as sw
-from skillweave.types import Array
+from skillweave import Array
 
 PLACE, KEY, DOOR = range(3)
 
@@ -109,6 +111,20 @@ tree = sw.tree.Sequence(
 )
 
 
+# 4. A guide: what the automaton leaves open, a selector learns.
+guide = sw.Automaton(
+    states={"no key": {"get_key", "leave"}, "key": {"open_door", "leave"}, "open": "leave"},
+    transitions={("no key", "key"): got_key, ("key", "open"): "success"},
+)
+guided = sw.Hierarchy(
+    Corridor,
+    [GetKey(), OpenDoor(), Leave()],
+    selector=sw.PPO(num_envs=8, n_steps=32),
+    guide=guide,
+    selector_steps=4_000,
+)
+
+
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, selector in {"function": rule, "automaton": automaton, "tree": tree}.items():
@@ -116,6 +132,8 @@ def main() -> None:
             run = hierarchy.train(Path(folder) / name, quiet=True)  # skills that learn learn here
             score = run.evaluate(50)
             print(f"{name:<10} return {score.mean:.2f}, {np.mean(score.lengths):.1f} steps")
+        score = guided.train(Path(folder) / "guided", quiet=True).evaluate(50)
+        print(f"guided     return {score.mean:.2f}, {np.mean(score.lengths):.1f} steps")
 
 
 if __name__ == "__main__":

@@ -18,25 +18,31 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from skillweave import EnvSpec, Evaluation, Hierarchy, OptionsEnv, Skill, evaluate
-from skillweave.envs.make import make_engine
-from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.types import Array
+from skillweave import (
+    Array,
+    Evaluation,
+    Hierarchy,
+    HierarchyPolicy,
+    OptionsEnv,
+    Policy,
+    Skill,
+    evaluate,
+    from_function,
+    make_options_env,
+)
 
 GAMMA = 0.999  # of one environment step
 CALL_STEPS = 10
 
 
-def leaning(sign: float, env: str = "CartPole-v1") -> ScriptedPolicy:
+def leaning(sign: float) -> Policy:
     """Balances the pole a little aside of upright, so that the cart drifts."""
 
     def act(obs: Array) -> Array:
         angle, turning = obs[:, 2], obs[:, 3]
         return (angle - sign * 0.1 + 0.5 * turning > 0).astype(np.int64)
 
-    reference = EnvSpec(env).make()
-    return ScriptedPolicy(act, reference.observation_space, reference.action_space)
+    return from_function(act)
 
 
 class DriftLeft(Skill):
@@ -118,15 +124,15 @@ class StepBudget(BaseCallback):
         return self.left > 0
 
 
-def score(model: PPO, hierarchy: Hierarchy, episodes: int) -> Evaluation:
+def score(model: PPO, env: OptionsEnv, episodes: int) -> Evaluation:
     """Evaluate the selector with its skills as one policy, on Gymnasium's environment."""
 
     def choose(obs: Array) -> Array:
         return model.predict(obs, deterministic=True)[0]
 
-    selector = ScriptedPolicy(choose, model.observation_space, model.action_space)
-    skills = hierarchy.skill_set([s.policy for s in hierarchy.skills])
-    return evaluate(HierarchyPolicy(selector, skills), hierarchy.spec, episodes=episodes)
+    spaces = {"observation_space": model.observation_space, "action_space": model.action_space}
+    woven = HierarchyPolicy(from_function(choose, **spaces), env.skills)
+    return evaluate(woven, "CartPole-v1", episodes=episodes)
 
 
 def main() -> None:
@@ -138,19 +144,18 @@ def main() -> None:
     torch.set_num_threads(1)
 
     hierarchy = Hierarchy("CartPole-v1", [DriftLeft(), DriftRight()], call_steps=CALL_STEPS)
-    hierarchy.check_spaces()
-    skills = hierarchy.skill_set([s.policy for s in hierarchy.skills])
-    env = SB3VecEnv(OptionsEnv(make_engine(hierarchy.spec, num_envs=8), skills, GAMMA), args.seed)
+    options = make_options_env(hierarchy, 8, GAMMA)
+    env = SB3VecEnv(options, args.seed)
     model = PPO(
         "MlpPolicy", env, n_steps=32, batch_size=64, learning_rate=1e-3,
         gamma=GAMMA**CALL_STEPS, seed=args.seed, device="cpu",
     )  # fmt: skip
     for skill in hierarchy.skills:
         assert skill.policy is not None
-        alone = evaluate(skill.policy, hierarchy.spec, episodes=args.episodes)
+        alone = evaluate(skill.policy, "CartPole-v1", episodes=args.episodes)
         print(f"{skill.name} alone: {alone}")
     model.learn(total_timesteps=args.steps, callback=StepBudget(args.steps))
-    print(f"woven by the selector: {score(model, hierarchy, args.episodes)}")
+    print(f"woven by the selector: {score(model, options, args.episodes)}")
     env.close()
 
 

@@ -6,30 +6,46 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skillweave.algorithms.base import ActingParams, Algorithm
-    from skillweave.algorithms.config import DQN, PPO, SAC, TD3
+    from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
+    from skillweave.algorithms.config import DQN, PPO, SAC, TD3, OnPolicy
+    from skillweave.algorithms.parameters import ParameterGroup
     from skillweave.algorithms.registry import register_algorithm
     from skillweave.api import Agent, Hierarchy, Run, train_agent
+    from skillweave.api.options import make_options_env
+    from skillweave.api.player import Player
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
+    from skillweave.envs.pool import PoolWrapper, envpool
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, Selection
     from skillweave.experience import Report, Rollout, Sample
+    from skillweave.export.write import Export
     from skillweave.hierarchy.options import OptionsEnv
+    from skillweave.hierarchy.policy import HierarchyPolicy
     from skillweave.networks.config import CNN, RNN, Network
     from skillweave.networks.encoders import Encoder, register_encoder
+    from skillweave.networks.heads import ActionHead
+    from skillweave.networks.net import Net
+    from skillweave.networks.stacked import Layout
+    from skillweave.ops.distributions import mask_logits
+    from skillweave.ops.moments import masked_mean, normalise
+    from skillweave.ops.optim import adam_, clip_grad_norm_
+    from skillweave.ops.returns import gae
+    from skillweave.seeding import Seeds
     from skillweave.selectors import Automaton, LastCall, tree
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
     from skillweave.training.evaluation import Evaluation, evaluate
     from skillweave.training.stage import Together
-    from skillweave.types import Array, SkillweaveError, Step
+    from skillweave.types import Array, Policy, SkillweaveError, Step
 
 __version__ = "0.1.0"
 
 _HOME = {
     "ActingParams": "algorithms.base",
-    "Algorithm": "algorithms.base",
+    "ActionHead": "networks.heads",
     "Agent": "api",
+    "AgentState": "algorithms.base",
+    "Algorithm": "algorithms.base",
     "Array": "types",
     "Automaton": "selectors",
     "CNN": "networks.config",
@@ -38,14 +54,23 @@ _HOME = {
     "EnvSpec": "envs.make",
     "Evaluation": "training.evaluation",
     "Evolution": "evolution.config",
+    "Export": "export.write",
     "Heir": "evolution.selection",
     "Hierarchy": "api",
+    "HierarchyPolicy": "hierarchy.policy",
+    "LastCall": "selectors",
+    "Layout": "networks.stacked",
     "Lengths": "collecting.lengths",
     "Mutations": "evolution.config",
-    "LastCall": "selectors",
+    "Net": "networks.net",
     "Network": "networks.config",
+    "OnPolicy": "algorithms.config",
     "OptionsEnv": "hierarchy.options",
     "PPO": "algorithms.config",
+    "ParameterGroup": "algorithms.parameters",
+    "Player": "api.player",
+    "Policy": "types",
+    "PoolWrapper": "envs.pool",
     "RNN": "networks.config",
     "Range": "evolution.config",
     "Reflex": "skills",
@@ -54,6 +79,7 @@ _HOME = {
     "Run": "api",
     "SAC": "algorithms.config",
     "Sample": "experience",
+    "Seeds": "seeding",
     "Selection": "evolution.selection",
     "Skill": "skills",
     "SkillweaveError": "types",
@@ -62,11 +88,19 @@ _HOME = {
     "Together": "training.stage",
     "Tournament": "evolution.config",
     "Truncation": "evolution.config",
+    "adam_": "ops.optim",
+    "clip_grad_norm_": "ops.optim",
+    "envpool": "envs.pool",
     "evaluate": "training.evaluation",
     "from_function": "skills",
     "from_onnx": "skills",
     "from_sb3": "skills",
     "from_torch": "skills",
+    "gae": "ops.returns",
+    "make_options_env": "api.options",
+    "mask_logits": "ops.distributions",
+    "masked_mean": "ops.moments",
+    "normalise": "ops.moments",
     "register_algorithm": "algorithms.registry",
     "register_encoder": "networks.encoders",
     "train_agent": "api",
@@ -81,7 +115,9 @@ __all__ = [
     "SAC",
     "TD3",
     "ActingParams",
+    "ActionHead",
     "Agent",
+    "AgentState",
     "Algorithm",
     "Array",
     "Automaton",
@@ -89,19 +125,29 @@ __all__ = [
     "EnvSpec",
     "Evaluation",
     "Evolution",
+    "Export",
     "Heir",
     "Hierarchy",
+    "HierarchyPolicy",
     "LastCall",
+    "Layout",
     "Lengths",
     "Mutations",
+    "Net",
     "Network",
+    "OnPolicy",
     "OptionsEnv",
+    "ParameterGroup",
+    "Player",
+    "Policy",
+    "PoolWrapper",
     "Range",
     "Reflex",
     "Report",
     "Rollout",
     "Run",
     "Sample",
+    "Seeds",
     "Selection",
     "Skill",
     "SkillweaveError",
@@ -109,11 +155,19 @@ __all__ = [
     "Together",
     "Tournament",
     "Truncation",
+    "adam_",
+    "clip_grad_norm_",
+    "envpool",
     "evaluate",
     "from_function",
     "from_onnx",
     "from_sb3",
     "from_torch",
+    "gae",
+    "make_options_env",
+    "mask_logits",
+    "masked_mean",
+    "normalise",
     "register_algorithm",
     "register_encoder",
     "train_agent",

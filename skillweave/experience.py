@@ -43,6 +43,8 @@ class Experience:
     starts: Array | None = None  # (T, N) bool, an episode begins here, so memory is empty before it
     rewards: Array | None = None  # (T, N, L) float32, of each step of a call, then zeros
     advantage: Array | None = None  # (T, N) float32, what counts beside the learner's own
+    guide: Array | None = None  # (T, N, A) float32, logits of a ready selector's choice
+    overridden: Array | None = None  # (T, N) bool, a reflex acted, not ``action``; None: nowhere
     parts: tuple[Experience, ...] = ()
     """Of a selector: what its skills did in the same steps, those that learn, in their order."""
     spent: int = 0
@@ -73,10 +75,13 @@ class Rollout:
     obs_mask: Tensor | None = None  # (P, T, B, A) bool
     valid: Tensor | None = None  # (P, T, B) bool; None: all
     head: Tensor | None = None  # (P, T, B, H)
-    log_std: Tensor | None = None  # (P, 1, 1, A), of who acted, where it is no part of ``head``
+    log_std: Tensor | None = None
+    """Of who acted, where it is no part of ``head``: (P, 1, 1, A), or (P, 1, B, A), by column."""
     memory: Tensor | None = None  # (P, B, M), before the first row
     starts: Tensor | None = None  # (P, T, B) bool, memory is empty before this row
     advantage: Tensor | None = None  # (P, T, B), what counts beside the learner's own advantage
+    guide: Tensor | None = None  # (P, T, B, A), logits of a ready selector's choice
+    overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted instead; None: nowhere
     anchor: Anchor | None = None
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
@@ -85,8 +90,9 @@ class Rollout:
 class Anchor:
     """The policy that a learner is to stay near."""
 
-    params: Any  # ``ActingParams`` of P members
+    params: Any | None  # ``ActingParams`` of P members; None: ``Rollout.guide`` says what it does
     coef: Tensor  # (P,), what a nat of KL from it costs
+    nats: float = 0.0  # how far from it the learner is to be; the cost follows it
 
 
 @dataclass(slots=True)

@@ -24,6 +24,7 @@ BASE = {"types", "messages", "reading", "experience", "shapes"}
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
 LEARNING |= {"collecting", "selectors"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "recipes", "api"}
+EVERYTHING |= {"export"}
 ROOMS: dict[str, set[str]] = {
     "seeding": set(),
     "types": set(),
@@ -44,6 +45,7 @@ ROOMS: dict[str, set[str]] = {
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
+    "export": LEARNING | {"training", "hierarchy"},
     "reporting": BASE | {"skills", "envs", "runs", "training", "hierarchy"},
     "recipes": {"skillweave", "api"},
     "api": EVERYTHING,

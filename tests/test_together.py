@@ -208,7 +208,6 @@ WRONG = {
     "it must be at least 1, Lengths": {"call_steps": 0},
     "call_cost is -1": {"call_cost": -1},
     "interrupt is 3": {"interrupt": 3},
-    "learn is 'together', but the selector is ready": {"selector": lambda obs: obs[:, 0] > 0},
 }
 
 

@@ -27,7 +27,7 @@ class AgentPolicy(Memoryless):
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
         self.algorithm, self.weights = algorithm, weights
-        self._params = algorithm.acting_params_of(weights)
+        self.params = algorithm.acting_params_of(weights)
         self.observation_space = algorithm.observation_space
         self.action_space = algorithm.action_space
 
@@ -60,7 +60,7 @@ class AgentPolicy(Memoryless):
         allowed = None if mask is None else torch.from_numpy(mask)[None]
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
         before = torch.from_numpy(memory["rnn"])[None] if memory else None
-        action, _, after = self.algorithm.act(self._params, rows, allowed, noise, before)
+        action, _, after = self.algorithm.act(self.params, rows, allowed, noise, before)
         memory = {} if after is None else {"rnn": after[0].numpy()}
         return self.algorithm.to_env(action[0].numpy()), memory
 
@@ -68,7 +68,7 @@ class AgentPolicy(Memoryless):
     def heads(self, obs: Array) -> Array:
         """What actions are chosen from, (n, H), without a memory: logits, means or values."""
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
-        _, head, _ = self.algorithm.act(self._params, rows, None, None)
+        _, head, _ = self.algorithm.act(self.params, rows, None, None)
         assert head is not None
         found: Array = head[0].numpy()
         return found

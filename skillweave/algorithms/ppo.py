@@ -182,26 +182,27 @@ class PPOAlgorithm(Algorithm):
         raw, _ = self.run(self.critic_net, views, batch.inputs, batch.memory, batch.starts)
         if batch.memory is not None:
             batch = batch.changed(lambda x: x.flatten(1, 2))
-        log_std, valid = views.get("actor.log_std"), batch.valid
+        log_std, valid, acted = views.get("actor.log_std"), batch.valid, batch.own
         own = head  # the anchor is compared without the floor
         if now.floor is not None:
             head = with_floor(head, batch.mask, now.floor)
         log_prob, entropy = self.head.stats(head, log_std, batch.mask, batch.action)
         old, weight = batch.log_prob, batch.importance
-        policy = ppo_policy_loss(log_prob, old, batch.advantage, state.clip_coef, weight, valid)
+        policy = ppo_policy_loss(log_prob, old, batch.advantage, state.clip_coef, weight, acted)
         clip = self.config.clip_value
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
         value = value_loss(raw.squeeze(-1), batch.target, batch.old_value, bound, valid)
-        bonus = masked_mean(entropy, valid)
+        bonus = masked_mean(entropy, acted)
         total = policy + state.vf_coef * value - now.ent_coef * bonus
         with torch.no_grad():
-            kl = approximate_kl(log_prob, old, weight, valid)
+            kl = approximate_kl(log_prob, old, weight, acted)
         report = {"policy_loss": policy, "value_loss": value, "entropy": bonus, "kl": kl}
         if now.anchor is not None:
-            other = now.anchor.params.views.get("actor.log_std")
+            near = now.anchor.params
+            other = None if near is None else near.views.get("actor.log_std")
             assert batch.anchor is not None
             away = self.head.kl(own, log_std, batch.anchor, other, batch.mask)
-            report["anchor_kl"] = masked_mean(away, valid)
+            report["anchor_kl"] = masked_mean(away, acted)
             total = total + now.anchor.coef * report["anchor_kl"]
         return total, {k: v.detach() for k, v in report.items()}
 

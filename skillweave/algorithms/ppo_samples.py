@@ -87,17 +87,19 @@ def samples_of(
     if now.floor is not None:
         head = with_floor(head, mask, now.floor)
     log_prob, _ = agent.head.stats(head, params.views.get("actor.log_std"), mask, action)
+    own = _own(cells.flat_or_none(rollout.overridden), valid)
     samples = Samples(
         inputs={} if memory is not None else inputs,
         action=action,
         log_prob=log_prob,
         importance=(log_prob - _acted(agent, rollout, cells, mask, action)).exp(),
-        advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), valid),
-        anchor=_anchor(agent, now, obs),
+        advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), own),
+        anchor=_anchor(agent, now, rollout, cells),
         target=(returns - mean) / scale,
         old_value=None if cfg.clip_value is None else (value - mean) / scale,
         mask=mask,
         valid=valid,
+        own=own,
         most=cells.most,
     )
     if memory is not None:
@@ -106,19 +108,36 @@ def samples_of(
     return samples, metrics
 
 
-def _anchor(agent: PPOAlgorithm, now: Terms, obs: Tensor) -> Tensor | None:
-    """Heads (P, N, H) of the policy that the learner is to stay near."""
-    if now.anchor is None or agent.memory_size:  # what the anchor would remember is not known
+def _own(overridden: Tensor | None, valid: Tensor | None) -> Tensor | None:
+    """Samples that the policy learns from, (P, N) bool: a reflex's action says nothing of it."""
+    if overridden is None:
+        return valid
+    return ~overridden if valid is None else valid & ~overridden
+
+
+def _anchor(agent: PPOAlgorithm, now: Terms, rollout: Rollout, cells: Cells) -> Tensor | None:
+    """Heads (P, N, H) of the policy that the learner is to stay near.
+
+    Where there is a memory, it runs along each trajectory. What the anchor would remember from
+    before the rollout's first row is not known; the learner, who is near, says it.
+    """
+    if now.anchor is None:
         return None
-    params = now.anchor.params
-    return agent.actor_net(params.views, agent.inputs(params, obs))
+    if now.anchor.params is None:
+        return cells.flat_or_none(rollout.guide)
+    params, recurrent = now.anchor.params, bool(agent.memory_size)
+    inputs = agent.inputs(params, cells.flat(rollout.obs))
+    if recurrent:
+        inputs = {k: cells.unflat(v) for k, v in inputs.items()}
+    memory, starts = (rollout.memory, rollout.starts) if recurrent else (None, None)
+    return agent.run(agent.actor_net, params.views, inputs, memory, starts)[0]
 
 
 def _advantage(
-    agent: PPOAlgorithm, own: Tensor, other: Tensor | None, valid: Tensor | None
+    agent: PPOAlgorithm, own: Tensor, other: Tensor | None, counts: Tensor | None
 ) -> Tensor:
     """The learner's own advantage, and what counts beside it in the same units, (P, N)."""
-    own = normalise(own, valid) if agent.config.normalize_advantage else own
+    own = normalise(own, counts) if agent.config.normalize_advantage else own
     return own if other is None else own + other
 
 
@@ -127,7 +146,10 @@ def _acted(
 ) -> Tensor:
     """Log-probabilities (P, N) of the actions by the policy that acted."""
     assert rollout.head is not None
-    log_std = None if rollout.log_std is None else rollout.log_std.flatten(1, 2)
+    log_std = rollout.log_std
+    if log_std is not None:
+        one = log_std.shape[2] == 1
+        log_std = log_std[:, 0] if one else cells.flat(log_std.expand(-1, cells.shape[0], -1, -1))
     return agent.head.stats(cells.flat(rollout.head), log_std, mask, action)[0]
 
 

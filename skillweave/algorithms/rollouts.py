@@ -97,6 +97,7 @@ class Samples:
     anchor: Tensor | None = None  # (P, N, H), heads of the policy that it is to stay near
     mask: Tensor | None = None  # bool, allowed actions; None: all
     valid: Tensor | None = None  # bool, samples that count; None: all
+    own: Tensor | None = None  # bool, those whose action was the policy's own; None: as ``valid``
     starts: Tensor | None = None  # bool, memory is empty before this row
     memory: Tensor | None = None  # (P, B, M), before the first row
     most: int = 0

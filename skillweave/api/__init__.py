@@ -234,7 +234,7 @@ def _train(
     assign_workers(content["stages"], declared.spec)
     for stage in content["stages"]:
         acts: Any = action_space
-        if stage["decides"] is not None and isinstance(declared, Hierarchy):
+        if stage["decides"] in stage["learns"] and isinstance(declared, Hierarchy):
             acts = declared.chooses_from(stage["decides"], action_space)
         check_replay(stage, observation_space, acts)
         for name, config in stage.get("algorithms", {}).items():

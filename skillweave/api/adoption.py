@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import every_skill, inner_of
+from skillweave.hierarchy.guidance import adopt_guide
+from skillweave.hierarchy.nesting import every_hierarchy, every_skill, inner_of
 from skillweave.hierarchy.weights import adopt_calls, check_selector
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import PlainAgent
@@ -14,17 +15,20 @@ from skillweave.types import SkillweaveError
 
 def adopt(declared: Declaration, run: RunDirectory) -> None:
     """Take over from a run how skills are called, here and in hierarchies below."""
-    _adopt(declared, run.manifest)
     entries = {s["name"]: s for s in run.manifest["skills"]}
-    for path, skill in every_skill(declared.skills):
-        if (inner := inner_of(skill)) is not None:
-            _adopt(inner, entries[path]["hierarchy"])
+    for path, own in every_hierarchy(declared):
+        if path:
+            _adopt(own, entries[path]["hierarchy"], f"{run.path}: {path}")
+        else:
+            _adopt(own, run.manifest, str(run.path))
 
 
-def _adopt(declared: Declaration, told: dict[str, Any]) -> None:
+def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
+    adopt_guide(declared, told, where)
     adopt_calls(declared, told)
     declared.learn = told.get("learn", "apart")
     declared.reflexes_in_training = told.get("reflexes_in_training", True)
+    declared.start_calls = told.get("start_calls")
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:

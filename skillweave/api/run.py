@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skillweave.api.player import Player
+from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.nesting import every_skill
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
 from skillweave.messages import short, whole_number
+from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import color_of, render_policy
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
@@ -28,6 +31,7 @@ class Run:
 
     def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
         self.declaration, self.path, self.policy = declaration, path, policy
+        self._player: Player | None = None
 
     @property
     def hierarchy(self) -> Hierarchy:
@@ -117,6 +121,79 @@ class Run:
             label=label,
             max_steps=max_steps,
             rng=np.random.default_rng(seed),
+        )
+
+    def act(self, obs: Any, **told: Any) -> Any:
+        """The greedy action for one observation; the arguments are ``Player.act``'s.
+
+        It remembers what a policy remembers, so call ``reset`` where an episode begins.
+        """
+        if self._player is None:
+            self._player = self.player()
+        return self._player.act(obs, **told)
+
+    def reset(self) -> None:
+        """For ``act``: a new episode begins."""
+        if self._player is not None:
+            self._player.reset()
+
+    def player(self, *, deterministic: bool = True, seed: int = 0) -> Player:
+        """The policy for one environment, with a memory of its own.
+
+        Args:
+            deterministic: act greedily, else sample; as in ``evaluate``.
+            seed: of what is sampled.
+        """
+        return Player(self.policy, deterministic=deterministic, seed=seed)
+
+    def export(self, path: str | Path) -> Export:
+        """Write ONNX files, ``policy.json`` and ``runner.py``, which needs only onnxruntime.
+
+        What is Python code (initiation, termination, reflexes' conditions, functions) is not
+        written: ``Export.code`` lists it, and the ``Runner`` is given it by name.
+
+        Args:
+            path: a folder; files of the same names are replaced.
+
+        Raises:
+            SkillweaveError: a part cannot be exported; the message says which, and what to do.
+        """
+        return write_export(as_path(path, "path"), self.policy, self.declaration.spec.name)
+
+    def report(
+        self,
+        path: str | Path | None = None,
+        *,
+        episodes: int = 20,
+        films: int = 3,
+        seed: int = 0,
+        deterministic: bool = True,
+    ) -> dict[str, Any]:
+        """Write one HTML file about the run: film, calls, skills, curves, settings.
+
+        Args:
+            path: the file; None: ``report.html`` in the run.
+            episodes: to play, with seeds that training never used.
+            films: how many of them to film, from the worst to the best.
+            seed: picks the episodes.
+            deterministic: act greedily, else sample.
+
+        Returns:
+            ``path``, ``bytes``, ``seconds``, and ``missing``: sentences on what is not in it.
+
+        Raises:
+            SkillweaveError: this is no run but a weights file, or the file cannot be written.
+        """
+        run = RunDirectory.open(self.path)
+        return write_report(
+            run,
+            run.path / "report.html" if path is None else as_path(path, "path"),
+            self.policy,
+            self.declaration.spec,
+            episodes=episodes,
+            filmed=films,
+            seed=seed,
+            deterministic=deterministic,
         )
 
     def save_weights(self, path: str | Path) -> Path:

@@ -32,10 +32,13 @@ class RolloutStore:
         self._members, self._quota, self._device = members, quota, torch.device(device)
         self._held: list[dict[str, Tensor]] = []  # fields (P, T, B, …), memory as one row
 
-    def add(self, experience: Experience) -> None:
+    def add(self, experience: Experience, log_std: Tensor | None = None) -> None:
         """Keep an experience until it is learnt from.
 
         Arrays of one member are not copied: they must stay as they are until then.
+
+        Args:
+            log_std: (P, 1, 1, A), of who acted in it, where it is no part of ``head``.
         """
         e, last = experience, experience.ended
         valid = np.ones_like(last) if e.valid is None else e.valid
@@ -45,7 +48,7 @@ class RolloutStore:
             "obs": e.obs, "action": e.action, "reward": e.reward, "steps": e.steps,
             "terminated": e.terminated, "next_obs": e.next_obs, "last": last,
             "obs_mask": e.obs_mask, "head": e.head, "starts": e.starts,
-            "advantage": e.advantage,
+            "advantage": e.advantage, "overridden": e.overridden, "guide": e.guide,
         }  # fmt: skip
         rows = {k: x for k, x in found.items() if x is not None}
         if valid.all():
@@ -59,12 +62,13 @@ class RolloutStore:
         held = {k: self._by_member(x) for k, x in (rows | {"valid": valid}).items()}
         if e.memory is not None:
             held["memory"] = self._by_member(e.memory[None])
+        if log_std is not None:
+            held["log_std"] = log_std
         self._held.append(held)
 
     def rollout(
         self,
         gamma: Tensor,
-        log_std: Tensor | None = None,
         progress: float = 0.0,
         anchor: Anchor | None = None,
     ) -> Rollout | None:
@@ -72,7 +76,7 @@ class RolloutStore:
 
         Args:
             gamma: (P,), each member's discount of one step.
-            log_std, progress, anchor: of the ``Rollout``.
+            progress, anchor: of the ``Rollout``.
         """
         if not self._held or (self._quota and self._valid_rows() < self._quota):
             return None
@@ -83,8 +87,6 @@ class RolloutStore:
         named = _filled_columns(named)
         if named["valid"].all():
             del named["valid"]
-        if log_std is not None:
-            named["log_std"] = log_std
         parts: dict[str, Any] = {name: x.to(self._device) for name, x in named.items()}
         memory = parts.pop("memory", None)
         parts["memory"] = None if memory is None else memory[:, 0]
@@ -139,7 +141,10 @@ def _filled_columns(named: dict[str, Tensor]) -> dict[str, Tensor]:
     order = filled.to(torch.int8).argsort(dim=1, descending=True, stable=True)
     order = order[:, : int(filled.sum(1).max())]
     member = torch.arange(len(order))[:, None]
-    return {k: x.transpose(1, 2)[member, order].transpose(1, 2) for k, x in named.items()}
+    return {
+        k: x if x.shape[2] == 1 else x.transpose(1, 2)[member, order].transpose(1, 2)
+        for k, x in named.items()
+    }
 
 
 def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -148,11 +153,17 @@ def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     if masks:  # without one, all is allowed
         every = [masks[0].new_ones(*h["valid"].shape, masks[0].shape[-1]) for h in held]
         held = [{"obs_mask": free} | h for free, h in zip(every, held, strict=True)]
+    if "log_std" in held[0]:  # each was acted with one of its own
+        held = [h | {"log_std": h["log_std"].expand(-1, -1, h["valid"].shape[2], -1)} for h in held]
     t = max(h["valid"].shape[1] for h in held)
     return {k: torch.cat([_padded(k, h[k], t) for h in held], 2) for k in held[0]}
 
 
+_ONE_ROW = ("memory", "log_std")
+"""Fields that have one row, however many there are of the others."""
+
+
 def _padded(name: str, x: Tensor, t: int) -> Tensor:
     """A field (P, T, B, …) with ``t`` rows: its first is repeated, but is not valid there."""
-    more = x[:, :1].expand(-1, 0 if name == "memory" else t - x.shape[1], *x.shape[2:])
+    more = x[:, :1].expand(-1, 0 if name in _ONE_ROW else t - x.shape[1], *x.shape[2:])
     return torch.cat([x, torch.zeros_like(more) if name in ("valid", "last") else more], 1)

@@ -109,6 +109,36 @@ class Plot(Output):
 
 
 @dataclass(frozen=True)
+class Report(Output):
+    """Write one HTML file about a run: film, timeline of calls, curves, skills, settings."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """The file to write; default: report.html in the run."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+    episodes: int = 20
+    """Episodes to play, with seeds that training never used."""
+    films: int = 3
+    """How many of them to film, from the worst to the best; 0: no film."""
+    seed: int = 0
+    """Picks the episodes."""
+    deterministic: bool = True
+    """Act greedily, or (--no-deterministic, --stochastic) sample."""
+
+
+@dataclass(frozen=True)
+class Compare(Output):
+    """Write one HTML file that compares runs; those that differ by their seed alone are a group."""
+
+    runs: Positional[tuple[Path, ...]] = tyro.MISSING
+    """The runs' directories."""
+    out: Annotated[Path, arg(aliases=["-o"])] = Path("compare.html")
+    """The file to write."""
+
+
+@dataclass(frozen=True)
 class List(Output):
     """List the shipped recipes, and the runs under ./runs."""
 
@@ -134,6 +164,22 @@ class Weights(Output):
 
 
 @dataclass(frozen=True)
+class Export(Output):
+    """Write a policy for machines without this library: ONNX files and a runner of one file."""
+
+    target: Positional[str] = tyro.MISSING
+    """A run's directory, a weights file, or with --pretrained a recipe's name."""
+    onnx: bool = False
+    """As ONNX, the only format there is; needed, so that a later one can be told apart."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """The folder to write; default: NAME-onnx here."""
+    pretrained: bool = False
+    """Take the shipped weights of a shipped recipe."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+
+
+@dataclass(frozen=True)
 class ImportAgilerl(Output):
     """Convert a checkpoint of AgileRL 0.1 or 1.0, which is a pickle."""
 
@@ -145,8 +191,34 @@ class ImportAgilerl(Output):
     """The file to write; default: FILE with the suffix .safetensors."""
 
 
-COMMANDS = (Train, Resume, Evaluate, Render, Plot, List, Info, Weights, ImportAgilerl)
-Command = Train | Resume | Evaluate | Render | Plot | List | Info | Weights | ImportAgilerl
+COMMANDS = (
+    Train,
+    Resume,
+    Evaluate,
+    Render,
+    Plot,
+    Report,
+    Compare,
+    List,
+    Info,
+    Weights,
+    Export,
+    ImportAgilerl,
+)
+Command = (
+    Train
+    | Resume
+    | Evaluate
+    | Render
+    | Plot
+    | Report
+    | Compare
+    | List
+    | Info
+    | Weights
+    | Export
+    | ImportAgilerl
+)
 
 
 def name_of(command: type) -> str:

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
-from skillweave.api import Agent, Hierarchy, Run
+from skillweave.api import Run
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.cli.run_lines import run_lines
+from skillweave.cli.targets import declared_by_run, target
 from skillweave.compat.agilerl_files import convert
-from skillweave.hierarchy.weights import open_weights
 from skillweave.reporting.plots import plot_run
+from skillweave.reporting.report.compare import write_comparison
+from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.training.evaluation import Evaluation
@@ -37,12 +39,18 @@ def run(command: commands.Command) -> int:
             _render(command)
         case commands.Plot():
             _plot(command)
+        case commands.Report():
+            _report(command)
+        case commands.Compare():
+            _compare(command)
         case commands.List():
             _list(command)
         case commands.Info():
             _info(command)
         case commands.Weights():
             _weights(command)
+        case commands.Export():
+            _export(command)
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0
@@ -72,7 +80,7 @@ def _train(command: commands.Train) -> None:
 
 
 def _resume(command: commands.Resume) -> None:
-    declared = _declared_by_run(command.run, command.recipe, "resume_needs_recipe")
+    declared = declared_by_run(command.run, command.recipe, "resume_needs_recipe")
     try:
         trained = declared.resume(command.run, quiet=command.quiet)
     except KeyboardInterrupt:
@@ -81,24 +89,24 @@ def _resume(command: commands.Resume) -> None:
 
 
 def _evaluate(command: commands.Evaluate) -> None:
-    target = _target(command)
-    score = target.evaluate(
+    found = target(command)
+    score = found.evaluate(
         command.episodes,
         seed=command.seed,
         deterministic=command.deterministic,
         skill=command.skill,
     )
-    result = {"target": command.target, "env": target.declaration.spec.name, "seed": command.seed}
+    result = {"target": command.target, "env": found.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}
     if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
-        _save(target, score, command.seed, command.deterministic)
+        _save(found, score, command.seed, command.deterministic)
     _tell(command, result | score.to_json(), score.for_people())
 
 
 def _render(command: commands.Render) -> None:
-    target = _target(command)
+    found = target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
-    result = target.render(
+    result = found.render(
         path,
         episodes=command.episodes,
         seed=command.seed,
@@ -112,6 +120,43 @@ def _render(command: commands.Render) -> None:
 def _plot(command: commands.Plot) -> None:
     paths = [str(path) for path in plot_run(RunDirectory.open(command.run), command.out)]
     _tell(command, {"paths": paths}, "\n".join(paths))
+
+
+def _report(command: commands.Report) -> None:
+    run, why_not, trained = RunDirectory.open(command.run), None, None
+    told = run.manifest.get("recipe")
+    # Code of our own is as good as told: with it, the skills' rewards and successes are known.
+    recipe = command.recipe or (told if told in recipes.names() else None)
+    if run.finished:
+        try:
+            trained = declared_by_run(command.run, recipe).load(command.run)
+        except SkillweaveError as error:
+            if command.recipe is not None:
+                raise
+            why_not = f"There are no episodes and no film: {error}."
+    page = write_report(
+        run,
+        command.out or command.run / "report.html",
+        None if trained is None else trained.policy,
+        None if trained is None else trained.declaration.spec,
+        why_not=why_not,
+        episodes=command.episodes,
+        filmed=command.films,
+        seed=command.seed,
+        deterministic=command.deterministic,
+    )
+    _tell_page(command, page)
+
+
+def _compare(command: commands.Compare) -> None:
+    runs = [RunDirectory.open(path) for path in command.runs]
+    _tell_page(command, write_comparison(runs, command.out))
+
+
+def _tell_page(command: commands.Output, told: dict[str, Any]) -> None:
+    lines = [f"{told['path']}: {told['bytes'] / 1e6:.1f} MB, written in {told['seconds']:.1f} s"]
+    lines += [f"missing: {line}" for line in told["missing"]]
+    _tell(command, told, "\n".join(lines))
 
 
 def _list(command: commands.List) -> None:
@@ -144,9 +189,18 @@ def _info(command: commands.Info) -> None:
 
 
 def _weights(command: commands.Weights) -> None:
-    trained = _declared_by_run(command.run, command.recipe).load(command.run)
+    trained = declared_by_run(command.run, command.recipe).load(command.run)
     path = trained.save_weights(command.out)
     _tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
+
+
+def _export(command: commands.Export) -> None:
+    if not command.onnx:
+        raise SkillweaveError("say as what to export: --onnx")
+    name = Path(command.target).name.removesuffix(".safetensors")
+    found = target(command).export(command.out or Path(f"{name}-onnx"))
+    told = {"path": str(found.path), "files": list(found.files), "code": found.code}
+    _tell(command, told, str(found))
 
 
 def _import_agilerl(command: commands.ImportAgilerl) -> None:
@@ -160,46 +214,6 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
     algo = convert(command.file, out)
     text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"
     _tell(command, {"path": str(out), "algorithm": algo}, text)
-
-
-def _target(command: commands.Watched) -> Run:
-    """The trained policy that a command names."""
-    path = Path(command.target)
-    if command.pretrained:
-        return Hierarchy.pretrained(command.target)
-    if path.is_dir():
-        return _declared_by_run(path, command.recipe).load(path)
-    if path.suffix == ".safetensors":
-        header = open_weights(path)[1]
-        if header.get("kind") == "agent" and "env" in header:
-            return Agent.from_weights(path)
-        recipe = command.recipe or header.get("recipe")
-        return _declared(recipe, command.recipe, path).load_weights(path)
-    hint = (
-        " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
-    )
-    raise SkillweaveError(f"{command.target} is neither a run nor a weights file{hint}")
-
-
-def _declared_by_run(
-    path: Path, recipe: str | None, needs: str = "needs_recipe"
-) -> Hierarchy | Agent:
-    """What a run was trained from; code never comes from inside the run."""
-    manifest = RunDirectory.open(path).manifest
-    if recipe is None and not manifest.get(needs, True):
-        kind = Agent if manifest["kind"] == "agent" else Hierarchy
-        return kind.from_manifest(manifest)
-    return _declared(recipe or manifest.get("recipe"), recipe, path)
-
-
-def _declared(recipe: str | None, given: str | None, path: Path) -> Hierarchy:
-    if recipe is not None and (given is not None or recipe in recipes.names()):
-        return recipes.load(recipe)
-    made = f"in {recipe}" if recipe else "in Python"
-    raise SkillweaveError(
-        f"{path} was declared {made}, and needs that code. Point to the file that "
-        "defines it, if you trust it: --recipe FILE.py"
-    )
 
 
 def _tell_trained(

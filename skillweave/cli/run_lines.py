@@ -14,6 +14,7 @@ def run_lines(m: Mapping[str, Any], saved: SavedEvaluation | None, target: objec
     lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
     calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
     calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
+    calls += f", guide: {m['guide']['kind']}" if "guide" in m else ""
     lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}{calls}"]
     lines += [
         f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"

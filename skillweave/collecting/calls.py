@@ -6,30 +6,16 @@ Collectors (training) and ``HierarchyPolicy`` (everything else) both run skills 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 
-from skillweave.collecting.ends import ENDED, Why, skill_step
+from skillweave.collecting.ends import ENDED, Interruption, Why, skill_step
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.infos import allowed_rows
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked, path_of
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
-
-
-@dataclass(frozen=True)
-class Interruption:
-    """When a call is cut (Sutton, Precup & Singh 1999, sec. 4)."""
-
-    worth: Callable[[Array], Array]
-    """Observations (n, …) to what each skill is worth there, (n, S), in deviations of the return.
-    """
-    margin: float
-    """By how much another skill must be worth more, in the same unit."""
-    critic: Policy | None = None
-    """Who says what skills are worth, where it is trained."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +43,8 @@ class SkillSet:
     """What a selector that learns pays for each call, in units of reward."""
     interruption: Interruption | None = None
     """When the selector cuts a call; None: never."""
+    reflexes_apart: bool = False
+    """``act`` leaves reflexes to its caller, who asks ``override``."""
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -81,8 +69,11 @@ class SkillSet:
         remembers = any(p.start(1) for p in self.policies)
         return stops or remembers or self.interruption is not None
 
-    def mask(self, obs: Array) -> Array | None:
+    def mask(self, obs: Array, age: Array | None = None) -> Array | None:
         """Which choices are allowed, (n, choices) bool; None: all, everywhere.
+
+        Args:
+            age: (n,), steps of the episodes so far, for messages.
 
         Raises:
             SkillweaveError: in some observation no skill may start.
@@ -93,9 +84,11 @@ class SkillSet:
         if not mask.any(axis=1).all():
             row = int(np.flatnonzero(~mask.any(axis=1))[0])
             names = ", ".join(repr(path_of(s)) for s in self.skills)
+            where = np.array2string(obs[row], precision=3)
+            where += "" if age is None else f", after {int(age[row])} steps of the episode"
             raise SkillweaveError(
-                f"no skill may start in observation {np.array2string(obs[row], precision=3)}: the "
-                f"initiation() of {names} is False there. Let at least one start everywhere"
+                f"no skill may start in observation {where}: the initiation() of {names} is False "
+                "there. Let at least one start everywhere"
             )
         return mask
 
@@ -188,8 +181,12 @@ class SkillSet:
                 actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
             actions[mine] = some
         assert actions is not None, "act() before begin()"
-        if not self.reflexes:
+        if not self.reflexes or self.reflexes_apart:
             return actions
+        return self.override(obs, actions)[0]
+
+    def override(self, obs: Array, actions: Array) -> tuple[Array, Array]:
+        """Actions (k, …) with the reflexes in force, and (k,) bool: where one of them acted."""
         return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)
 
     def limit(self, i: int) -> int | None:

@@ -27,6 +27,7 @@ class Columns:
         self._terminated, self._truncated = np.empty(lead, bool), np.empty(lead, bool)
         self._action: list[Array] = []
         self._head: list[Array] = []
+        self._overridden: list[Array] = []
         self._masks: list[Array | None] = []
         self._next_masks: list[Array | None] = []
         self._valid: Array | None = None
@@ -43,6 +44,7 @@ class Columns:
         next_obs: Array,
         next_mask: Array | None,
         valid: Array | None,
+        overridden: Array | None = None,
     ) -> None:
         """Write a row: what was acted on, what was done, and what came of it."""
         at, self._at = self._at, self._at + 1
@@ -53,6 +55,8 @@ class Columns:
             self._head.append(acted.head)
         self._masks.append(mask)
         self._next_masks.append(next_mask)
+        if overridden is not None:
+            self._overridden.append(overridden)
         if valid is not None:
             if self._valid is None:
                 self._valid = np.ones(self._reward.shape, bool)
@@ -82,6 +86,7 @@ class Columns:
             head=np.stack(self._head) if self._head else None,
             memory=self._memory,
             starts=starts,
+            overridden=np.stack(self._overridden) if self._overridden else None,
         )
 
 

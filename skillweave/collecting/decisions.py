@@ -12,6 +12,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.ends import Why, judged, skill_step
+from skillweave.collecting.guide import Guide, tell_guide
 from skillweave.collecting.open_calls import Decisions, OpenCalls
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
@@ -33,6 +34,7 @@ class DecisionCollector(Collector):
         skills: what their actions mean.
         keep_rewards: of each call, keep the reward of every step, so that others may learn from it
             with a γ of their own.
+        guide: a ready selector that is asked wherever they decide.
         seen_as: the skill that all of it is, in another hierarchy: its reward and its ends count;
             None: the environment's.
     """
@@ -43,27 +45,38 @@ class DecisionCollector(Collector):
         acting: Acting | None,
         skills: SkillSet,
         keep_rewards: bool = False,
+        guide: Guide | None = None,
         seen_as: Skill | None = None,
     ) -> None:
         super().__init__(engine, acting)
         n = self.num_envs
-        self.skills, self.keep_rewards, self.seen_as = skills, keep_rewards, seen_as
-        self._watches = skills.watches or seen_as is not None
+        self.skills, self.keep_rewards = skills, keep_rewards
+        self.guide, self.seen_as = guide, seen_as
+        self._watches = skills.watches or guide is not None or seen_as is not None
         self._calls: Memory = skills.start(n)  # what the skills remember of each environment
         self._never = np.zeros(n, bool)
         self.kept |= prefixed("skills", self._calls)
         self.kept["over"] = np.zeros(n, bool)  # there is no call: the selector must decide
-        self._open = OpenCalls(self, skills, self.kept["memory"].shape[1], keep_rewards)
+        if guide is not None:
+            self.kept |= guide.start(n)
+            self.kept["chances"] = np.zeros((n, skills.choices), np.float32)  # when it was asked
+        size = self.kept["memory"].shape[1]
+        self._open = OpenCalls(self, skills, size, keep_rewards, guide, self.kept)
 
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:
         """The same over other environments."""
-        return DecisionCollector(engine, acting, self.skills, self.keep_rewards, self.seen_as)
+        return DecisionCollector(
+            engine, acting, self.skills, self.keep_rewards, self.guide, self.seen_as
+        )
 
     def _forget(self, ids: Array) -> None:
         super()._forget(ids)
         self.skills.forget(self._calls, ids)
         self.kept["over"][ids] = True
         self.kept["first"][ids] = True
+        if self.guide is not None:
+            for name, value in self.guide.start(len(ids)).items():
+                self.kept[name][ids] = value
 
     def _collect(self, request: Request) -> Experience:
         self._prepare(request)
@@ -76,7 +89,7 @@ class DecisionCollector(Collector):
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request, every_step=False)
         self._gamma = request.gamma.astype(np.float64).repeat(self.acting.each)
-        self._rng = (request.seeds / "skills").numpy()
+        self._rng, self._greedy = (request.seeds / "skills").numpy(), request.greedy
 
     def _step(self, out: Decisions | None = None) -> None:
         """One step of every environment."""
@@ -92,6 +105,8 @@ class DecisionCollector(Collector):
         self._count(counts)
         ended = counts.terminated | counts.truncated
         why[ended] = Why.EPISODE
+        if self.guide is not None and seen is not None:
+            tell_guide(self.guide, self.kept, self.skills, self._calls, seen, why)
         if out is not None and seen is not None:
             self._record(seen, counts, mask, why)
         self.obs = raw.next_obs
@@ -145,7 +160,7 @@ class DecisionCollector(Collector):
         kept, here = self.kept, self.obs[rows]
         allowed = None
         if "allowed" in kept:
-            kept["allowed"][rows] = self.skills.mask(here)
+            kept["allowed"][rows] = self._allowed(rows, here)
             allowed = kept["allowed"]
         acted = self.acting.some(rows, self.obs, allowed, self.memory)
         choice = np.asarray(self.acting.to_env(acted.action))
@@ -154,6 +169,15 @@ class DecisionCollector(Collector):
         if acted.memory is not None:
             kept["memory"][rows] = acted.memory
         self.skills.begin(self._calls, rows, choice)
+
+    def _allowed(self, rows: Array, here: Array) -> Array:
+        """Choices that are allowed in environments ``rows`` (k,), in observations ``here``."""
+        may = self.skills.mask(here, self.kept["age"][rows])
+        if self.guide is None:
+            assert may is not None
+            return may
+        may = self.skills.startable(here) if may is None else may
+        return self.guide.mask(self.kept, rows, here, may, self._greedy, self._rng)
 
     def _count(self, raw: RawStep) -> None:
         """Add a step to the open calls and episodes."""

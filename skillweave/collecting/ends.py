@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
 from skillweave.envs.infos import info_rows
 from skillweave.skills import Skill, asked
-from skillweave.types import Array, Step
+from skillweave.types import Array, Policy, Step
 
 ENDED = "why"
 """Under this name a hierarchy's policy remembers why its last call ended; see ``Why``."""
@@ -27,6 +29,19 @@ class Why(IntEnum):
     """The selector cut it, as another skill was worth more."""
     EPISODE = 4
     """The episode ended, or has just begun: there is no call."""
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """When a call is cut (Sutton, Precup & Singh 1999, sec. 4)."""
+
+    worth: Callable[[Array], Array]
+    """Observations (n, …) to what each skill is worth there, (n, S), in deviations of the return.
+    """
+    margin: float
+    """By how much another skill must be worth more, in the same unit."""
+    critic: Policy | None = None
+    """Who says what skills are worth, where it is trained."""
 
 
 def judged(skill: Skill, step: Step, ids: Array, why: Array | None = None) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from skillweave.collecting.ends import ENDED, Why
 from skillweave.collecting.open_calls import Decisions, OpenCalls
 from skillweave.experience import Experience
 from skillweave.skills import Skill
-from skillweave.types import Array, Memory, Memoryless, Policy
+from skillweave.types import Array, Memory, Memoryless, Policy, unprefixed
 
 SELECTOR = "selector"
 """What a selector is named, after the names of the hierarchies that it is in."""
@@ -97,7 +97,12 @@ def woven(
     critic, cuts = path + CRITIC, None
     if critic in margins:
         cuts = Interruption(_worth(learners[critic]), margins[critic])
-    return replace(skills, policies=tuple(policy_of(*p) for p in pairs), interruption=cuts)
+    return replace(
+        skills,
+        policies=tuple(policy_of(*p) for p in pairs),
+        interruption=cuts,
+        reflexes_apart=any(name.startswith(path) for name in learners),
+    )
 
 
 def _worth(critic: Acting) -> Callable[[Array], Array]:
@@ -115,6 +120,7 @@ class Level:
 
     Args:
         collector: in which they act.
+        memory: of the root's skills.
         skills: of this level.
         learners: by path, who learns.
         path: of these skills: empty, or ``inner/`` for example.
@@ -125,6 +131,7 @@ class Level:
     def __init__(
         self,
         collector: Collector,
+        memory: Memory,
         skills: SkillSet,
         learners: Mapping[str, Acting],
         path: str = "",
@@ -142,7 +149,7 @@ class Level:
             below = skills_below(policy)
             if any(k.startswith(f"{name}/") for k in learners) and below is not None:
                 self.below[i] = Inside(
-                    collector, below, learners, f"{name}/", f"{prefix}{i}.", at, policy
+                    collector, memory, below, learners, f"{name}/", f"{prefix}{i}.", at, policy
                 )
                 at = self.below[i].end
                 continue
@@ -187,6 +194,7 @@ class Inside(Level):
     def __init__(
         self,
         collector: Collector,
+        memory: Memory,
         skills: SkillSet,
         learners: Mapping[str, Acting],
         path: str,
@@ -194,13 +202,14 @@ class Inside(Level):
         first: int,
         policy: Any,
     ) -> None:
-        super().__init__(collector, skills, learners, path, prefix, first)
+        super().__init__(collector, memory, skills, learners, path, prefix, first)
         found = policy.selector
         self.selector = found if isinstance(found, LearningSkill) else None
         """None: it is ready."""
         if self.selector is not None:
             size = self.selector.acts.memory_size
-            self.calls = OpenCalls(collector, skills, size, prefix=path)
+            own = unprefixed(prefix.removesuffix("."), memory)
+            self.calls = OpenCalls(collector, skills, size, False, policy.guide, own, path)
             self.acted = np.zeros(collector.num_envs, bool)  # in the step before
             self.open = np.zeros(collector.num_envs, bool)  # a call of its selector is under way
             collector.kept |= {f"{path}acted": self.acted, f"{path}open": self.open}

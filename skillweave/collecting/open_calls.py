@@ -10,8 +10,9 @@ from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import as_wide
+from skillweave.collecting.guide import Guide, as_logits
 from skillweave.experience import Experience
-from skillweave.types import Array
+from skillweave.types import Array, Memory
 
 
 class OpenCalls:
@@ -24,6 +25,8 @@ class OpenCalls:
         skills: what the selector chooses from.
         memory_size: of the selector's network.
         keep_rewards: of each call, keep the reward of every step.
+        guide: a ready selector that was asked at each decision.
+        memory: where the guide remembers, with ``chances``: how likely its choices were.
         prefix: of all names, where a collector has several selectors.
     """
 
@@ -33,10 +36,13 @@ class OpenCalls:
         skills: SkillSet,
         memory_size: int,
         keep_rewards: bool = False,
+        guide: Guide | None = None,
+        memory: Memory | None = None,
         prefix: str = "",
     ) -> None:
         n = collector.num_envs
         self.skills, self.memory_size, self.keep_rewards = skills, memory_size, keep_rewards
+        self.guide, self._memory = guide, memory or {}
         self._collector, self._prefix, self._all = collector, prefix, np.arange(n)
         self.kept: dict[str, Array] = {
             "first": np.zeros(n, bool),  # the selector's memory was empty before this call
@@ -46,7 +52,7 @@ class OpenCalls:
             "choice": np.zeros(n, np.int64),
             "before": np.zeros((n, memory_size), np.float32),  # the selector's memory
         }
-        if skills.restricts:
+        if skills.restricts or guide is not None:
             self.kept["allowed"] = np.ones((n, skills.choices), bool)  # when it decided
         collector.kept |= {prefix + k: v for k, v in self.kept.items()}
 
@@ -109,8 +115,15 @@ class OpenCalls:
                 values[name] = held[ids]
         if "allowed" in kept:
             values["obs_mask"] = kept["allowed"][ids]
-            values["next_obs_mask"] = self._next_mask(values)
+            values["next_obs_mask"] = self._next_mask(values, ids)
+        if (chances := self.chances) is not None:
+            values["guide"] = as_logits(chances[ids], values["obs_mask"])
         return values
+
+    @property
+    def chances(self) -> Array | None:
+        """How likely the guide's choices were when it was asked, (N, choices); None: not told."""
+        return self._memory["chances"] if self.guide is not None and self.guide.tells else None
 
     def _keep(self, ids: Array, reward: Array) -> None:
         """Keep the reward of this step of the open calls."""
@@ -123,12 +136,14 @@ class OpenCalls:
         self._collector.open[self._prefix + "rewards"] = rewards
         rewards[ids, self.kept["tau"][ids]] = reward
 
-    def _next_mask(self, values: Mapping[str, Array]) -> Array:
+    def _next_mask(self, values: Mapping[str, Array], ids: Array) -> Array:
         """Where skills may start in the true successors: all where that does not matter."""
         mask = np.ones_like(values["obs_mask"])
         on = np.flatnonzero(~values["terminated"])
         if len(on):
             found = self.skills.startable(values["next_obs"][on])
+            if self.guide is not None:
+                found = self.guide.ahead(self._memory, ids[on], found)
             mask[on] = found | ~found.any(axis=1, keepdims=True)
         return mask
 
@@ -183,7 +198,7 @@ class Decisions:
         """One empty row: no call has ended."""
         n = len(obs)
         lead, no = (1, n), np.zeros((1, n), bool)
-        head, size = calls.opened("head"), calls.memory_size
+        head, size, chances = calls.opened("head"), calls.memory_size, calls.chances
         return Experience(
             obs=obs[None], action=np.zeros(lead, np.int64), reward=np.zeros(lead, np.float32),
             steps=np.ones(lead, np.int64), terminated=no, truncated=no, next_obs=obs[None],
@@ -191,4 +206,5 @@ class Decisions:
             memory=np.zeros((n, size), np.float32) if size else None,
             starts=no if size else None,
             rewards=np.zeros((*lead, 1), np.float32) if calls.keep_rewards else None,
+            guide=None if chances is None else chances[None],
         )  # fmt: skip

@@ -15,6 +15,7 @@ from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
 from skillweave.experience import Experience
+from skillweave.messages import shortened
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, SkillweaveError, Step
 
@@ -38,6 +39,7 @@ class SkillCollector(Collector):
     A skill's ``termination`` terminates the episode (nothing is worth anything after it), its
     ``max_steps`` truncates it (its value goes on). Where the skill may not start, skills that can
     act already are called until it may, while other environments go on; these rows are not valid.
+    A number of such calls may also come first where it may start at once.
 
     Args:
         engine: the environments.
@@ -45,6 +47,7 @@ class SkillCollector(Collector):
         skill: None for the task itself: the environment's own reward and ends.
         reflexes: in force while the skill acts.
         starters: skills that can act already; None: random actions lead to where it may start.
+        start_calls: the most calls of theirs that come first; their number is drawn evenly.
     """
 
     def __init__(
@@ -54,24 +57,30 @@ class SkillCollector(Collector):
         skill: Skill | None = None,
         reflexes: tuple[Reflex, ...] = (),
         starters: SkillSet | None = None,
+        start_calls: int = 0,
     ) -> None:
         super().__init__(engine, acting)
         self.skill, self.reflexes = skill, reflexes
+        self._start_calls = 0 if starters is None else start_calls
         n = self.num_envs
         self._never = np.zeros(n, bool)
         self.kept["elapsed"] = np.zeros(n, np.int64)  # the skill's steps in the open episode
-        self._searches = skill is not None and skill.defines("initiation")
+        self._restricted = skill is not None and skill.defines("initiation")
+        self._searches = self._restricted or self._start_calls > 0
         if self._searches:
             self.kept["searching"] = np.zeros(n, bool)  # the skill may not start yet
             self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
             self.kept["found"] = np.zeros(n, bool)  # it ever might
+            self.kept["calls_left"] = np.zeros(n, np.int64)  # that come first; −1: to be drawn
             self._starters = Starters(starters, n, engine.action_space)
             self.kept |= self._starters.kept
 
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
         """The same over other environments."""
         starters = self._starters.skills if self._searches else None
-        return SkillCollector(engine, acting, self.skill, self.reflexes, starters)
+        return SkillCollector(
+            engine, acting, self.skill, self.reflexes, starters, self._start_calls
+        )
 
     def _collect(self, request: Request) -> Experience:
         self._prepare(request)
@@ -86,14 +95,18 @@ class SkillCollector(Collector):
 
     def _step(self, out: Columns | None = None) -> None:
         """One step of every environment."""
+        if self._start_calls:
+            self._draw_calls()
         obs, mask, memory = self.obs, self.engine.mask(), self.memory
         playing = ~self.kept["searching"] if self._searches else None
         if playing is not None and playing.all():
             playing = None
         acted = self.acting.all(obs, mask, memory)
         action = self.acting.to_env(acted.action)
+        overridden = None
         if self.reflexes:
-            action = apply_reflexes(self.reflexes, obs, action, self.engine.action_space)
+            space = self.engine.action_space
+            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
         searching = np.zeros(0, np.int64) if playing is None else np.flatnonzero(~playing)
         if playing is not None:
             action = action.copy()
@@ -103,7 +116,8 @@ class SkillCollector(Collector):
         judged = self._judge(obs, action, raw, playing)
         ended = judged.terminated | judged.truncated
         if out is not None:
-            out.put(obs, mask, acted, judged, raw.next_obs, self.engine.mask(), playing)
+            next_mask = self.engine.mask()
+            out.put(obs, mask, acted, judged, raw.next_obs, next_mask, playing, overridden)
         self._count(raw, judged, playing)
         if memory is not None and acted.memory is not None:
             memory[:] = acted.memory
@@ -121,8 +135,17 @@ class SkillCollector(Collector):
             self._begin_anew(ids)
         if playing is not None:
             going_on = searching[~over[searching]]
-            self._starters.observe(going_on, obs, action, raw)
+            free = self._starters.observe(going_on, obs, action, raw)
+            left = self.kept["calls_left"]
+            left[free] = np.maximum(left[free] - 1, 0)
             self._look(going_on)
+
+    def _draw_calls(self) -> None:
+        """How many calls of others come first, where an episode has just begun."""
+        ids = np.flatnonzero(self.kept["calls_left"] < 0)
+        if len(ids):
+            self.kept["calls_left"][ids] = self._rng.integers(self._start_calls + 1, size=len(ids))
+            self._look(ids)
 
     def _forget(self, ids: Array) -> None:
         counted = {k: self.kept[k][ids] for k in ("searched", "found") if self._searches}
@@ -132,15 +155,21 @@ class SkillCollector(Collector):
                 self.kept[name][ids] = value
             self.kept["searching"][ids] = True
             self._starters.stop(ids)
-            self._look(ids)
+            if self._start_calls:
+                self.kept["calls_left"][ids] = -1
+            else:
+                self._look(ids)
 
     def _look(self, ids: Array) -> None:
         """Whether the skill may start now in environments ``ids`` (k,) that search."""
         if not len(ids):
             return
         assert self.skill is not None
-        holds = asked(self.skill, "initiation", self.obs[ids], len(ids), ids=ids)
-        found, waiting = ids[holds], ids[~holds]
+        holds = np.ones(len(ids), bool)
+        if self._restricted:
+            holds = asked(self.skill, "initiation", self.obs[ids], len(ids), ids=ids)
+        found = ids[holds & (self.kept["calls_left"][ids] == 0)]
+        waiting = ids[~holds]
         self.kept["searching"][found] = False
         self.kept["searched"][found] = 0
         self.kept["found"][found] = True
@@ -149,8 +178,10 @@ class SkillCollector(Collector):
         if self.kept["searched"].max() > PATIENCE and not self.kept["found"].any():
             raise SkillweaveError(
                 f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps "
-                f"{self._sought()}, so there is nothing to train on; widen it, or give an "
-                "environment that starts where it holds"
+                f"{self._sought()}, so there is nothing to train on; the latest observation was "
+                f"{shortened(np.array2string(self.obs[waiting[0]], precision=3), 300)}. Widen it; "
+                "or put the skills that lead to where it holds before it in skills, as skills are "
+                "trained in that order; or give an environment that starts where it holds"
             )
 
     def _sought(self) -> str:

@@ -53,13 +53,18 @@ class Starters:
             action[~led] = random_actions(self._space, len(free), rng, allowed)
         return action
 
-    def observe(self, ids: Array, obs: Array, action: Array, raw: RawStep) -> None:
-        """Notice where calls in environments ``ids`` (k,) are over; the others are of all N."""
+    def observe(self, ids: Array, obs: Array, action: Array, raw: RawStep) -> Array:
+        """Notice where calls in environments ``ids`` (k,) are over; the others are of all N.
+
+        Returns:
+            Those where nobody is called now.
+        """
         if self.skills is None:
-            return
-        own = ids[self.kept["starters.called"][ids]]
+            return ids
+        called = self.kept["starters.called"][ids]
+        own = ids[called]
         if not len(own):
-            return
+            return ids
         seen = Step(
             obs[own], action[own], raw.next_obs[own], raw.reward[own], raw.terminated[own],
             raw.truncated[own], np.zeros(len(own), bool), self._calls["elapsed"][own],
@@ -67,6 +72,7 @@ class Starters:
         )  # fmt: skip
         over = self.skills.observe(self._calls, own, seen) != Why.RUNNING
         self.kept["starters.called"][own[over]] = False
+        return np.concatenate([ids[~called], own[over]])
 
     def stop(self, ids: Array) -> None:
         """The calls in environments ``ids`` (k,) are over: the skill starts, or an episode."""

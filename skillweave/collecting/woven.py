@@ -11,6 +11,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.ends import ENDED, Why, judged, skill_step
+from skillweave.collecting.guide import Guide
 from skillweave.collecting.levels import CRITIC, SELECTOR, Inside, Level, woven
 from skillweave.collecting.woven_rows import Rows
 from skillweave.envs.engine import Engine, RawStep
@@ -34,7 +35,7 @@ class WovenCollector(DecisionCollector):
         learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
             ``skill_critic`` and ``inner/skill_critic`` say what skills are worth.
         margins: by the paths of critics: calls are cut where another skill is worth so much more.
-        seen_as: as of ``DecisionCollector``.
+        guide, seen_as: as of ``DecisionCollector``.
     """
 
     def __init__(
@@ -44,12 +45,17 @@ class WovenCollector(DecisionCollector):
         skills: SkillSet,
         learners: Mapping[str, Acting],
         margins: Mapping[str, float] | None = None,
+        guide: Guide | None = None,
         seen_as: Skill | None = None,
     ) -> None:
         self.learners = dict(learners)
-        super().__init__(engine, acting, woven(skills, learners, margins or {}), seen_as=seen_as)
+        acts = woven(skills, learners, margins or {})
+        super().__init__(engine, acting, acts, guide=guide, seen_as=seen_as)
         self._watches = True
-        self.root = Level(self, self.skills, learners)
+        self.root = Level(self, self._calls, self.skills, learners)
+        apart = any(x.skills.reflexes and x.skills.reflexes_apart for x in self.root.all())
+        self.overridden = np.zeros(self.num_envs, bool) if apart else None
+        """(N,), where reflexes acted in the latest step; None: there are none."""
         self.kept["leaf"] = np.zeros(self.num_envs, np.int64)  # who acted last; 0: nobody yet
         self._fresh = self._never  # the leaf that acts begins to
         self._rows: Rows | None = None
@@ -88,6 +94,9 @@ class WovenCollector(DecisionCollector):
     def _act(self, obs: Array, mask: Array | None) -> Array:
         """The actions; who acts, and what selectors below have decided, is kept."""
         action = super()._act(obs, mask)
+        if self.overridden is not None:
+            action, self.overridden[:] = action.copy(), False
+            self._override(self.root, self._all, action, self.overridden)
         leaf = self.root.leaf(self._calls, self._all)
         same = leaf == self.kept["leaf"]
         self._fresh, self.kept["leaf"][:] = ~same, leaf
@@ -95,6 +104,20 @@ class WovenCollector(DecisionCollector):
         if self._rows is not None:
             self._rows.go_on(np.flatnonzero(same))
         return action
+
+    def _override(self, level: Level, ids: Array, action: Array, overridden: Array) -> None:
+        """Put reflexes in force where a level acts, those below it first; in place.
+
+        Args:
+            ids: (k,) environments in which it acts.
+            action, overridden: of all environments.
+        """
+        running = self._calls[f"{level.prefix}skill"][ids]
+        for i, inside in level.below.items():
+            self._override(inside, ids[running == i], action, overridden)
+        if level.skills.reflexes and len(ids):
+            action[ids], holds = level.skills.override(self.obs[ids], action[ids])
+            overridden[ids] |= holds
 
     def _decided(self, level: Level, ids: Array) -> None:
         """Keep what selectors below ``level`` have decided in environments ``ids`` (k,)."""

@@ -27,13 +27,14 @@ class Rows:
 
     def __init__(self, collector: WovenCollector, rows: int, levels: Iterable[Level]) -> None:
         n, obs = collector.num_envs, collector.obs
-        lead, self._at = (rows, n), 0
+        lead, self._at, self._collector = (rows, n), 0, collector
         self._obs = np.empty((rows, *obs.shape), obs.dtype)
         self._next_obs = np.empty_like(self._obs)
         self._reward = np.zeros(lead, np.float32)
         self._terminated, self._truncated = np.zeros(lead, bool), np.zeros(lead, bool)
         self._owner = np.empty(lead, np.int64)  # the leaf
         self._fresh = np.empty(lead, bool)
+        self._overridden = None if collector.overridden is None else np.zeros(lead, bool)
         self._goes_on = np.zeros(n, bool)  # if the same skill is called again
         self._masks: list[Array | None] = []
         self._next_masks: list[Array | None] = []
@@ -64,6 +65,8 @@ class Rows:
         at = self._at
         self._obs[at], self._next_obs[at] = step.obs, step.next_obs
         self._owner[at], self._fresh[at] = leaf, fresh
+        if self._overridden is not None:
+            self._overridden[at] = self._collector.overridden
         self._masks.append(mask)
         self._next_masks.append(next_mask)
         self._goes_on[:] = False
@@ -111,7 +114,7 @@ class Rows:
             truncated=self._truncated, next_obs=self._next_obs, obs_mask=stacked(self._masks),
             next_obs_mask=stacked(self._next_masks), valid=self._owner == leaf,
             head=self._heads.get(leaf), memory=memory,
-            starts=None if memory is None else self._fresh,
+            starts=None if memory is None else self._fresh, overridden=self._overridden,
         )  # fmt: skip
 
     def of_critic(self, path: str) -> Experience:

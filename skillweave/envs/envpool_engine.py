@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +12,7 @@ from skillweave.envs.checks import Watch
 from skillweave.envs.engine import RawStep
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
+from skillweave.envs.pool import MakePool, installed, no_precision_warnings
 from skillweave.types import Array, MissingExtra, SkillweaveError
 
 RENEW_AFTER = 100_000
@@ -21,15 +20,22 @@ RENEW_AFTER = 100_000
 
 
 class EnvPoolEngine:
-    """EnvPool's environments.
+    """Environments of a pool: EnvPool's, or what a user makes of them.
 
     A pool takes its seeds when it is made, so an environment can be played again only from there.
     To keep that short, ``renew`` makes a second pool now and then, in which environments go on
     whose episodes have ended in the first one.
+
+    Args:
+        make: a pool.
+        name: of the environment, for messages.
+        spaces: the same environment as Gymnasium has it.
     """
 
-    def __init__(self, env_id: str, num_envs: int, threads: int, spaces: gym.Env[Any, Any]) -> None:
-        self._id, self._threads = env_id, min(threads, num_envs)
+    def __init__(
+        self, make: MakePool, name: str, num_envs: int, threads: int, spaces: gym.Env[Any, Any]
+    ) -> None:
+        self._make, self._threads = make, min(threads, num_envs)
         self.num_envs, self.steps_made = num_envs, 0
         # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
         self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
@@ -41,20 +47,20 @@ class EnvPoolEngine:
         example: Any = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._history = History(num_envs, example)
         self._masks = ActionMasks(self.action_space, num_envs)
-        self._watch = Watch(env_id, self.observation_space, num_envs)
+        self._watch = Watch(name, self.observation_space, num_envs)
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
         """Whether EnvPool is installed and has this environment with the same spaces and limit."""
         try:
-            envpool = _envpool()
+            envpool = installed()
         except MissingExtra:
             return False
         if env_id not in envpool.list_all_envs():
             return False
         if reference.observation_space.shape is None:  # Dict, Tuple: EnvPool nests in its own way
             return False
-        with _no_precision_warnings():
+        with no_precision_warnings():
             spec = envpool.make_spec(env_id)
             theirs = (spec.gymnasium_observation_space, spec.gymnasium_action_space)
         ours = (reference.observation_space, reference.action_space)
@@ -74,13 +80,8 @@ class EnvPoolEngine:
         )
 
     def make_pool(self, seed: int) -> Any:
-        """A bare pool of EnvPool's."""
-        with _no_precision_warnings():
-            pool = _envpool().make_gymnasium(
-                self._id, num_envs=self.num_envs, num_threads=self._threads, seed=seed
-            )
-            _ = pool.observation_space  # made on first use, with the warning
-            return pool
+        """A bare pool."""
+        return self._make(self.num_envs, self._threads, seed)
 
     def reset(self, seed: int) -> Array:
         """Start all anew from one seed; observations (N, *obs_shape)."""
@@ -204,19 +205,3 @@ def _joined(parts: list[tuple[Array, Any]], n: int) -> Any:
     for rows, part in parts:
         found[rows] = part
     return found
-
-
-@contextmanager
-def _no_precision_warnings() -> Iterator[None]:
-    """EnvPool states bounds in float64 for float32 spaces, and Gymnasium warns of it each time."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*precision lowered.*")
-        yield
-
-
-def _envpool() -> Any:
-    try:
-        import envpool
-    except ImportError as error:
-        raise MissingExtra("the EnvPool engine", "envpool") from error
-    return envpool

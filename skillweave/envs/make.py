@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import os
 import time
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, random_actions
+from skillweave.envs.pool import MakePool, envpool
 from skillweave.messages import short, shortened, told, whole_number
 from skillweave.types import MissingExtra, SkillweaveError
 
@@ -40,6 +42,8 @@ class EnvSpec:
         wrappers: applied to each environment, first one first.
         engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
             environment as Gymnasium defines it, else sync.
+        pool: makes the same environments side by side, for training: EnvPool's, perhaps with
+            changes (``PoolWrapper``). Evaluations play ``env``, and so does engine sync.
         workers: processes in which sync environments are stepped, and acted in, while they are
             trained in. None: measured when a run begins, one for each core if a step takes long
             enough to be worth it; the run keeps the choice, as results depend on it.
@@ -50,6 +54,7 @@ class EnvSpec:
     wrappers: tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...] = ()
     engine: EngineName = "auto"
     workers: int | None = None
+    pool: MakePool | None = None
 
     def __post_init__(self) -> None:
         made = isinstance(self.env, gym.Env)
@@ -67,6 +72,11 @@ class EnvSpec:
             raise SkillweaveError(
                 f"{self.name}: wrappers is {short(wrappers)}; it must be a tuple of functions that "
                 "take an environment and return one"
+            )
+        if self.pool is not None and not callable(self.pool):
+            raise SkillweaveError(
+                f"{self.name}: pool is {short(self.pool)}; it must be a function of num_envs, "
+                "threads and seed that makes a pool"
             )
         if self.workers is not None:
             whole_number(self.workers, f"{self.name}: workers", 1)
@@ -130,7 +140,8 @@ class EnvSpec:
     @property
     def is_data(self) -> bool:
         """Whether an id and plain settings say it all, without any code of the user's."""
-        return isinstance(self.env, str) and ":" not in self.env and not self.wrappers
+        plain = not self.wrappers and self.pool is None
+        return isinstance(self.env, str) and ":" not in self.env and plain
 
 
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0) -> Engine:
@@ -147,8 +158,8 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first:
     if spec.engine in ("auto", "envpool"):
         reference = spec.make()
         try:
-            if _in_envpool(spec, reference):
-                return EnvPoolEngine(str(spec.env), num_envs, threads or cores(), reference)
+            if (make := _pool_of(spec, reference)) is not None:
+                return EnvPoolEngine(make, spec.name, num_envs, threads or cores(), reference)
         finally:
             reference.close()
         if spec.engine == "envpool":
@@ -176,16 +187,42 @@ def workers_for(spec: EnvSpec) -> int:
         return 1
     env = spec.make()
     try:
-        if spec.engine != "sync" and _in_envpool(spec, env):
+        if spec.engine != "sync" and _pool_of(spec, env) is not None:
             return 1
         return cores() if _step_seconds(env) > SLOW else 1
     finally:
         env.close()
 
 
-def _in_envpool(spec: EnvSpec, reference: gym.Env[Any, Any]) -> bool:
+def _pool_of(spec: EnvSpec, reference: gym.Env[Any, Any]) -> MakePool | None:
+    """What makes pools of this environment; None: there are none."""
+    if spec.pool is not None:
+        return spec.pool if _fits(spec, spec.pool, reference) else None
     plain = isinstance(spec.env, str) and not spec.kwargs and not spec.wrappers
-    return plain and EnvPoolEngine.supports(str(spec.env), reference)
+    if plain and EnvPoolEngine.supports(str(spec.env), reference):
+        return functools.partial(envpool, str(spec.env))
+    return None
+
+
+def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
+    """Whether the user's pool can be made here.
+
+    Raises:
+        SkillweaveError: it can, but is of another environment.
+    """
+    try:
+        pool = make(num_envs=1, threads=1, seed=0)
+    except MissingExtra:
+        return False
+    for what in ("observation_space", "action_space"):
+        theirs, ours = getattr(pool, what), getattr(reference, what)
+        alike = isinstance(theirs, type(ours)) and theirs.shape == ours.shape
+        if not alike or theirs.dtype != ours.dtype:
+            raise SkillweaveError(
+                f"{spec.name}: its pool's {what} is {short(theirs)}, but the environment's is "
+                f"{short(ours)}; give the pool a PoolWrapper that makes them alike"
+            )
+    return True
 
 
 def _step_seconds(env: gym.Env[Any, Any]) -> float:

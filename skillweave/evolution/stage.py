@@ -96,6 +96,10 @@ class EvolvingPopulation:
             self.generation()
         return {self.stage.name: self._finish()}
 
+    def states(self) -> dict[str, Any]:
+        """None: its best member is known by its policy alone."""
+        return {}
+
     def close(self) -> None:
         """Release the environments."""
         self._open.close()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.levels import Inner
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.guidance import own_guide, restricting_guide
 from skillweave.hierarchy.nesting import below, inner_of
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.skills import Skill
@@ -20,7 +23,8 @@ def assembled(declared: Declaration, found: Mapping[str, Policy]) -> HierarchyPo
     skills = declared.skill_set([policy_of(s, found) for s in declared.skills])
     if declared.interrupt:
         skills = with_interruption(skills, found[CRITIC], declared.together.margin)
-    return HierarchyPolicy(found[SELECTOR], skills)
+    guide = restricting_guide(declared, found[SELECTOR].observation_space)
+    return HierarchyPolicy(found[SELECTOR], skills, guide)
 
 
 def policy_of(skill: Skill, found: Mapping[str, Policy]) -> Policy:
@@ -48,6 +52,8 @@ def learning_set(declared: Declaration, found: Mapping[str, Policy]) -> SkillSet
             return found[skill.name]
         own = below(found, skill.name)
         selector = own[SELECTOR] if inner.ready_selector is not None else None
-        return Inner(learning_set(inner, own), selector, HierarchyPolicy)
+        make = partial(HierarchyPolicy, guide=own_guide(inner))
+        return Inner(learning_set(inner, own), selector, make)
 
-    return declared.skill_set([acts(s) for s in declared.skills])
+    skills = declared.skill_set([acts(s) for s in declared.skills])
+    return skills if declared.reflexes_in_training else replace(skills, reflexes=())

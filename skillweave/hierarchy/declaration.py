@@ -15,6 +15,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
 from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted_selectors
+from skillweave.hierarchy.guidance import check_selection
 from skillweave.hierarchy.nesting import (
     Nestable,
     check_nested,
@@ -39,7 +40,6 @@ from skillweave.types import Policy, SkillweaveError
 
 TOGETHER = "together"
 """What the stage is named in which all learn together."""
-WAYS = ("apart", "together", "apart, then together")
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT, "flat")
 """Names of stages that are not skills; "flat" in runs of older versions."""
 
@@ -67,10 +67,20 @@ class Declaration(Nestable):
     selector: AlgorithmConfig | ReadyValue = field(default_factory=PPO)
     """Trains the selector; its γ is that of one environment step, and so its n_steps. Or a ready
     selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
+    guide: ReadyValue | None = None
+    """A ready selector that a trained one keeps to."""
+    guide_restricts: bool = True
+    """Only what the guide may choose is called, in training and afterwards."""
+    guide_nats: float | None = None
+    """How far from the guide the selector may be while it learns, in nats of KL; None: freely."""
     skill_steps: int = 500_000
     """Training budget of every skill that names none of its own."""
     selector_steps: int = 1_000_000
     """Training budget of the selector, in environment steps; a ready one takes none."""
+    start_calls: int | None = None
+    """While a skill trains apart, its episodes begin after up to this many calls of the skills that
+    can act already, a number drawn for each: it learns where it will be called. None: it starts as
+    soon as it may."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
     call_cost: float = 0.0
@@ -89,7 +99,7 @@ class Declaration(Nestable):
     greedy_skills: bool = True
     """Skills act greedily under the selector; else they sample."""
     reflexes_in_training: bool = True
-    """Reflexes are in force while skills train too: skills learn the body they will have."""
+    """Reflexes are in force while skills train, apart or together: the body they will have."""
     cut_every: int = 100_000
     """Environment steps between checkpoints."""
     eval_every: int | None = None
@@ -105,7 +115,7 @@ class Declaration(Nestable):
         self.reflexes = checked_reflexes(self.reflexes)
         for name in ("algorithm", "flat"):
             check_algorithm(getattr(self, name), name, optional=name == "flat")
-        self._check_selector()
+        check_selection(self)
         target_of(self.selector_target_return, None, "selector")
         check_fields(self)
         check_calls(self.call_steps, self.skills)
@@ -120,24 +130,6 @@ class Declaration(Nestable):
                 f"together is {short(self.together)}; write together=Together(floor=0.3)"
             )
 
-    def _check_selector(self) -> None:
-        if self.learn not in WAYS:
-            raise SkillweaveError(
-                f"learn is {short(self.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
-            )
-        if self.ready_selector is None:
-            check_algorithm(self.selector, "selector", also="function, Automaton or tree")
-            return
-        needs = {
-            "selector_target_return is given": self.selector_target_return is not None,
-            f"learn is {self.learn!r}": self.learn != "apart",
-            "interrupt is True": self.interrupt,
-            "call_steps are Lengths": isinstance(self.call_steps, Lengths),
-        }
-        for what, asked in needs.items():
-            if asked:
-                raise SkillweaveError(f"{what}, but the selector is ready: it does not learn")
-
     @property
     def spec(self) -> EnvSpec:
         """The environment, fully specified."""
@@ -149,7 +141,8 @@ class Declaration(Nestable):
         code = any(s.defines("termination") or s.defines("initiation") for s in self.skills)
         plain = (inner.is_data if (inner := inner_of(s)) else s.policy is None for s in self.skills)
         ready = self.ready_selector is not None or not all(plain)
-        return not code and not ready and not self.reflexes and self.spec.is_data
+        own = bool(self.reflexes) or self.guide is not None
+        return not code and not ready and not own and self.spec.is_data
 
     @property
     def trains_from_data(self) -> bool:

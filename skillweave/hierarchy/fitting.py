@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
+from skillweave.hierarchy.guidance import fitted_guide
 from skillweave.hierarchy.nesting import every_skill, inner_hierarchies, inner_of
 from skillweave.skills import path_of, ready_policy
 from skillweave.skills.foreign_policy import fitted
@@ -40,6 +41,7 @@ def check_settings(declared: Declaration, env: gym.Env[Any, Any], path: str = ""
             check_rollout(config, env.observation_space)
     for reflex in declared.reflexes:
         reflex.check(space)
+    fitted_guide(declared, env.observation_space, path)
     for skill, inner in inner_hierarchies(declared.skills):
         check_settings(inner, env, f"{path}{skill.name}/")
 

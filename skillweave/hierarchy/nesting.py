@@ -77,6 +77,14 @@ def every_skill(skills: Iterable[Skill], path: str = "") -> Iterator[tuple[str, 
             yield from every_skill(inner.skills, f"{path}{skill.name}/")
 
 
+def every_hierarchy(declared: Declaration) -> Iterator[tuple[str, Declaration]]:
+    """A hierarchy, by an empty path, and all below it by theirs."""
+    yield "", declared
+    for name, skill in every_skill(declared.skills):
+        if (inner := inner_of(skill)) is not None:
+            yield name, inner
+
+
 def below(found: Mapping[str, T], name: str) -> dict[str, T]:
     """What has paths that begin with ``name``, by the rest of the path."""
     cut = len(name) + 1

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from skillweave.collecting.calls import Interruption, SkillSet, Why
+from skillweave.collecting.guide import Guide
 from skillweave.selectors import LastCall, ReadySelector
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
@@ -21,11 +22,15 @@ class HierarchyPolicy:
     """Decides where a call is over, lets the skill act elsewhere.
 
     Memory rows: those of ``SkillSet``, ``why`` (int8, why the last call ended; one that is
-    running has not), and the selector's own.
+    running has not), the selector's own and its guide's; where that tells, ``chances``: how likely
+    its latest choices were.
+
+    Args:
+        guide: a ready selector that is asked at every decision.
     """
 
-    def __init__(self, selector: Policy, skills: SkillSet) -> None:
-        self.selector, self.skills = selector, skills
+    def __init__(self, selector: Policy, skills: SkillSet, guide: Guide | None = None) -> None:
+        self.selector, self.skills, self.guide = selector, skills, guide
         self.observation_space = selector.observation_space
         self.action_space = skills.policies[0].action_space
         self.labels = tuple(s.name for s in skills.skills)
@@ -44,12 +49,18 @@ class HierarchyPolicy:
         cuts = told.interruption
         if cuts is not None and cuts.critic is not None:
             acts.append([cuts.margin, source_of(cuts.critic).get("sha256")])
+        if self.guide is not None:
+            acts.append(["guide", source_of(cast(Policy, self.guide.selector)).get("sha256")])
         whole = json.dumps([acts, skills, reflexes, told.lengths or told.call_steps, told.greedy])
         return {"sha256": checksum(whole.encode())}
 
     def start(self, n: int) -> Memory:
         """Memory of n environments that wait for their first decision."""
         memory = self.skills.start(n) | {"why": np.full(n, Why.EPISODE, np.int8)}
+        if self.guide is not None:
+            memory |= self.guide.start(n)
+            if self.guide.tells:
+                memory["chances"] = np.zeros((n, self.skills.choices), np.float32)
         return memory | {_SELECTOR + k: v for k, v in self.selector.start(n).items()}
 
     def act(
@@ -70,9 +81,14 @@ class HierarchyPolicy:
         if len(rows):
             here = obs[rows]
             own = {k: v[rows] for k, v in self._selectors(memory).items()}
-            skill, after = self.selector.act(
-                own, here, self.skills.mask(here), deterministic=deterministic, rng=rng
-            )
+            may = self.skills.mask(here)
+            if self.guide is not None:
+                may = np.ones((len(rows), self.skills.choices), bool) if may is None else may
+                chances = self.guide.ask(memory, rows, here, may)
+                may = chances > 0.0 if self.guide.restricts else may
+                if self.guide.tells:
+                    memory["chances"][rows] = chances
+            skill, after = self.selector.act(own, here, may, deterministic=deterministic, rng=rng)
             for k, v in after.items():
                 memory[_SELECTOR + k][rows] = v
             self.skills.begin(memory, rows, skill)
@@ -82,13 +98,18 @@ class HierarchyPolicy:
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Notice where calls are over."""
         memory = {k: v.copy() for k, v in memory.items()}
+        watches = self.guide is not None or isinstance(self.selector, ReadySelector)
         seen = step if self.skills.watches else None
         rows = np.arange(len(step.reward))
         why = self.skills.observe(memory, rows, seen)
         memory["why"] = np.where(step.terminated | step.truncated, np.int8(Why.EPISODE), why)
+        if not watches:
+            return memory
+        succeeded = self.skills.succeeded(memory, rows, step, memory["why"])
+        last = LastCall(memory["skill"], memory["why"], succeeded)
+        if self.guide is not None:
+            self.guide.watch(memory, step, last)
         if isinstance(self.selector, ReadySelector):
-            succeeded = self.skills.succeeded(memory, rows, step, memory["why"])
-            last = LastCall(memory["skill"], memory["why"], succeeded)
             after = self.selector.watch(self._selectors(memory), step, last)
             memory |= {_SELECTOR + k: v for k, v in after.items()}
         return memory
@@ -143,4 +164,5 @@ class SkillAlone:
     ) -> tuple[Array, Memory]:
         """The skill's actions, or those of the reflexes where one holds."""
         action, memory = self.policy.act(memory, obs, mask, deterministic=deterministic, rng=rng)
-        return apply_reflexes(self.reflexes, obs, action, self.action_space), memory
+        action, _ = apply_reflexes(self.reflexes, obs, action, self.action_space)
+        return action, memory

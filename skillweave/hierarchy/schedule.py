@@ -9,6 +9,7 @@ from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
 from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.guidance import who_guides
 from skillweave.hierarchy.nesting import inner_hierarchies, inner_of
 from skillweave.skills import Skill
 from skillweave.training.scene import (
@@ -37,23 +38,53 @@ def stages_of(declaration: Declaration, seen_as: Skill | None = None) -> list[St
 def own_stages(declaration: Declaration, seen_as: Skill | None = None) -> list[Stage]:
     """The same without those of hierarchies below."""
     apart = _apart(declaration, seen_as) if declaration.learns_apart else []
-    return [*apart, *([_together(declaration, seen_as)] if declaration.weaves else [])]
+    if not declaration.weaves:
+        return apart
+    compared = bool(apart) and (seen_as is None or _plays_alone(declaration))
+    return [*apart, _together(declaration, seen_as, compared)]
 
 
-def _together(declaration: Declaration, seen_as: Skill | None) -> Stage:
-    """The stage in which skills and selectors learn from the same steps."""
+def _together(declaration: Declaration, seen_as: Skill | None, compared: bool) -> Stage:
+    """The stage in which skills and selectors learn from the same steps.
+
+    Args:
+        compared: it is kept only if it is better than what was there before.
+    """
     how = declaration.together
 
     def scene(policies: Policies) -> WovenScene:
-        skills = learning_set(declaration, policies)
-        return woven_scene(declaration.spec, skills, seen_as, _margins(declaration))
+        skills, guide = learning_set(declaration, policies), who_guides(declaration)
+        margins, nats = _margins(declaration), _nats(declaration)
+        return woven_scene(declaration.spec, skills, guide, seen_as, margins, nats)
 
+    ready = declaration.ready_selector is not None
     beside = _learners(declaration, how)
     beside |= _critic(declaration) if how.task_weight or declaration.interrupt else {}
     target = target_of(declaration.selector_target_return, None, TOGETHER)
-    budget, cuts = declaration.together_steps, declaration.interrupt
-    config = _with_floor(declaration.selector, how)
-    return Stage(TOGETHER, "together", config, budget, scene, target, beside, how, cuts)
+    config = declaration.algorithm if ready else _with_floor(declaration.selector, how)
+    return Stage(
+        TOGETHER,
+        "together",
+        config,
+        declaration.together_steps,
+        scene,
+        target,
+        beside,
+        how,
+        declaration.interrupt,
+        ready,
+        declaration.guide_nats,
+        compared=compared,
+    )
+
+
+def _plays_alone(declaration: Declaration) -> bool:
+    """Whether a hierarchy can play whole episodes by itself: some skill may start everywhere."""
+    for skill in declaration.skills:
+        inner = inner_of(skill)
+        if not skill.defines("initiation") and (inner is None or _plays_alone(inner)):
+            return True
+    return False
 
 
 def _learners(declaration: Declaration, how: Together) -> dict[str, AlgorithmConfig]:
@@ -81,6 +112,17 @@ def _margins(declaration: Declaration) -> dict[str, float]:
     return found
 
 
+def _nats(declaration: Declaration) -> dict[str, float]:
+    """By the paths of selectors in hierarchies below, how far they may be from their guides."""
+    found: dict[str, float] = {}
+    for skill, inner in inner_hierarchies(declaration.skills):
+        own = _nats(inner)
+        if inner.guide_nats is not None:
+            own[SELECTOR] = inner.guide_nats
+        found |= {f"{skill.name}/{name}": nats for name, nats in own.items()}
+    return found
+
+
 def _with_floor(config: Any, how: Together) -> Any:
     """A selector's settings, with the floor of learning together where it names none."""
     if isinstance(config, PPO) and not config.floor:
@@ -91,6 +133,7 @@ def _with_floor(config: Any, how: Together) -> Any:
 def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
     """The critic of skills, which sees and discounts as the selector does."""
     own: Any = declaration.selector
+    own = own if isinstance(own, AlgorithmConfig) else declaration.algorithm
     shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(own, PPO):
         shared |= {f: getattr(own, f) for f in ("n_steps", "gae_lambda", "network", "overlap")}
@@ -110,22 +153,27 @@ def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
         def scene(policies: Policies) -> Scene:
             others = [s for s in declaration.skills if can_act(s, policies)]
             starters = declaration.skill_set([policy_of(s, policies) for s in others], others)
-            return skill_scene(declaration.spec, skill, reflexes, starters if others else None)
+            led_by = starters if others else None
+            return skill_scene(
+                declaration.spec, skill, reflexes, led_by, declaration.start_calls or 0
+            )
 
         return Stage(skill.name, "skill", config, budget, scene, target)
 
     def calls(policies: Policies) -> Scene:
         skills = declaration.skill_set([policy_of(s, policies) for s in declaration.skills])
+        guide = who_guides(declaration)
         if declaration.interrupt:
-            return woven_scene(declaration.spec, skills, seen_as)
-        return selector_scene(declaration.spec, skills, seen_as)
+            return woven_scene(declaration.spec, skills, guide, seen_as)
+        return selector_scene(declaration.spec, skills, guide, seen_as)
 
     first = [skill_stage(s) for s in declaration.skills if s.policy is None]
     if not isinstance(config := declaration.selector, AlgorithmConfig):
         return first
     budget = declaration.selector_steps
     target = target_of(declaration.selector_target_return, None, SELECTOR)
-    last = Stage(SELECTOR, "selector", config, budget, calls, target)
+    nats = declaration.guide_nats
+    last = Stage(SELECTOR, "selector", config, budget, calls, target, guide_nats=nats)
     if declaration.interrupt:
         how, beside = declaration.together, _critic(declaration)
         last = replace(last, beside=beside, together=how, interrupt=True)

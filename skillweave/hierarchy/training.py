@@ -7,9 +7,11 @@ from typing import Any
 from skillweave.collecting.lengths import calls_to_json
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.guidance import guide_entry, ready_guide
 from skillweave.hierarchy.nesting import (
     below,
     check_nested,
+    every_hierarchy,
     every_skill,
     inner_hierarchies,
     inner_of,
@@ -27,7 +29,7 @@ from skillweave.training.stage import SELECTOR, Policies
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, train_stages
 from skillweave.training.woven import agents_of
-from skillweave.types import Policy
+from skillweave.types import Policy, SkillweaveError
 
 
 def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
@@ -102,18 +104,9 @@ def _trained(
     if len(apart) == len(stages):
         return before
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
-    if not apart or (nodes and not _plays_alone(declaration)):
+    if not stages[-1].compared:
         return after
     return _better(declaration, run, listeners, before, after, nodes)
-
-
-def _plays_alone(declaration: Declaration) -> bool:
-    """Whether a hierarchy can play whole episodes by itself: some skill may start everywhere."""
-    for skill in declaration.skills:
-        inner = inner_of(skill)
-        if not skill.defines("initiation") and (inner is None or _plays_alone(inner)):
-            return True
-    return False
 
 
 def _better(
@@ -164,6 +157,11 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
     found = ready | _learnt(run)
+    if run.unjudged:
+        raise SkillweaveError(
+            f"{run.path}: all is learnt, but whether the hierarchy before or that after learning "
+            f"together is better was not judged yet; skillweave resume {run.path}"
+        )
     policy = assembled(declaration, found)
     check_parts(declaration, policy, str(run.path))
     return policy
@@ -186,6 +184,10 @@ def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
         told = _told_of(run, name.removesuffix(SELECTOR).removesuffix("/"))
         where = f"{run.path}: the selector" + ("" if name == SELECTOR else f" {name}")
         found[name] = as_recorded(policy, told.get(SELECTOR), lambda: None, where)
+    for path, own in every_hierarchy(declaration):
+        if own.guide_restricts and (guide := ready_guide(own)) is not None:
+            where = f"{run.path}: the guide" + (f" of {path}" if path else "")
+            as_recorded(guide, _told_of(run, path).get("guide"), lambda: None, where)
     return found
 
 
@@ -198,9 +200,9 @@ def _told_of(run: RunDirectory, path: str) -> dict[str, Any]:
 
 
 def _selector_entry(declaration: Declaration) -> dict[str, Any]:
-    """Where a ready selector comes from; nothing where it is trained."""
+    """Where a ready selector comes from, or the guide of a trained one."""
     selector = declaration.ready_selector
-    return {} if selector is None else {SELECTOR: source_of(selector)}
+    return guide_entry(declaration) if selector is None else {SELECTOR: source_of(selector)}
 
 
 def _skill_entry(path: str, skill: Skill) -> dict[str, Any]:
@@ -224,5 +226,6 @@ def _hierarchy_entry(declaration: Declaration) -> dict[str, Any]:
         "greedy_skills": declaration.greedy_skills,
         "reflexes_in_training": declaration.reflexes_in_training,
         "reflexes": [r.name for r in declaration.reflexes],
+        "start_calls": declaration.start_calls,
         **_selector_entry(declaration),
     }

@@ -18,7 +18,8 @@ from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import every_skill, inner_of
+from skillweave.hierarchy.guidance import check_guided, ready_guide
+from skillweave.hierarchy.nesting import every_hierarchy, every_skill, inner_of
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
 from skillweave.reading import Positive, fit, shown
@@ -52,15 +53,14 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
         ready[name] = source_of(own)
         if isinstance(own, Foreign) and (content := own.content()) is not None:
             tensors[f"{name}/content"] = torch.tensor(np.frombuffer(content, np.uint8))
-    skills = dict(every_skill(declaration.skills))
-    inner = {k: found for k, skill in skills.items() if (found := inner_of(skill)) is not None}
+    hierarchies = every_hierarchy(declaration)
     header = {
         "kind": "hierarchy",
         "recipe": getattr(declaration, "recipe", None),
         **place,
-        "skills": list(skills),
+        "skills": [name for name, _ in every_skill(declaration.skills)],
         **_how(declaration),
-        "hierarchies": {name: _how(found) for name, found in inner.items()},
+        "hierarchies": {name: _how(found) for name, found in hierarchies if name},
         "parts": parts,
         "ready": ready,
     }
@@ -87,23 +87,27 @@ def _parts_of(
 
 def _how(declaration: Declaration) -> dict[str, Any]:
     """How a hierarchy calls its skills."""
+    guide = ready_guide(declaration) if declaration.guide_restricts else None
     return {
         **calls_to_json(declaration.call_steps),
         "interrupt": declaration.together.margin if declaration.interrupt else None,
         "greedy_skills": declaration.greedy_skills,
+        **({} if guide is None else {"guide": source_of(guide)}),
     }
 
 
 class InnerHeader(TypedDict):
-    """What the file says of a hierarchy that is a skill."""
+    """What the file says of how a hierarchy calls its skills."""
 
     call_steps: Positive | None
     call_lengths: NotRequired[list[Positive]]
-    interrupt: float | None
+    interrupt: NotRequired[float | None]
     greedy_skills: bool
+    guide: NotRequired[Source]
+    """Of the ready selector that restricts the trained one."""
 
 
-class HierarchyHeader(TypedDict):
+class HierarchyHeader(InnerHeader):
     """What the file of a hierarchy's weights says of them."""
 
     kind: str
@@ -111,10 +115,6 @@ class HierarchyHeader(TypedDict):
     env_kwargs: NotRequired[dict[str, Any]]
     recipe: NotRequired[str | None]
     skills: list[str]
-    call_steps: Positive | None
-    call_lengths: NotRequired[list[Positive]]
-    interrupt: NotRequired[float | None]
-    greedy_skills: bool
     parts: dict[str, dict[str, Any]]
     ready: NotRequired[dict[str, Source]]
     """Of skills by path, and of selectors."""
@@ -172,14 +172,9 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     if header["kind"] == "agent":
         return read_agent(declaration.spec, tensors, header, path)
     skills = dict(every_skill(declaration.skills))
-    names = list(skills)
-    inner = {name: own for name, skill in skills.items() if (own := inner_of(skill)) is not None}
+    names, inner = list(skills), {name for name, _ in every_hierarchy(declaration) if name}
     told = header.get("hierarchies", {})
-    if (
-        header["skills"] != names
-        or header["env"] != declaration.spec.name
-        or set(told) != set(inner)
-    ):
+    if header["skills"] != names or header["env"] != declaration.spec.name or set(told) != inner:
         theirs = ", ".join(header["skills"])
         raise SkillweaveError(
             f"{path} is of skills {theirs[:300]} on {header['env'][:100]}, but the "
@@ -201,13 +196,15 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     for name, policy in ready.items():
         read, where = partial(copied, name), f"{path}: skill {name!r}"
         found[name] = as_recorded(policy, recorded.get(name), read, where)
-    for name, own in ({"": declaration} | inner).items():
-        node = f"{name}/" if name else ""
-        adopt_calls(own, told[name] if name else header)
-        check_selector(own.ready_selector is not None, node + SELECTOR in recorded, str(path))
+    for name, own in every_hierarchy(declaration):
+        node, where = f"{name}/" if name else "", f"{path}: {name}" if name else str(path)
+        how = told[name] if name else header
+        adopt_calls(own, how)
+        check_selector(own.ready_selector is not None, node + SELECTOR in recorded, where)
         for other in [SELECTOR, *([CRITIC] if own.interrupt else [])]:
             if node + other not in recorded:
                 found[node + other] = part(node + other)
+        _check_guide(own, how.get("guide"), where)
     for name, policy in declaration.ready_selectors().items():
         found[name] = as_recorded(policy, recorded[name], lambda: None, f"{path}: the {name}")
     for name, skill in skills.items():
@@ -216,6 +213,14 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     whole = assembled(declaration, found)
     check_parts(declaration, whole, str(path))
     return whole
+
+
+def _check_guide(declaration: Declaration, told: dict[str, Any] | None, where: str) -> None:
+    """Raise a SkillweaveError where the selector was trained under another guide."""
+    guide = ready_guide(declaration) if declaration.guide_restricts else None
+    check_guided(guide is not None, told is not None, where)
+    if guide is not None:
+        as_recorded(guide, told, lambda: None, f"{where}: the guide")
 
 
 def adopt_calls(declaration: Declaration, told: Mapping[str, Any]) -> None:

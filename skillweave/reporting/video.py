@@ -119,10 +119,10 @@ class _Film:
 
     def _show(self, word: str, seconds: float | None = None) -> None:
         text = f"step {self._elapsed}   {word} {self._total:+.1f}"
-        self.video.add(caption(_frame(self.env), self._who, self._color, text), seconds)
+        self.video.add(caption(frame_of(self.env), self._who, self._color, text), seconds)
 
 
-def _frame(env: gym.Env[Any, Any]) -> Array:
+def frame_of(env: gym.Env[Any, Any]) -> Array:
     """What the environment shows now, reduced to at most ``MAX_WIDTH``."""
     frame: Any = env.render()
     if not isinstance(frame, np.ndarray):

@@ -6,6 +6,8 @@ import importlib
 import os
 import struct
 import subprocess
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from subprocess import PIPE
 from typing import Any, Self
@@ -23,15 +25,17 @@ class VideoWriter:
         path: ends in .gif or .mp4. An existing file is replaced at the end, and stays as it is
             if the writing fails or is interrupted.
         fps: frames per second.
+        most_bits: of an MP4, at most so many bits per second; None: as many as it takes.
 
     Raises:
         SkillweaveError: another suffix, frames of unlike sizes, or no frame at all.
         MissingExtra: the library for this kind of file is not installed.
     """
 
-    def __init__(self, path: str | Path, fps: float) -> None:
+    def __init__(self, path: str | Path, fps: float, most_bits: int | None = None) -> None:
         self.path, self.frames = Path(path), 0
-        kinds: dict[str, type[_Gif] | type[_Mp4]] = {".gif": _Gif, ".mp4": _Mp4}
+        kinds: dict[str, Callable[[Path, float], _Gif | _Mp4]]
+        kinds = {".gif": _Gif, ".mp4": partial(_Mp4, most_bits=most_bits)}
         kind = kinds.get(self.path.suffix.lower())
         if kind is None:
             raise SkillweaveError(f"cannot write a video to {path}: it must end in .gif or .mp4")
@@ -69,9 +73,9 @@ class VideoWriter:
 class _Mp4:
     """H.264 as every browser plays it, through a pipe to ffmpeg."""
 
-    def __init__(self, path: Path, fps: float) -> None:
+    def __init__(self, path: Path, fps: float, most_bits: int | None = None) -> None:
         self._ffmpeg = extra("imageio_ffmpeg").get_ffmpeg_exe()
-        self._path, self._fps = path, fps
+        self._path, self._fps, self._most_bits = path, fps, most_bits
         self._process: Any = None
 
     def add(self, frame: Array, seconds: float | None) -> None:
@@ -81,6 +85,9 @@ class _Mp4:
             size = f"{frame.shape[1]}x{frame.shape[0]}"
             raw = f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {size} -r {self._fps} -i -"
             coded = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
+            if self._most_bits is not None:
+                most = self._most_bits
+                coded += f" -preset veryfast -maxrate {most} -bufsize {most // 2}"
             command = [self._ffmpeg, *raw.split(), *coded.split(), str(self._path)]
             self._process = subprocess.Popen(command, stdin=PIPE, stderr=PIPE)
         try:

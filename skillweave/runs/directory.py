@@ -6,6 +6,7 @@ lineage.jsonl                a line for every member of every generation, where 
 evaluation.json              the latest evaluation (``training/evaluation_file.py``)
 checkpoint.safetensors       the stage under way, at its latest clean cut (and the one before)
 policies/<stage>.safetensors finished stages
+states/<who>.safetensors      what learns on in a later stage, until that is done
 policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights
 .lock                        empty; locked by the process that trains the run
 
@@ -148,8 +149,18 @@ class RunDirectory:
 
     @property
     def finished(self) -> bool:
-        """Whether every stage is done."""
-        return all(p["status"] == "done" for p in self.manifest["stages"])
+        """Whether every stage is done, and judged where it is to be."""
+        done = all(p["status"] == "done" for p in self.manifest["stages"])
+        return done and not self.unjudged
+
+    @property
+    def unjudged(self) -> bool:
+        """Whether nobody has found out yet which is better: before, or after, learning together."""
+        both = self.manifest.get("learn") == "apart, then together"  # older runs say no more
+        return any(
+            s["kind"] == "together" and s.get("compared", both) and "kept" not in s
+            for s in self.manifest["stages"]
+        )
 
     def save_checkpoint(
         self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
@@ -162,7 +173,7 @@ class RunDirectory:
         """
         tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
-        header = self._place(header["stage"]) | header | self.line_bytes()
+        header = self.place(header["stage"]) | header | self.line_bytes()
         self.check()
         self._checkpoints.save(tensors, header)
 
@@ -184,7 +195,7 @@ class RunDirectory:
         Raises:
             SkillweaveError: checkpoints of this stage exist, but none is good.
         """
-        found = self._checkpoints.load(stage, schema, self._must_be_ours)
+        found = self._checkpoints.load(stage, schema, self.must_be_ours)
         if found is None:
             return None
         tensors, header, path = found
@@ -206,19 +217,20 @@ class RunDirectory:
             tensors, header = policy.to_file()
             path = self.policy_path(stage, name)
             make_directory(path.parent)
-            header |= self._place(stage)
+            header |= self.place(stage)
             sums[name] = write_tensors(path, tensors, header, make_directories=False)
         if list(sums) == [stage]:
             entry["sha256"] = sums[stage]
         else:
             entry["policies"] = sums
 
-    def _place(self, stage: str) -> dict[str, str]:
+    def place(self, stage: str) -> dict[str, str]:
         """What the header of a stage's file says of where it belongs."""
         run = self.manifest.get("id")  # runs of older versions have none
         return {"stage": stage} | ({} if run is None else {"run": run})
 
-    def _must_be_ours(self, header: dict[str, Any], path: Path) -> None:
+    def must_be_ours(self, header: Mapping[str, Any], path: Path) -> None:
+        """Raise a SkillweaveError where a file's header names another run."""
         run = self.manifest.get("id")
         if header.get("run", run) != run:
             raise SkillweaveError(f"{path} belongs to another run")
@@ -246,7 +258,7 @@ class RunDirectory:
             raise SkillweaveError(f"{path} holds no agent's policy")
         if header.get("stage", stage) != stage:
             raise SkillweaveError(f"{path} holds the policy of stage {shown(header['stage'])}")
-        self._must_be_ours(header, path)
+        self.must_be_ours(header, path)
         known = entry.get("policies", {}).get(name, entry.get("sha256", sha256))
         if known != sha256:
             raise SkillweaveError(

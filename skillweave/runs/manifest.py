@@ -36,16 +36,23 @@ NodePath = Annotated[
 
 
 class NestedEntry(TypedDict):
-    """A hierarchy that is a skill of the run's, or of another one; its skills have entries, too."""
+    """A hierarchy: the run's, or a skill of it or of another one; its skills have entries, too."""
 
     call_steps: Positive | None
     call_lengths: NotRequired[list[Positive]]
-    learn: Literal["apart", "together", "apart, then together"]
-    interrupt: float | None
+    interrupt: NotRequired[float | None]
+    """By how much another skill must be worth more for a call to be cut."""
+    learn: NotRequired[Literal["apart", "together", "apart, then together"]]
     greedy_skills: bool
-    reflexes: list[str]
-    reflexes_in_training: bool
     selector: NotRequired[Source]
+    """Of a ready selector; absent where it is trained."""
+    guide: NotRequired[Source]
+    """Of the ready selector that a trained one keeps to."""
+    guide_restricts: NotRequired[bool]
+    guide_nats: NotRequired[float | None]
+    reflexes: NotRequired[list[str]]
+    reflexes_in_training: NotRequired[bool]
+    start_calls: NotRequired[int | None]
 
 
 class SkillEntry(TypedDict):
@@ -125,6 +132,10 @@ class StageEntry(TypedDict):
     """Of the skills that learn together with the selector."""
     interrupt: NotRequired[bool]
     """The selector cuts calls."""
+    guide_nats: NotRequired[float]
+    """How far the selector may be from its guide."""
+    compared: NotRequired[bool]
+    """What is learnt together is kept only if it is better than what was there before."""
     kept: NotRequired[Kept]
     """Whether what was there before was better than what was learnt together."""
 
@@ -149,20 +160,10 @@ class Manifest(TypedDict):
     track: NotRequired[list[str]]
 
 
-class HierarchyManifest(Manifest):
+class HierarchyManifest(Manifest, NestedEntry):
     """``run.json`` of a hierarchy."""
 
     skills: list[SkillEntry]
-    call_steps: Positive | None
-    call_lengths: NotRequired[list[Positive]]
-    interrupt: NotRequired[float | None]
-    """By how much another skill must be worth more for a call to be cut."""
-    learn: NotRequired[Literal["apart", "together", "apart, then together"]]
-    greedy_skills: bool
-    selector: NotRequired[Source]
-    """Of a ready selector; absent where it is trained."""
-    reflexes: NotRequired[list[str]]
-    reflexes_in_training: NotRequired[bool]
 
 
 class MemberEntry(TypedDict):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import os
 from collections.abc import Sequence
@@ -14,35 +15,49 @@ TRACKERS = ("tensorboard", "wandb")
 
 
 class TensorBoard:
-    """Scalars by environment step, under ``<run>/tensorboard``."""
+    """Scalars by environment step, under ``<run>/tensorboard``, in a folder for each stage.
+
+    A folder each, because every stage counts its steps from 0, and what a resumed run replaces is
+    purged by the number of the step.
+    """
 
     def __init__(self, run: RunDirectory) -> None:
-        from torch.utils.tensorboard import SummaryWriter
+        import torch.utils.tensorboard  # noqa: F401  # fails here, not after hours
 
-        self._writer: Any = SummaryWriter(str(run.path / "tensorboard"))
+        self._path = run.path / "tensorboard"
+        self._writers: dict[str, Any] = {}
 
     def stage(self, name: str, budget: int) -> None:
         """Nothing to say."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Write every metric."""
+        """Write every metric; a resumed stage's first one takes the place of all from there on."""
+        if name not in self._writers:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writers[name] = SummaryWriter(str(self._path / name), purge_step=steps)
         for key, value in metrics.items():
-            self._writer.add_scalar(f"{name}/{key}", value, steps)
+            self._writers[name].add_scalar(f"{name}/{key}", value, steps)
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Flush."""
-        self._writer.flush()
+        if name in self._writers:
+            self._writers[name].flush()
 
     def message(self, text: str) -> None:
         """Messages are not tracked."""
 
     def close(self) -> None:
         """Close the files."""
-        self._writer.close()
+        for writer in self._writers.values():
+            writer.close()
 
 
 class WandB:
-    """One Weights & Biases run; offline if there is no login. It never asks for one."""
+    """One Weights & Biases run; offline if there is no login. It never asks for one.
+
+    A resumed run goes on in it: its id follows from the run's path, and from when it was begun.
+    """
 
     def __init__(self, run: RunDirectory) -> None:
         import wandb
@@ -50,6 +65,8 @@ class WandB:
         self._run: Any = wandb.init(
             project="skillweave",
             name=run.path.name,
+            id=_identifier(run),
+            resume="allow",
             dir=str(run.path),
             config=run.manifest,
             mode=wandb_mode(),
@@ -73,6 +90,12 @@ class WandB:
     def close(self) -> None:
         """Finish the run."""
         self._run.finish()
+
+
+def _identifier(run: RunDirectory) -> str:
+    """The same for a run and for what resumes it, and for no other."""
+    told = (str(run.path.resolve()), run.manifest["created"], run.manifest.get("id"))
+    return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
 def make_trackers(

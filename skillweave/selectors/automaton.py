@@ -13,9 +13,10 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.collecting.calls import Why
+from skillweave.collecting.guide import LastCall
 from skillweave.messages import short
-from skillweave.selectors.base import LastCall, ReadySelector, function_name, listed, shown_obs
-from skillweave.skills.base import answer
+from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
+from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import checksum
 from skillweave.types import Array, Memory, SkillweaveError, Step
 
@@ -82,19 +83,19 @@ class Automaton(ReadySelector):
                 "transitions={('from', 'to'): event}"
             )
         self.transitions = dict(transitions)
-        self._arrows = [(*self._ends_of(pair, e), e) for pair, e in self.transitions.items()]
-        self._rank = np.zeros((len(states), 0))
+        self.arrows = [(*self._ends_of(pair, e), e) for pair, e in self.transitions.items()]
+        self.ranks = np.zeros((len(states), 0))
 
     def among(self, skills: tuple[str, ...]) -> Self:
         """A copy that chooses among the skills of these names."""
         found = super().among(skills)
         # The larger, the earlier: 0 where the skill is none of the state's.
-        found._rank = np.zeros((len(self.states), len(skills)), np.int64)
+        found.ranks = np.zeros((len(self.states), len(skills)), np.int64)
         for i, (state, names) in enumerate(self.states.items()):
             numbers = [found._number(n, f"automaton: state {short(state)}") for n in names]
             numbers = sorted(numbers) if isinstance(names, frozenset) else numbers
             for place, number in enumerate(numbers):
-                found._rank[i, number] = len(numbers) - place
+                found.ranks[i, number] = len(numbers) - place
         return found
 
     def start(self, n: int) -> Memory:
@@ -103,7 +104,7 @@ class Automaton(ReadySelector):
 
     def allowed(self, memory: Memory) -> Array:
         """(n, S) bool: the skills of the state that each environment is in."""
-        allowed: Array = self._rank[memory["state"]] > 0
+        allowed: Array = self.ranks[memory["state"]] > 0
         return allowed
 
     def act(
@@ -116,21 +117,23 @@ class Automaton(ReadySelector):
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """A skill of each environment's state, (n,)."""
-        allowed = self.allowed(memory)
-        if mask is not None:
-            allowed &= mask
-        if not allowed.any(axis=1).all():
-            self._nothing_may_start(memory, obs, int(np.flatnonzero(~allowed.any(axis=1))[0]))
-        score = self._rank[memory["state"]]
+        allowed = self._startable(memory, obs, mask)
+        score = self.ranks[memory["state"]]
         if not deterministic:
             score = (rng or np.random.default_rng()).random(allowed.shape)
         return np.where(allowed, score, -1).argmax(axis=1), memory
+
+    def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
+        """All skills of the state that may start are equally likely, (n, S)."""
+        allowed = self._startable(memory, obs, mask)
+        found: Array = allowed / allowed.sum(axis=1, keepdims=True, dtype=np.float32)
+        return found, memory
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Take the transitions whose events have happened."""
         before, after = memory["state"], memory["state"].copy()
         waiting = np.ones(len(before), bool)  # no transition was taken yet
-        for origin, target, event in self._arrows:
+        for origin, target, event in self.arrows:
             here = waiting & (before == origin)
             if not here.any():
                 continue
@@ -151,6 +154,15 @@ class Automaton(ReadySelector):
         ]
         whole = json.dumps([self.start_state, states, arrows])
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
+
+    def _startable(self, memory: Memory, obs: Array, mask: Array | None) -> Array:
+        """The skills of the state that may start, (n, S) bool: at least one."""
+        allowed = self.allowed(memory)
+        if mask is not None:
+            allowed = allowed & mask
+        if not allowed.any(axis=1).all():
+            self._nothing_may_start(memory, obs, int(np.flatnonzero(~allowed.any(axis=1))[0]))
+        return allowed
 
     def _happened(self, event: Event, step: Step, last: LastCall) -> Array:
         """Whether an event has happened in this step, (n,) bool."""

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 
+from skillweave.collecting.guide import LastCall
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.types import Array, Memory, SkillweaveError, Step
-
-
-@dataclass(frozen=True, slots=True)
-class LastCall:
-    """How the last call of n environments ended; where one still runs, that is said."""
-
-    skill: Array  # (n,) int64, its place in the hierarchy's list; −1: the episode has just begun
-    why: Array  # (n,) int8, ``Why`` it ended
-    succeeded: Array  # (n,) bool: by the skill's success(), where it has none by its own end
 
 
 class ReadySelector(Foreign):
@@ -42,6 +33,19 @@ class ReadySelector(Foreign):
         found = copy.copy(self)
         found.skills = skills
         return found
+
+    def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
+        """How likely it is to choose each skill where a call is over, (n, S) float32.
+
+        Returns:
+            that, and the memory after it was asked.
+        """
+        skill, after = self.act(memory, obs, mask)
+        return np.eye(len(self.skills), dtype=np.float32)[skill], after
+
+    def allowed(self, memory: Memory) -> Array | None:
+        """(n, S) bool, the skills that it may choose next; None: that depends on what it sees."""
+        return None
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """The memory after a step of n environments; called after every step.

@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.spaces import Discrete
 
 from skillweave.collecting.calls import Why
-from skillweave.selectors.base import LastCall, ReadySelector, function_name, listed, shown_obs
+from skillweave.collecting.guide import LastCall
+from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.ready import required_arguments
@@ -31,11 +32,11 @@ class FunctionSelector(ReadySelector):
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(f"function {function_name(function)}()")
         self.function = function
-        self._asks_last = required_arguments(function) > 1
+        self.asks_last = required_arguments(function) > 1
 
     def start(self, n: int) -> Memory:
         """How the last call ended, for functions that are told; else nothing."""
-        if not self._asks_last:
+        if not self.asks_last:
             return {}
         return {
             "skill": np.full(n, -1),
@@ -54,7 +55,7 @@ class FunctionSelector(ReadySelector):
     ) -> tuple[Array, Memory]:
         """What the function chooses, (n,), checked."""
         function = self.function
-        if self._asks_last:
+        if self.asks_last:
             last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
             value = called(lambda given: function(given, last), read_only(obs), self._who)
         else:
@@ -68,7 +69,7 @@ class FunctionSelector(ReadySelector):
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Keep how the last call ended."""
-        if not self._asks_last:
+        if not self.asks_last:
             return memory
         return {
             "skill": last.skill.copy(), "why": last.why.copy(), "succeeded": last.succeeded.copy()

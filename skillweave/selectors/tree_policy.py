@@ -10,9 +10,10 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.collecting.calls import Why
-from skillweave.selectors.base import LastCall, ReadySelector, shown_obs
+from skillweave.collecting.guide import LastCall
+from skillweave.selectors.base import ReadySelector, shown_obs
 from skillweave.selectors.tree import Composite, Condition, Node, Status
-from skillweave.skills.base import answer
+from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import checksum, made_up
 from skillweave.types import Array, Memory, SkillweaveError, Step
 
@@ -34,7 +35,7 @@ class TreeSelector(ReadySelector):
         self.root = root
         self._plan = _Plan()
         self._top = self._plan.add(root, lambda name: 0)
-        if not self._plan.leaves:
+        if not self._plan.skills:
             raise SkillweaveError(
                 "the tree has no skill: give at least one skill's name as a child"
             )
@@ -83,9 +84,16 @@ class TreeSelector(ReadySelector):
         return tick.skill, after
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Keep whether the call under way has succeeded."""
+        """Keep whether the call under way has succeeded.
+
+        Where another skill was called than the leaf's, as one may who is only guided, the leaf was
+        not under way: it is asked for again.
+        """
         over = last.why != Why.RUNNING
-        return memory | {"succeeded": np.where(over, last.succeeded, memory["succeeded"])}
+        called = np.array(self._plan.skills)[memory["leaf"]] == last.skill
+        leaf = np.where(over & ~called, -1, memory["leaf"])
+        succeeded = np.where(over, last.succeeded, memory["succeeded"])
+        return memory | {"leaf": leaf, "succeeded": succeeded}
 
     def try_out(self) -> None:
         """Ask every condition once about two made-up observations."""
@@ -178,7 +186,7 @@ class _Several:
 class _Plan:
     """The nodes of a tree with numbers, so that memories can be arrays."""
 
-    leaves: int = 0
+    skills: list[int] = field(default_factory=list)  # of each leaf
     composites: int = 0
     asked: list[_Asked] = field(default_factory=list)
 
@@ -188,8 +196,8 @@ class _Plan:
             self.asked.append(_Asked(node))
             return self.asked[-1]
         if isinstance(node, str):
-            self.leaves += 1
-            return _Leaf(self.leaves - 1, number_of(node))
+            self.skills.append(number_of(node))
+            return _Leaf(len(self.skills) - 1, self.skills[-1])
         self.composites += 1
         number = self.composites - 1
         children = tuple(self.add(child, number_of) for child in node.children)

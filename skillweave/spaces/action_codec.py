@@ -50,7 +50,7 @@ class ActionCodec:
             action = action if self.low is None else np.asarray(action + self.low)
             return self._shaped(action) if self.multi else action
         assert self.low is not None
-        low, span, bounded = self._span
+        low, span, bounded = self.span
         # A diverged network gives NaN; it acts by 0 until training reports it.
         action = np.nan_to_num(action)
         scaled = action.astype(np.result_type(action, low))
@@ -64,7 +64,7 @@ class ActionCodec:
             units = units.reshape(len(units), -1) if self.multi else units
             return units if self.low is None else np.asarray(units - self.low)
         assert self.low is not None
-        low, span, bounded = self._span
+        low, span, bounded = self.span
         units = action.reshape(len(action), -1).clip(self.low, self.high)
         width = np.where(span[bounded] == 0.0, 1.0, span[bounded])  # low == high: any unit
         units[:, bounded] = (units[:, bounded] - low[bounded]) / width * 2.0 - 1.0
@@ -75,7 +75,7 @@ class ActionCodec:
         return shaped.astype(self.space.dtype, copy=False)
 
     @cached_property
-    def _span(self) -> tuple[Array, Array, Array]:
+    def span(self) -> tuple[Array, Array, Array]:
         """Lower bound, width, and whether the width is finite, of a Box; (A,) each."""
         assert self.low is not None
         assert self.high is not None

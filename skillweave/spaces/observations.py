@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -114,23 +114,29 @@ class ObsCodec:
     leaves: tuple[_Leaf, ...]
     peaks: tuple[float, ...]  # of each image
 
-    def split(self, obs: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Raw observations (*lead, *item) to a vector and images.
+    def split(self, obs: Tensor | Sequence[Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Raw observations to a vector and images.
+
+        Args:
+            obs: (*lead, *item); or of each leaf, in order, (*lead, *its shape).
 
         Returns:
             The vector float32 (*lead, size); each image (*lead, C, H, W) in its own dtype.
         """
-        lead = obs.shape[: obs.ndim - len(self.item)]
+        if isinstance(obs, Tensor):
+            lead = obs.shape[: obs.ndim - len(self.item)]
+            raw: Sequence[Tensor] = [leaf.read(obs) for leaf in self.leaves]
+        else:
+            lead, raw = obs[0].shape[: obs[0].ndim - len(self.leaves[0].shape)], obs
         vectors, images = [], []
-        for leaf in self.leaves:
-            x = leaf.read(obs)
+        for leaf, x in zip(self.leaves, raw, strict=True):
             if leaf.image is None:
                 vectors.append(leaf.vector(x, lead))
             else:
                 images.append(leaf.image.read(x, lead))
         if len(vectors) == 1:
             return vectors[0], tuple(images)
-        nothing = obs.new_empty((*lead, 0), dtype=torch.float32)
+        nothing = raw[0].new_empty((*lead, 0), dtype=torch.float32)
         return torch.cat(vectors, dim=-1) if vectors else nothing, tuple(images)
 
     def pixels(self, image: Tensor, i: int) -> Tensor:

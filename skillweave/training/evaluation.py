@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.messages import whole_number
 from skillweave.reading import Count, Positive
+from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.skill_report import SkillReport, SkillTally, all_steps, skill_table
@@ -110,31 +112,41 @@ class Evaluation:
 
 def interquartile_mean(values: Array) -> float:
     """Mean of the middle half (Agarwal et al. 2021); the ends of the half count in part."""
-    x = np.sort(np.asarray(values, float))
+    return float(interquartile_means(values))
+
+
+def interquartile_means(values: Array) -> Array:
+    """The same over the first axis of an array (n, …): (…)."""
+    x = np.sort(np.asarray(values, float), axis=0)
     n = len(x)
     cut = n / 4
     weight = np.clip(np.minimum(np.arange(1, n + 1) - cut, n - cut - np.arange(n)), 0.0, 1.0)
-    return float((weight * x).sum() / weight.sum())
+    found: Array = np.tensordot(weight, x, axes=1) / weight.sum()
+    return found
 
 
 def evaluate(
     policy: Policy,
-    env: EnvSpec,
+    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
     *,
     episodes: int = 100,
     seed: int = 0,
     deterministic: bool = True,
     num_envs: int = 100,
     max_steps: int | None = None,
+    watch: Callable[[Played], None] | None = None,
 ) -> Evaluation:
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
     Args:
+        policy: who acts; one made elsewhere (``from_function``) takes the environment's spaces.
+        env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
         seed: picks the episodes; the same seed gives the same starts to every policy.
         deterministic: act greedily, else sample.
         num_envs: environments side by side; does not change the result of a greedy policy.
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
             as many as the environment's own time limit, or ``LONGEST_EPISODE``.
+        watch: is shown every step that is played.
 
     Raises:
         SkillweaveError: the policy was made for other spaces.
@@ -142,29 +154,43 @@ def evaluate(
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = min(whole_number(num_envs, "num_envs", 1), episodes)
-    reference = env.make()
+    spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
+    reference = spec.make()
     try:
         limit = limit or time_limit(reference) or LONGEST_EPISODE
         threshold = reference.spec.reward_threshold if reference.spec else None
     finally:
         reference.close()
-    engine = make_engine(replaced(env, engine="sync"), n)
+    engine = make_engine(replaced(spec, engine="sync"), n)
     try:
-        _check_spaces(policy, engine.observation_space, engine.action_space, env.name)
+        spaces = engine.observation_space, engine.action_space
+        if isinstance(policy, Foreign):
+            policy = policy.bind(*spaces, "the policy")
+        _check_spaces(policy, *spaces, spec.name)
         engine.reset(0)
-        seeds = [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+        seeds = episode_seeds(seed, episodes)
         moments = play(
             policy,
             SeededEpisodes(engine, seeds, limit),
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
-        return replaced(_scored(policy, episodes, moments), threshold=threshold)
+        return replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
     finally:
         engine.close()
 
 
-def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluation:
+def episode_seeds(seed: int, episodes: int) -> list[int]:
+    """The seeds that an evaluation's episodes start from; training uses none of them."""
+    return [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
+
+
+def _scored(
+    policy: Policy,
+    episodes: int,
+    moments: Iterator[Played],
+    watch: Callable[[Played], None] | None,
+) -> Evaluation:
     """The scores of episodes as they are played."""
     returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
     tally = SkillTally(policy, episodes)
@@ -173,6 +199,8 @@ def _scored(policy: Policy, episodes: int, moments: Iterator[Played]) -> Evaluat
         lengths[played.episode] += played.lasted
         cut += int(played.cut.sum())
         tally.add(played)
+        if watch is not None:
+            watch(played)
     return Evaluation(tuple(returns.tolist()), tuple(lengths.tolist()), None, tally.reports(), cut)
 
 

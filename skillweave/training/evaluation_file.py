@@ -9,8 +9,12 @@ from typing import Any, NotRequired, TypedDict
 from skillweave.reading import Count, fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
+from skillweave.runs.trackers import make_trackers
 from skillweave.training.evaluation import Evaluation
-from skillweave.types import SkillweaveError
+from skillweave.types import MissingExtra, SkillweaveError
+
+CHARTS = {"usage": "share", "call_length": "length_mean", "success": "success_rate"}
+"""What trackers are sent of each skill, and where it stands in its report."""
 
 
 class EvaluationFile(TypedDict):
@@ -41,7 +45,7 @@ class SavedEvaluation:
 def save_evaluation(
     run: RunDirectory, evaluation: Evaluation, seed: int, deterministic: bool
 ) -> None:
-    """Write it into the run, in place of the one before.
+    """Write it into the run, in place of the one before, and send it to the run's trackers.
 
     Raises:
         SkillweaveError: the disk is full or cannot be written; what was there is intact.
@@ -56,6 +60,24 @@ def save_evaluation(
         found["run"] = run.manifest["id"]
     plain = {**found, "evaluation": asdict(evaluation)}
     write_json(run.path / "evaluation.json", plain, make_directories=False)
+    _track(run, evaluation)
+
+
+def _track(run: RunDirectory, evaluation: Evaluation) -> None:
+    """Charts of the whole policy: its return, and of each skill usage, call length and success."""
+    steps = sum(stage.get("steps", 0) for stage in run.manifest["stages"])
+    scores = {"return_mean": evaluation.mean}
+    told = evaluation.to_json()["skills"]
+    for kind, key in CHARTS.items():
+        scores |= {f"{kind}/{k}": v[key] for k, v in told.items() if v[key] is not None}
+    try:
+        trackers = make_trackers(run.manifest.get("track", ()), run)
+    except MissingExtra:  # the run was trained on another machine
+        return
+    for tracker in trackers:
+        tracker.stage("evaluation", 0)
+        tracker.tick("evaluation", steps, 0.0, scores)
+        tracker.close()
 
 
 def load_evaluation(run: RunDirectory) -> SavedEvaluation | None:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from skillweave.buffers.rollout import RolloutStore
@@ -85,7 +86,6 @@ class RolloutLearner:
         config = stack.algorithm.config
         self.overlap, self.threads = bool(config.overlap), int(config.threads)
         self._store = RolloutStore(stack.members, quota, stack.state.params.device)
-        self._log_std: Tensor | None = None
         self.anchor: Anchor | None = None
         """The policy that it is to stay near, if there is one."""
         self._progress = 0.0  # where the rollout began, so that the first has the whole rate
@@ -102,33 +102,48 @@ class RolloutLearner:
         """Keep a rollout, and what it was collected with."""
         params, self._progress = self._asked
         log_std = params.views.get("actor.log_std")
-        if log_std is not None:
-            self._log_std = log_std[:, None].to(self._stack.state.params.device)
-        self._store.add(experience)
+        self._store.add(experience, None if log_std is None else log_std[:, None])
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """An update, where there was something to learn from."""
         stack = self._stack
         gamma, anchor = stack.state.gamma, self.anchor
-        rollout = self._store.rollout(gamma, self._log_std, self._progress, anchor)
+        rollout = self._store.rollout(gamma, self._progress, anchor)
         if rollout is None:
             return {}
         seeds = member_seeds(self._seeds, "learn", stack.members, update)
         generators = [s.torch() for s in seeds]
         stack.state, report = stack.algorithm.update(stack.state, rollout, generators)
         metrics: dict[str, Tensor] = report.metrics
+        if anchor is not None and "anchor_kl" in metrics:
+            anchor.coef = adapted(anchor.coef, metrics["anchor_kl"], anchor.nats)
         return metrics
 
     def cut(self, columns: Array) -> None:
         """Nothing to do: trajectories end with each experience."""
 
     def kept(self) -> dict[str, Tensor]:
-        """Rows of which there are not enough yet."""
-        return self._store.state()
+        """Rows of which there are not enough yet, and what a nat of divergence costs."""
+        coef = {} if self.anchor is None else {"anchor_coef": self.anchor.coef.cpu().clone()}
+        return self._store.state() | coef
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint kept."""
         self._store.load(kept)
+        if self.anchor is not None:
+            coef = kept["anchor_coef"]
+            if coef.shape != self.anchor.coef.shape or not bool(coef.isfinite().all()):
+                raise ValueError(f"the price of divergence is {coef.tolist()}")
+            self.anchor.coef = coef.to(self.anchor.coef.device)
+
+
+def adapted(coef: Tensor, kl: Tensor, nats: float) -> Tensor:
+    """What a nat of KL costs from now on, so that KL comes near ``nats``; (P,) each.
+
+    The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
+    """
+    factor = torch.where(kl > 1.5 * nats, 2.0, torch.where(kl < nats / 1.5, 0.5, 1.0))
+    return (coef * factor).clamp(1e-3, 1e3)
 
 
 def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int = 0) -> list[Seeds]:

@@ -12,6 +12,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.guide import AskedElsewhere, Guide
 from skillweave.collecting.levels import CRITIC, SELECTOR
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
@@ -58,26 +59,31 @@ def skill_scene(
     skill: Skill | None = None,
     reflexes: Sequence[Reflex] = (),
     starters: SkillSet | None = None,
+    start_calls: int = 0,
 ) -> Scene:
     """The environments seen through a skill; None: as they are.
 
     Args:
         starters: skills that can act already: they lead to where the skill may start.
+        start_calls: an episode begins after up to so many calls of theirs.
     """
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return SkillCollector(engine, acting, skill, tuple(reflexes), starters)
+        return SkillCollector(engine, acting, skill, tuple(reflexes), starters, start_calls)
 
     return Scene(spec.name, *_spaces(spec), collector)
 
 
-def selector_scene(spec: EnvSpec, skills: SkillSet, seen_as: Skill | None = None) -> Scene:
+def selector_scene(
+    spec: EnvSpec, skills: SkillSet, guide: Guide | None = None, seen_as: Skill | None = None
+) -> Scene:
     """The environments in which a selector calls skills.
 
     Args:
+        guide: a ready selector that is asked wherever it decides.
         seen_as: the skill that all of it is, in another hierarchy; None: the task itself.
     """
 
@@ -85,7 +91,7 @@ def selector_scene(spec: EnvSpec, skills: SkillSet, seen_as: Skill | None = None
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return DecisionCollector(engine, acting, skills, shared, seen_as)
+        return DecisionCollector(engine, acting, skills, shared, guide, seen_as)
 
     observation_space, _ = _spaces(spec)
     choices = gym.spaces.Discrete(skills.choices)
@@ -101,10 +107,14 @@ class WovenScene(Scene):
     skill_space: gym.Space[Any] = field(kw_only=True)
     """What skills choose from."""
     spec: EnvSpec = field(kw_only=True)
+    guide: Guide | None = field(kw_only=True)
+    """A ready selector, which is asked wherever the selector decides, or decides itself."""
     seen_as: Skill | None = field(kw_only=True)
     """The skill that all of it is, in another hierarchy."""
     margins: Mapping[str, float] = field(kw_only=True)
     """By the paths of critics in hierarchies below: where calls are cut there."""
+    nats: Mapping[str, float] = field(kw_only=True)
+    """By the paths of selectors in hierarchies below: how far they may be from their guides."""
 
     def chooses_from(self, path: str) -> gym.Space[Any]:
         """The actions of a skill, a selector or a critic of skills, by its path."""
@@ -136,26 +146,36 @@ class WovenScene(Scene):
     def woven(
         self,
         engine: Engine,
-        acting: Acting,
+        acting: Acting | None,
         learners: Mapping[str, Acting],
         margins: Mapping[str, float],
     ) -> WovenCollector:
-        """A collector of these environments; the arguments are those of ``WovenCollector``."""
-        return WovenCollector(engine, acting, self.skills, learners, margins, self.seen_as)
+        """A collector of these environments.
+
+        Args:
+            acting: the selector; None: the guide decides.
+            learners, margins: as of ``WovenCollector``.
+        """
+        decides: Any = acting or AskedElsewhere(engine.num_envs)
+        return WovenCollector(
+            engine, decides, self.skills, learners, margins, self.guide, self.seen_as
+        )
 
 
 def woven_scene(
     spec: EnvSpec,
     skills: SkillSet,
+    guide: Guide | None = None,
     seen_as: Skill | None = None,
     margins: Mapping[str, float] | None = None,
+    nats: Mapping[str, float] | None = None,
 ) -> WovenScene:
     """The environments in which a selector calls skills, and some of these learn too."""
     plain = skill_scene(spec)
     return WovenScene(
         spec.name, plain.observation_space, gym.spaces.Discrete(skills.choices), plain.collector,
         skills.usual_steps or CALL, skills=skills, skill_space=plain.action_space, spec=spec,
-        seen_as=seen_as, margins=margins or {},
+        guide=guide, seen_as=seen_as, margins=margins or {}, nats=nats or {},
     )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,11 @@ class SkillReport:
     return_sum: float | None
     """Sum of its own reward over its steps, not discounted; of the environment's reward where the
     skill defines none. None: not known."""
+    first: Count = field(default=0, compare=False)
+    """Calls with which an episode began."""
+    followed: dict[str, Count] = field(default_factory=dict, compare=False)
+    """How many of its calls a call of each skill followed; the others were the last of an episode.
+    Empty: not known, as in files of older versions."""
 
     @property
     def length_mean(self) -> float | None:
@@ -71,6 +76,32 @@ class SkillReport:
         }
 
 
+@dataclass(frozen=True)
+class Judged:
+    """What the skills say of one step in each environment that acts."""
+
+    why: Array  # (k,) int8, ``Why`` its call has ended; RUNNING: it goes on
+    reward: Array  # (k,) the running skill's own; the environment's where it defines none
+    succeeded: Array  # (k,) bool, the call is over, and its skill's ``success`` says yes
+
+
+def judge(skills: SkillSet, played: Played) -> Judged:
+    """Ask the running skills about a step of a hierarchy."""
+    assert played.acting is not None
+    assert played.elapsed is not None
+    assert played.why is not None
+    acting, why = played.acting, played.why.copy()
+    why[(why == Why.RUNNING) & played.over] = Why.EPISODE
+    over = why != Why.RUNNING
+    own, succeeded = played.reward.copy(), np.zeros(len(acting), bool)
+    for i, skill in enumerate(skills.skills):
+        if skill.defines("reward") and len(rows := np.flatnonzero(acting == i)):
+            own[rows] = _ask(skills, i, "reward", played, played.elapsed, rows)
+        if skill.defines("success") and len(rows := np.flatnonzero(over & (acting == i))):
+            succeeded[rows] = _ask(skills, i, "success", played, played.elapsed, rows)
+    return Judged(why, own, succeeded)
+
+
 class SkillTally:
     """Counts what each skill of a policy does, as episodes are played.
 
@@ -88,6 +119,9 @@ class SkillTally:
         self._steps, self._calls = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._ended = np.zeros((count, len(Why)), np.int64)
         self._succeeded = np.zeros(count, np.int64)
+        # By skill before (the first row: none) and skill after.
+        self._next = np.zeros((1 + count, count), np.int64)
+        self._before = np.zeros(episodes, np.int64)
         # One sum for each episode, so the result does not depend on which are played together.
         self._returns = np.zeros((episodes, count))
         policies = () if self.skills is None else self.skills.policies
@@ -104,10 +138,18 @@ class SkillTally:
         if acting is None:
             return
         self._steps += np.bincount(acting, minlength=count)
-        self._calls += np.bincount(acting[played.begun], minlength=count)
+        called, whose = acting[played.begun], played.episode[played.begun]
+        self._calls += np.bincount(called, minlength=count)
+        np.add.at(self._next, (self._before[whose], called), 1)
+        self._before[whose] = 1 + called
         own = played.reward
         if self.skills is not None:
-            own = self._judge(self.skills, played, acting)
+            judged = judge(self.skills, played)
+            self._open[played.episode] = np.where(judged.why == Why.RUNNING, acting, -1)
+            own = judged.reward
+            ended = np.flatnonzero(judged.why != Why.RUNNING)
+            np.add.at(self._ended, (acting[ended], judged.why[ended]), 1)
+            np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
         self._returns[played.episode, acting] += own
         for i, tally in self._below.items():
             tally.cut(played.episode[acting != i])
@@ -124,37 +166,15 @@ class SkillTally:
         for tally in self._below.values():
             tally.cut(episodes)
 
-    def _judge(self, skills: SkillSet, played: Played, acting: Array) -> Array:
-        """Count the calls that end here; the reward of each running skill, (k,)."""
-        assert played.elapsed is not None
-        assert played.why is not None
-        why = played.why.copy()
-        why[(why == Why.RUNNING) & played.over] = Why.EPISODE
-        ended = np.flatnonzero(why != Why.RUNNING)
-        self._open[played.episode] = np.where(why == Why.RUNNING, acting, -1)
-        pairs = acting[ended] * len(Why) + why[ended]
-        self._ended += np.bincount(pairs, minlength=self._ended.size).reshape(self._ended.shape)
-        own = played.reward
-        for i, skill in enumerate(skills.skills):
-            if skill.defines("reward"):
-                rows = np.flatnonzero(acting == i)
-                if len(rows):
-                    own = own.copy() if own is played.reward else own
-                    own[rows] = _ask(skills, i, "reward", played, played.elapsed, rows)
-            if skill.defines("success"):
-                rows = ended[acting[ended] == i]
-                if len(rows):
-                    found = _ask(skills, i, "success", played, played.elapsed, rows)
-                    self._succeeded[i] += int(found.sum())
-        return own
-
     def reports(self) -> dict[str, SkillReport]:
         """The report of each skill, by its path."""
         returns, found = self._returns.sum(axis=0), dict[str, SkillReport]()
-        for i, name in enumerate(self.labels):
-            found[self._path + name] = SkillReport(
+        paths = [self._path + name for name in self.labels]
+        for i, name in enumerate(paths):
+            found[name] = SkillReport(
                 int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
-                float(returns[i]) if self._known(i) else None,
+                float(returns[i]) if self._known(i) else None, int(self._next[0, i]),
+                dict(zip(paths, self._next[1 + i].tolist(), strict=True)),
             )  # fmt: skip
             if i in self._below:
                 found |= self._below[i].reports()

@@ -126,8 +126,14 @@ class Stage:
     """How they learn together; None: one learns alone."""
     interrupt: bool = False
     """The selector cuts calls."""
+    ready: bool = False
+    """The selector does not learn: ``config`` says how many environments there are."""
+    guide_nats: float | None = None
+    """How far the selector may be from a ready one, in nats of KL; None: as far as it likes."""
     node: str = ""
     """The path of the hierarchy that it is of: empty, or ``inner/`` for example."""
+    compared: bool = False
+    """What is learnt is kept only if it is better than what was there before."""
 
     def inside(self, name: str) -> Stage:
         """This stage in a hierarchy that is the skill ``name`` of another one."""
@@ -145,10 +151,10 @@ class Stage:
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
         first = self.node + SELECTOR if self.together else self.name
-        entry = {
+        entry: dict[str, Any] = {
             "name": self.name,
             "kind": self.kind,
-            "learns": [first, *self.beside],
+            "learns": [*([] if self.ready else [first]), *self.beside],
             "decides": first if self.kind in ("selector", "together") else None,
             "budget": self.budget,
             "algorithm": config_to_json(self.config),
@@ -159,6 +165,10 @@ class Stage:
             entry["together"] = asdict(self.together)
             entry["algorithms"] = {k: config_to_json(v) for k, v in self.beside.items()}
             entry["interrupt"] = self.interrupt
+        if self.guide_nats is not None:
+            entry["guide_nats"] = self.guide_nats
+        if self.kind == "together":
+            entry["compared"] = self.compared
         return entry
 
 

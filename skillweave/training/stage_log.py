@@ -9,6 +9,7 @@ from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.types import SkillweaveError
 
 T = TypeVar("T")
@@ -91,9 +92,16 @@ class StageLog:
             f"at least {target['at_least']:g} was asked"
         )
 
-    def done(self, policies: Mapping[str, AgentPolicy]) -> None:
-        """The stage is over: keep who learnt in it, and say how it went."""
+    def done(self, policies: Mapping[str, AgentPolicy], states: Mapping[str, Any]) -> None:
+        """The stage is over: keep who learnt in it, and say how it went.
+
+        Args:
+            states: by name, what those who learn on in a later stage begin with there.
+        """
         entry, at = self.entry, self.at
+        for name, state in states.items():
+            if learns_again(self.run, entry["name"], name):
+                save_state(self.run, entry["name"], name, state)
         self.run.save_policies(entry["name"], policies)
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
         entry["evaluation_steps"] = at["evaluation_steps"]
@@ -101,6 +109,7 @@ class StageLog:
         entry["final"] = at["metrics"]
         self.run.save()
         self.run.drop_checkpoints()
+        drop_states(self.run, entry["name"])
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 

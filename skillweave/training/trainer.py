@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import state_to
@@ -15,13 +16,14 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import make_collectors
+from skillweave.experience import Anchor
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import Learner, Stack
+from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.training.loop import Progress, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import learner_of
@@ -84,6 +86,10 @@ class StageLearner(Protocol):
         """Learn until the stage is over; by name, those who learnt, as they end."""
         ...
 
+    def states(self) -> dict[str, Any]:
+        """By name, all that those have learnt who may learn on in a later stage."""
+        ...
+
     def close(self) -> None:
         """Release the environments."""
         ...
@@ -134,15 +140,22 @@ class OneAgent:
         """Who learns, from this state on."""
         stage, config = self.stage, self.stage.config
         stack = Stack(self.algorithm, state_to(state, resolve_device(config.device)))
-        return learner_of(
+        found = learner_of(
             stack, config.num_envs, stage.seeds, row_steps=stage.scene.row_steps,
             goes_on_at=log.at["steps"],
         )  # fmt: skip
+        keep_to_guide(found, stage.entry.get("guide_nats"))
+        return found
 
     def policies(self) -> dict[str, AgentPolicy]:
         """By name, who learns, as they are now."""
         (stack,) = self.learner.stacks
         return {self.stage.name: AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))}
+
+    def states(self) -> dict[str, Any]:
+        """All that the agent has learnt."""
+        (stack,) = self.learner.stacks
+        return {self.stage.name: state_to(stack.state, "cpu")}
 
     def play(self, arena: Collector, seeds: Seeds) -> Array:
         """An episode in each environment of an arena, (N, 4); see ``Collected.episodes``."""
@@ -158,7 +171,9 @@ class OneAgent:
         """Stand where a checkpoint says."""
         self.learner = self.learner_from(state, extra, log)
         self._steps_before = int(log.at["steps"])
-        if extra and "collector.collectors" not in extra:
+        if self._steps_before >= self.stage.budget:
+            pass  # nothing is collected any more, and the last checkpoint holds no episodes
+        elif extra and "collector.collectors" not in extra:
             log.tell(
                 "the checkpoint is of an older version: learning goes on where it stood, but all "
                 "episodes, and what was kept to learn from, begin anew"
@@ -201,6 +216,14 @@ class OneAgent:
         self._open.close()
 
 
+def keep_to_guide(learner: Learner, nats: float | None) -> None:
+    """Let a selector stay near its guide, so many nats of KL; None: it need not."""
+    if nats is not None and isinstance(learner, RolloutLearner):
+        (stack,) = learner.stacks
+        coef = torch.ones(stack.members, device=stack.state.params.device)
+        learner.anchor = Anchor(None, coef, nats)
+
+
 class _TargetReached(Exception):
     """Ends a loop: what it has learnt is good enough."""
 
@@ -238,7 +261,7 @@ def train_stage(
         policies = learner.train(log)
     finally:
         learner.close()
-    log.done(policies)
+    log.done(policies, learner.states())
     return policies
 
 

@@ -19,10 +19,12 @@ from skillweave import DQN, PPO, SAC, TD3, Network, SkillweaveError
 from skillweave.algorithms import rollouts
 from skillweave.algorithms.base import state_to
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.experience import Rollout, Sample
+from skillweave.experience import Anchor, Rollout, Sample
 from skillweave.networks.config import CNN, RNN
 from skillweave.ops.device import Constant, all_false, on_host, resolve_device
 from skillweave.seeding import Seeds
+from skillweave.training.learner import RolloutLearner, Stack
+from skillweave.training.trainer import keep_to_guide
 
 P, T, B = 2, 4, 3
 SMALL: dict[str, Any] = {"network": Network((8,)), "normalize_obs": True}
@@ -102,15 +104,40 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
         obs_mask=torch.ones(*lead, width, dtype=torch.bool) if algorithm.codec.discrete else None,
         log_std=None if algorithm.codec.discrete else torch.zeros(P, 1, 1, width),
         memory=memory, starts=None if memory is None else last,
+        overridden=last,
     )  # fmt: skip
     rng = [Seeds(m).torch() for m in range(P)]
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state, batch = on_device(algorithm, mode), moved(batch, mode)
+        near = algorithm.acting_params(state, device=THERE)
+        batch.anchor = Anchor(near, mode.from_tensor(torch.ones(P)).to(THERE))
         assert algorithm.value(state, batch.obs[:, 0]).device == THERE
         state, report = algorithm.update(state, batch, rng)
         assert devices(state) == {"meta"}
         assert {v.device.type for v in report.metrics.values()} == {"meta"}
         assert_acts(algorithm, state, mode, batch.obs[:, 0], memory)
+
+
+def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_cpu(monkeypatch):
+    config, seen, space = ON["discrete"]
+    algorithm = make_algorithm(replace(config, batch_size=4), seen, space)
+    monkeypatch.setattr(rollouts, "on_host", lambda *counts: [3 for _ in counts])
+    lead, width = (P, T, B), algorithm.head.width
+    batch = Rollout(
+        rows(algorithm, lead), actions(algorithm, lead), torch.zeros(lead), torch.zeros(lead),
+        rows(algorithm, lead), torch.zeros(lead, dtype=torch.bool), head=torch.zeros(*lead, width),
+        guide=torch.zeros(*lead, width),
+    )  # fmt: skip
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        learner = RolloutLearner(Stack(algorithm, on_device(algorithm, mode)), Seeds(0))
+        keep_to_guide(learner, {"guide_nats": 0.1})
+        assert learner.anchor is not None
+        batch = moved(batch, mode)
+        batch.anchor = learner.anchor
+        monkeypatch.setattr(learner._store, "rollout", lambda *about: batch)
+        learner.learn(0, 0, 0.0)
+        assert learner.anchor.coef.device == THERE
+        assert learner.kept()["anchor_coef"].device.type == "cpu"
 
 
 @pytest.mark.parametrize("name", OFF)

@@ -14,7 +14,7 @@ from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_floor
 from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec
-from skillweave.training.woven import adapted
+from skillweave.training.learner import adapted
 
 SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)
 SMALL = Network(hidden=(8,))

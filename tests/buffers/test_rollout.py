@@ -46,8 +46,7 @@ def rollout(*experiences: Experience, quota=0, **kwargs) -> Rollout:
 
 
 def test_columns_are_member_after_member():
-    log_std = torch.zeros(P, 1, 1, A)
-    r = rollout(experience(), log_std=log_std, progress=0.25)
+    r = rollout(experience(), progress=0.25)
     expected = torch.tensor([[[0.0, 1], [10, 11], [20, 21]], [[2, 3], [12, 13], [22, 23]]])
     assert torch.equal(r.reward, expected)
     assert torch.equal(r.action, (expected + 90 * (expected // 10)).long())
@@ -57,7 +56,7 @@ def test_columns_are_member_after_member():
     assert torch.equal(r.head, (r.obs[..., :1] + 7).expand(P, T, B, A))
     assert torch.equal(r.memory[..., 0], torch.tensor([[0.0, 1], [2, 3]]))
     assert torch.equal(r.starts, r.obs[..., 0] == 0)
-    assert r.log_std is log_std
+    assert r.log_std is None
     assert r.progress == 0.25
     assert r.obs_mask is None
     assert r.valid is None
@@ -227,6 +226,26 @@ def test_experiences_lie_side_by_side_with_their_memory():
     assert r.discount[0, 0].tolist() == pytest.approx([0.9, 0.9, 0.0, 0.81])
     assert r.obs_mask[:, :2, :2].all()
     assert not r.obs_mask[:, :, 2:].any()
+
+
+def test_each_experience_keeps_the_deviation_that_it_was_acted_with():
+    store, again = RolloutStore(P), RolloutStore(P)
+    first, second = torch.full((P, 1, 1, A), -1.0), torch.full((P, 1, 1, A), 2.0)
+    first[1] = -3.0
+    e = experience(2)
+    e.valid = np.array([[1, 0, 1, 1], [1, 0, 0, 1]], bool)  # a column of member 0 is empty
+    store.add(e, first)
+    again.load(store.state())
+    for each in store, again:
+        each.add(experience(3), second)
+        r = each.rollout(GAMMA)
+        assert r.log_std.shape == (P, 1, 4, A)
+        own = r.log_std[..., 0].expand(P, 3, 4)[r.valid].tolist()
+        assert own.count(-1.0) == 2
+        assert own.count(-3.0) == 3
+        assert own.count(2.0) == 6 + 6
+    store.add(experience(), second)
+    assert torch.equal(store.rollout(GAMMA).log_std, second)
 
 
 @given(

@@ -18,7 +18,8 @@ from skillweave.cli import main
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 from skillweave.types import SkillweaveError
 
-COMMANDS = ("train", "resume", "evaluate", "render", "list", "info", "weights", "import-agilerl")
+COMMANDS = ("train", "resume", "evaluate", "render", "plot", "report", "compare", "list", "info")
+COMMANDS += ("weights", "export", "import-agilerl")
 
 # The same hierarchy twice: as plain data, and with a reflex, which only code can say.
 PLAIN = '''

@@ -66,11 +66,22 @@ class Far(Skill):
         return obs[:, X] >= 20
 
 
-def collector_of(*kinds, skill=Far):
+class Five(Skill):
+    """Five steps forward."""
+
+    max_steps = 5
+    policy = always(1)
+
+
+class Anywhere(Skill):
+    max_steps = 7
+
+
+def collector_of(*kinds, skill=Far, start_calls=0):
     skills = tuple(kind() for kind in kinds)
     starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
     engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
-    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters)
+    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters, start_calls)
     found.start(Seeds(0))
     return found
 
@@ -108,13 +119,29 @@ def test_without_starters_it_says_that_chance_found_nothing():
         collector.collect(next(requests(6_000)))
 
 
-@pytest.mark.parametrize("rows", [7, 50])
-def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(rows):
-    first, asked = collector_of(Forward), requests(rows)
+@pytest.mark.parametrize(("kinds", "skill"), [((Five,), Anywhere), ((Five,), Far)])
+def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill):
+    collector = collector_of(*kinds, skill=skill, start_calls=6)
+    found = collector.collect(next(requests(6_000))).experience
+    before = np.concatenate([np.zeros((1, N), bool), found.valid[:-1]])
+    began = found.valid & (~before | (found.obs[:, :, T] == 0))
+    at = found.obs[:, :, X][began]
+    calls = at / 5
+    least = 4 if skill is Far else 0  # it may start at 20, after four calls
+    counts = np.array([np.mean(calls == k) for k in range(7)])
+    expected = np.where(np.arange(7) < least, 0, 1 / 7)
+    expected[least] += least / 7
+    np.testing.assert_allclose(counts, expected, atol=0.05)
+    assert counts.sum() == 1.0
+
+
+@pytest.mark.parametrize(("rows", "start_calls"), [(7, 0), (50, 0), (7, 3), (50, 3)])
+def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(rows, start_calls):
+    first, asked = collector_of(Forward, start_calls=start_calls), requests(rows)
     for request in itertools.islice(asked, 3):
         first.collect(request)
     first.cut(Seeds(1))
-    again = collector_of(Forward)
+    again = collector_of(Forward, start_calls=start_calls)
     assert not len(again.restore(first.state()))
     for request in itertools.islice(asked, 4):
         one, two = first.collect(request).experience, again.collect(request).experience

@@ -33,9 +33,21 @@ def made(root: Any, names: tuple[str, ...] = ABC) -> TreeSelector:
 
 def told(policy: Any, memory: Any, succeeded: Any) -> Any:
     """The memory after calls that ended so."""
-    n = len(succeeded)
-    why = np.full(n, Why.OWN, np.int8)
-    return policy.watch(memory, None, LastCall(np.zeros(n, int), why, np.array(succeeded)))
+    why = np.full(len(succeeded), Why.OWN, np.int8)
+    called = np.array(policy._plan.skills)[memory["leaf"]]
+    return policy.watch(memory, None, LastCall(called, why, np.array(succeeded)))
+
+
+def test_a_leaf_whose_skill_was_not_called_is_asked_for_again():
+    policy = made(tree.Sequence("a", "b", "c"))
+    memory, obs = policy.start(1), np.zeros((1, 3), np.float32)
+    names = ""
+    for instead in (None, 2, 2, None, None):
+        skill, memory = policy.act(memory, obs)
+        names += ABC[skill[0]]
+        skill = skill if instead is None else np.array([instead])
+        memory = policy.watch(memory, None, LastCall(skill, np.int8([Why.OWN]), np.array([True])))
+    assert names == "abbbc"
 
 
 def chosen(root: Any, ends: list[bool], flags: Any = (), masks: Any = ()) -> str:

@@ -70,11 +70,78 @@ def test_tensorboard_gets_every_scalar_over_environment_steps(run: RunDirectory)
     tracker.tick("landing", 256, 1.0, {"return": 2.5, "kl": 0.5})
     tracker.done("landing", 256, 1.0, {"return": 2.5})
     tracker.close()
-    assert list((run.path / "tensorboard").glob("events.out.tfevents.*"))
-    events = EventAccumulator(str(run.path / "tensorboard")).Reload()
+    assert list((run.path / "tensorboard/landing").glob("events.out.tfevents.*"))
+    events = EventAccumulator(str(run.path / "tensorboard/landing")).Reload()
     assert set(events.Tags()["scalars"]) == {"landing/return", "landing/kl"}
     points = [(e.step, e.value) for e in events.Scalars("landing/return")]
     assert points == [(128, 1.5), (256, 2.5)]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_after_a_resume_tensorboard_shows_each_step_of_each_stage_once(run: RunDirectory) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    (killed,) = make_trackers(("tensorboard",), run)
+    for steps in (100, 200, 300):  # the latest checkpoint is of step 100
+        killed.tick("landing", steps, 1.0, {"return": 1.0})
+    killed.done("landing", 300, 1.0, {})
+    for steps in (100, 200):
+        killed.tick("selector", steps, 1.0, {"return": 1.0})
+    killed.close()
+    (resumed,) = make_trackers(("tensorboard",), run)
+    for steps in (200, 300):
+        resumed.tick("selector", steps, 1.0, {"return": 2.0})
+    resumed.close()
+    shown = {}
+    for stage in ("landing", "selector"):
+        events = EventAccumulator(str(run.path / "tensorboard" / stage)).Reload()
+        shown[stage] = [(e.step, e.value) for e in events.Scalars(f"{stage}/return")]
+    assert shown["landing"] == [(100, 1.0), (200, 1.0), (300, 1.0)]
+    assert shown["selector"] == [(100, 1.0), (200, 2.0), (300, 2.0)]
+
+
+def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
+    run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wandb = pytest.importorskip("wandb")
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(wandb, "init", lambda **how: asked.append(how))
+    make_trackers(("wandb",), run)
+    make_trackers(("wandb",), RunDirectory(run.path, dict(run.manifest)))
+    content = {"env": "CartPole-v1", "seed": 0, "stages": []}
+    make_trackers(("wandb",), RunDirectory.create(tmp_path / "other", content))
+    first, again, other = asked
+    assert first["id"] == again["id"] != other["id"]
+    assert first["resume"] == again["resume"] == "allow"
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_saved_evaluation_draws_what_each_skill_did(run: RunDirectory) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    from skillweave.training.evaluation import Evaluation
+    from skillweave.training.evaluation_file import save_evaluation
+    from skillweave.training.skill_report import SkillReport
+
+    land = SkillReport(steps=30, calls=10, succeeded=4, ended={}, return_sum=None)
+    hover = SkillReport(steps=10, calls=2, succeeded=None, ended={}, return_sum=None)
+    run.manifest["track"] = ["tensorboard"]
+    run.manifest["stages"] = [{"name": "land", "steps": 500}, {"name": "selector", "steps": 200}]
+    for returns in ((1.0, 1.0), (1.0, 2.0)):  # the later one takes the place of the first
+        found = Evaluation(returns, (20, 20), None, {"land": land, "hover": hover})
+        save_evaluation(run, found, 0, True)
+    events = EventAccumulator(str(run.path / "tensorboard/evaluation")).Reload()
+    shown = {}
+    for tag in events.Tags()["scalars"]:
+        (point,) = events.Scalars(tag)
+        assert point.step == 700
+        shown[tag.removeprefix("evaluation/")] = point.value
+    assert shown == {
+        "return_mean": 1.5, "usage/land": 0.75, "usage/hover": 0.25, "call_length/land": 3.0,
+        "call_length/hover": 5.0, "success/land": pytest.approx(0.4),
+    }  # fmt: skip
 
 
 OFFLINE = """

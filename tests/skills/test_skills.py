@@ -90,7 +90,9 @@ def test_a_reflex_may_compute_its_actions_from_the_observations_where_it_holds()
 
 def test_the_last_reflex_wins():
     reflexes = (Reflex(lambda o: o[:, 0] > 0, 1), Reflex(lambda o: o[:, 0] > 1, 2))
-    assert apply_reflexes(reflexes, OBS, np.zeros(3, int), Discrete(3)).tolist() == [0, 1, 2]
+    action, overridden = apply_reflexes(reflexes, OBS, np.zeros(3, int), Discrete(3))
+    assert action.tolist() == [0, 1, 2]
+    assert overridden.tolist() == [False, True, True]
 
 
 def test_a_reflex_is_named_after_its_condition():

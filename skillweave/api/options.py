@@ -1,0 +1,48 @@
+"""An environment whose actions are a hierarchy's skills, for selectors of other libraries."""
+
+from __future__ import annotations
+
+from skillweave.api import Hierarchy, Run
+from skillweave.envs.make import make_engine
+from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.messages import short, whole_number
+from skillweave.types import SkillweaveError
+
+
+def make_options_env(
+    hierarchy: Hierarchy | Run, num_envs: int, gamma: float, *, seed: int = 0
+) -> OptionsEnv:
+    """A Gymnasium ``VectorEnv`` of ``num_envs`` environments in which each action is a call.
+
+    Args:
+        hierarchy: a run of one, whose trained skills act; or a declaration whose skills all have a
+            ready policy.
+        num_envs: environments side by side.
+        gamma: γ of one environment step, over 0 and at most 1.
+        seed: of skills that sample.
+
+    Returns:
+        ``OptionsEnv``; its ``skills`` go into ``HierarchyPolicy`` with the selector once trained.
+
+    Raises:
+        SkillweaveError: a skill has no policy; the message names it.
+    """
+    num_envs = whole_number(num_envs, "num_envs", 1)
+    real = isinstance(gamma, int | float) and not isinstance(gamma, bool)
+    if not real or not 0.0 < gamma <= 1.0:
+        raise SkillweaveError(f"gamma is {short(gamma)}; it must be over 0 and at most 1")
+    if isinstance(hierarchy, Run):
+        if not isinstance(hierarchy.policy, HierarchyPolicy):
+            raise SkillweaveError("this is the run of a plain agent: it has no skills to call")
+        skills, spec = hierarchy.policy.skills, hierarchy.hierarchy.spec
+    else:
+        ready, spec = hierarchy.ready_policies(), hierarchy.spec
+        lacking = [s.name for s in hierarchy.skills if s.name not in ready]
+        if lacking:
+            raise SkillweaveError(
+                f"skill {lacking[0]!r} has no policy: train the hierarchy and give its run, or "
+                "declare the skill with a policy"
+            )
+        skills = hierarchy.skill_set([ready[s.name] for s in hierarchy.skills])
+    return OptionsEnv(make_engine(spec, num_envs), skills, float(gamma), seed)

@@ -1,0 +1,112 @@
+"""A policy in one environment, an observation at a time: for deployment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.spaces import obs_dtype, obs_shape
+from skillweave.spaces.packing import parts
+from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+
+
+class Player:
+    """A policy that acts in one environment and keeps its memory.
+
+    ::
+
+        player = run.player()
+        obs, info = env.reset()
+        player.reset()
+        while True:
+            obs, reward, terminated, truncated, info = env.step(player.act(obs))
+
+    Args:
+        policy: who acts.
+        deterministic: act greedily, else sample.
+        seed: of what is sampled.
+    """
+
+    def __init__(self, policy: Policy, *, deterministic: bool = True, seed: int = 0) -> None:
+        self.policy, self._deterministic = policy, deterministic
+        self._space = policy.observation_space
+        self._dtype, self._shape = obs_dtype(self._space), obs_shape(self._space)
+        self._seed = seed
+        self._rng = np.random.default_rng(seed)
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode begins: nothing is remembered."""
+        self.memory: Memory = self.policy.start(1)
+        self._before: tuple[Array, Array] | None = None
+        self._elapsed = 0
+
+    def act(
+        self,
+        obs: Any,
+        *,
+        reward: float = 0.0,
+        info: Mapping[str, Any] | None = None,
+        mask: Any = None,
+    ) -> Any:
+        """The action for one observation, as the environment takes it.
+
+        Args:
+            obs: what the environment's ``reset`` or ``step`` returned.
+            reward: what came with it; needed only where a skill's ``termination`` reads it.
+            info: the same.
+            mask: (A,) the actions that the environment allows; None: all.
+
+        Raises:
+            SkillweaveError: the observation is none of the policy's; the message says what is.
+        """
+        seen = self._seen(obs)
+        if self._before is not None:
+            self._elapsed += 1
+            step = self._step(seen, reward, info or {})
+            self.memory = self.policy.observe(self.memory, step)
+        allowed = None if mask is None else np.asarray(mask, bool)[None]
+        action, self.memory = self.policy.act(
+            self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
+        )
+        self._before = seen, action
+        return action[0]
+
+    def _step(self, seen: Array, reward: float, info: Mapping[str, Any]) -> Step:
+        """The step that led to an observation."""
+        assert self._before is not None
+        obs, action = self._before
+        no = np.zeros(1, bool)
+        told = {k: np.asarray([v]) for k, v in info.items()}
+        return Step(
+            obs, action, seen, np.array([reward], np.float32), no, no, no,
+            np.array([self._elapsed]), told,
+        )  # fmt: skip
+
+    def _seen(self, obs: Any) -> Array:
+        """One observation as a batch of one."""
+        found = np.empty((1, *self._shape), self._dtype)
+        try:
+            _put(self._space, found, obs)
+        except (TypeError, ValueError, KeyError, IndexError) as error:
+            raise SkillweaveError(
+                f"act() was given an observation that is none of {self._space}: {error}"
+            ) from error
+        return found
+
+
+def _put(space: gym.Space[Any], out: Array, obs: Any) -> None:
+    """Write an observation, or its parts, into an array of one row."""
+    inner = parts(space)
+    if inner is None:
+        given = np.asarray(obs)
+        if given.shape != out.shape[1:]:
+            raise ValueError(f"it has shape {given.shape}, not {out.shape[1:]}")
+        out[0] = given
+        return
+    keys = range(len(inner)) if isinstance(space, gym.spaces.Tuple) else inner
+    for (name, part), key in zip(inner.items(), keys, strict=True):
+        _put(part, out[name], obs[key])

@@ -1,0 +1,201 @@
+"""A ready selector beside a selector that learns, or in its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from skillweave.collecting.acting import Acted, Request
+from skillweave.collecting.calls import SkillSet
+from skillweave.types import Array, Memory, Step, prefixed, unprefixed
+
+SMOOTHED = 0.05
+"""Share of a guide's choice that is uniform: without it one deviation would cost infinitely much.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class LastCall:
+    """How the last call of n environments ended; where one still runs, that is said."""
+
+    skill: Array  # (n,) int64, its place in the hierarchy's list; −1: the episode has just begun
+    why: Array  # (n,) int8, ``Why`` it ended
+    succeeded: Array  # (n,) bool: by the skill's success(), where it has none by its own end
+
+
+class Ready(Protocol):
+    """What a guide needs of a ready selector; all it remembers is in its memory."""
+
+    skills: tuple[str, ...]
+
+    def start(self, n: int) -> Memory:
+        """The memory of n environments whose episodes begin."""
+        ...
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """The skill that it chooses, (n,)."""
+        ...
+
+    def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
+        """How likely it is to choose each skill, (n, S)."""
+        ...
+
+    def allowed(self, memory: Memory) -> Array | None:
+        """(n, S) bool, what it may choose next; None: that depends on what it will see."""
+        ...
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """The memory after a step."""
+        ...
+
+
+@dataclass(frozen=True)
+class Guide:
+    """A ready selector that is asked wherever a selector decides.
+
+    What it remembers stands under ``guide.<key>`` in the memories that it is given, with a row for
+    each environment; it is changed in place.
+    """
+
+    selector: Ready
+    restricts: bool = True
+    """Nothing is allowed but what it may choose."""
+    tells: bool = False
+    """How likely its choices are is kept, for who is to stay near it."""
+    decides: bool = False
+    """Nobody else chooses."""
+
+    def start(self, n: int) -> Memory:
+        """What it remembers of n environments whose episodes begin."""
+        return prefixed("guide", self.selector.start(n))
+
+    def ask(
+        self,
+        memory: Memory,
+        rows: Array,
+        obs: Array,
+        may: Array,
+        greedy: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> Array:
+        """How likely it is to make each choice at decisions of environments ``rows`` (k,).
+
+        Of a skill's lengths all are equally likely.
+
+        Args:
+            obs: (k, …).
+            may: (k, choices) bool, choices whose skill may start.
+            greedy, rng: where it decides, how it takes one of several skills.
+
+        Returns:
+            (k, choices) float32, the sum of each row is 1.
+        """
+        own = {k: v[rows] for k, v in unprefixed("guide", memory).items()}
+        skills = len(self.selector.skills)
+        lengths = may.shape[1] // skills
+        if self.decides:
+            skill, after = self.selector.act(
+                own, obs, may[:, ::lengths], deterministic=greedy, rng=rng
+            )
+            chances: Array = np.eye(skills, dtype=np.float32)[skill]
+        else:
+            chances, after = self.selector.chances(own, obs, may[:, ::lengths])
+        for k, v in after.items():
+            memory[f"guide.{k}"][rows] = v
+        return chances.repeat(lengths, axis=1) / np.float32(lengths)
+
+    def mask(
+        self,
+        kept: Memory,
+        rows: Array,
+        obs: Array,
+        may: Array,
+        greedy: bool,
+        rng: np.random.Generator,
+    ) -> Array:
+        """Choices that are allowed at decisions of a collector, (k, choices) bool.
+
+        How likely its own choices are is left in ``kept["chances"]``.
+        """
+        chances = self.ask(kept, rows, obs, may, greedy, rng)
+        kept["chances"][rows] = chances
+        return chances > 0.0 if self.restricts else may
+
+    def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
+        """What is left of choices (k, choices) bool in environments ``rows`` (k,), as far as known.
+
+        Nothing is asked of it, and nothing changes.
+        """
+        own = {k: v[rows] for k, v in unprefixed("guide", memory).items()}
+        allowed = self.selector.allowed(own) if self.restricts else None
+        if allowed is None:
+            return may
+        return may & allowed.repeat(may.shape[1] // allowed.shape[1], axis=1)
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> None:
+        """Tell it of a step of all environments."""
+        after = self.selector.watch(unprefixed("guide", memory), step, last)
+        for k, v in after.items():
+            memory[f"guide.{k}"][:] = v
+
+
+def tell_guide(
+    guide: Guide, kept: Memory, skills: SkillSet, calls: Memory, step: Step, why: Array
+) -> None:
+    """Tell a collector's guide of a step of all environments, and how calls ended with it.
+
+    Args:
+        kept: with the guide's memory, and ``age``: it sees the time of the episode.
+        calls: what the skills remember.
+    """
+    succeeded = skills.succeeded(calls, np.arange(len(why)), step, why)
+    last = LastCall(calls["skill"], why, succeeded)
+    guide.watch(kept, replace(step, elapsed=kept["age"]), last)
+
+
+def as_logits(chances: Array, may: Array) -> Array:
+    """Logits of choices that are as likely as that, but for a share that is uniform.
+
+    Args:
+        chances: (…, choices).
+        may: (…, choices) bool, what is allowed: the share is shared among it.
+    """
+    uniform = may / np.maximum(may.sum(-1, keepdims=True), 1)
+    mixed = (1.0 - SMOOTHED) * chances + SMOOTHED * uniform
+    found: Array = np.log(np.maximum(mixed, 1e-8)).astype(np.float32)
+    return found
+
+
+class AskedElsewhere:
+    """Stands where ``Acting`` does, where a guide decides: one choice is allowed, and it is made.
+
+    Args:
+        num_envs: N.
+    """
+
+    memory_size, members, keeps_head = 0, 1, False
+
+    def __init__(self, num_envs: int) -> None:
+        self.each = num_envs
+
+    def begin(self, request: Request, every_step: bool = True) -> None:
+        """There is nothing to make ready."""
+
+    def to_env(self, action: Array) -> Array:
+        """Choices are what they are."""
+        return action
+
+    def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        """What is allowed in environments ``rows`` (n,); all else is of all N."""
+        assert mask is not None
+        return Acted(mask[rows].argmax(axis=1), None, None)

@@ -1,0 +1,225 @@
+"""Networks as ONNX graphs: one observation of the environment in, one of its actions out.
+
+The graph is traced from the very code that acts here, so it cannot say something else. Scaling of
+observations, action masks, memories and the environment's units of actions are in it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.spaces import obs_dtype, obs_shape
+from skillweave.spaces.packing import parts
+from skillweave.types import MissingExtra, SkillweaveError
+
+OPSET = 18
+"""Version of ONNX's operators."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A part of an observation that has no parts itself: an input of the graph."""
+
+    name: str
+    """``obs``, or of a Dict or Tuple ``obs.camera``."""
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    def example(self) -> Tensor:
+        """One observation."""
+        return torch.from_numpy(np.zeros((1, *self.shape), self.dtype))
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A file's content, and what the runner must know of it beside."""
+
+    content: bytes
+    choices: int = 0
+    """Width of the input ``mask``; 0: there is none."""
+    memory: int = 0
+    """Width of the input ``memory`` and of the output of the same name; 0: there is none."""
+    noise: tuple[tuple[str, int], ...] = ()
+    """Inputs ``noise.0``, …: a distribution by NumPy's name, and how many numbers."""
+
+
+def leaves_of(space: gym.Space[Any], name: str = "obs") -> list[Leaf]:
+    """The inputs that observations of a space are, in the order of ``ObsCodec.leaves``."""
+    inner = parts(space)
+    if inner is None:
+        return [Leaf(name, obs_shape(space), obs_dtype(space))]
+    return [leaf for k, part in inner.items() for leaf in leaves_of(part, f"{name}.{k}")]
+
+
+class _Acting(nn.Module):
+    """A trained agent on one observation; inputs: leaves, mask, memory, noise."""
+
+    def __init__(self, policy: AgentPolicy, leaves: int, told: Graph) -> None:
+        super().__init__()
+        self.policy, self.leaves, self.told = policy, leaves, told
+
+    def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
+        """The action in the environment's units; and the memory after it, if there is one."""
+        algorithm, left = self.policy.algorithm, list(given)
+        obs: Any = [left.pop(0)[None] for _ in range(self.leaves)]
+        mask = left.pop(0)[None] if self.told.choices else None
+        memory = left.pop(0)[None] if self.told.memory else None
+        noise: Any = left[0][None] if left else None
+        if self.told.noise and self.told.noise[0][0] == "random":
+            noise = (noise, left[1] if len(left) > 1 else None)
+        action, _, after = algorithm.act(self.policy.params, obs, mask, noise, memory)
+        done = in_env_units(algorithm, action[0])
+        return (done,) if after is None else (done, after[0])
+
+
+class _Worth(nn.Module):
+    """What a network's actions are chosen from, on one observation."""
+
+    def __init__(self, policy: AgentPolicy) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, *obs: Tensor) -> Tensor:
+        """(1, A)."""
+        rows: Any = [x[None] for x in obs]
+        _, head, _ = self.policy.algorithm.act(self.policy.params, rows, None, None)
+        assert head is not None
+        return head[0]
+
+
+def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
+    """A trained agent.
+
+    Inputs ``obs…``, ``mask``, ``memory``, ``noise.…``; outputs ``action``, ``memory.after``.
+
+    Args:
+        sampled: it draws its actions, from noise that it is given; else it is greedy.
+
+    Raises:
+        SkillweaveError: it cannot be written as ONNX; the message begins with ``where``.
+    """
+    algorithm, leaves = policy.algorithm, leaves_of(policy.observation_space)
+    choices = algorithm.codec.size if algorithm.codec.discrete else 0
+    noise = _noise_of(algorithm) if sampled else ()
+    told = Graph(b"", choices, algorithm.memory_size, noise)
+    given = {leaf.name: leaf.example() for leaf in leaves}
+    if choices:
+        given["mask"] = torch.ones(1, choices, dtype=torch.bool)
+    outputs = ["action"]
+    if told.memory:
+        given["memory"] = torch.zeros(1, told.memory)
+        outputs.append("memory.after")
+    given |= {f"noise.{i}": torch.full((1, n), 0.5) for i, (_, n) in enumerate(noise)}
+    module = _Acting(policy, len(leaves), told)
+    return replace(told, content=traced(module, given, outputs, where))
+
+
+def worth_graph(critic: AgentPolicy, where: str) -> Graph:
+    """A skill critic: inputs ``obs…``, output ``worth`` (1, S)."""
+    given = {leaf.name: leaf.example() for leaf in leaves_of(critic.observation_space)}
+    return Graph(traced(_Worth(critic), given, ["worth"], where))
+
+
+def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
+    """``Algorithm.to_env`` on tensors: an action (1, …) in policy units to the environment's."""
+    codec, space = algorithm.codec, algorithm.action_space
+    shape, dtype = (1, *(space.shape or ())), torch.from_numpy(np.empty(0, space.dtype)).dtype
+    if getattr(getattr(algorithm, "head", None), "squash", False):
+        action = action.tanh()
+    if codec.discrete:
+        action = action if codec.low is None else action + torch.from_numpy(np.asarray(codec.low))
+        return action.reshape(shape).to(dtype) if codec.multi else action
+    assert codec.low is not None
+    assert codec.high is not None
+    low, span, bounded = codec.span
+    wide = np.result_type(np.float32, low)
+    shift = torch.from_numpy(np.where(bounded, low, 0).astype(wide))
+    width = torch.from_numpy(np.where(bounded, span, 0).astype(wide))
+    action = torch.where(action.isnan(), 0.0, action)
+    scaled = shift + 0.5 * (action + 1.0) * width
+    if not bounded.all():
+        scaled = torch.where(torch.from_numpy(bounded), scaled, action.to(scaled.dtype))
+    ends = (torch.from_numpy(np.asarray(x)) for x in (codec.low, codec.high))
+    return scaled.to(dtype).clamp(*ends).reshape(shape)
+
+
+def _noise_of(algorithm: Algorithm) -> tuple[tuple[str, int], ...]:
+    """The noise that an algorithm's ``act`` takes, for one observation."""
+    found = algorithm.noise([torch.Generator()], 1, 1)[0]
+    if isinstance(found, Tensor):
+        kind = "gumbel" if algorithm.codec.discrete else "standard_normal"
+        return ((kind, found.numel()),)
+    uniform, normal = found  # DQN's: of ε, and of the weights
+    more = () if normal is None else (("standard_normal", normal.numel()),)
+    return (("random", uniform.numel()), *more)
+
+
+def traced(
+    module: nn.Module, given: dict[str, Tensor], outputs: Sequence[str], where: str
+) -> bytes:
+    """A module as an ONNX file's content.
+
+    Raises:
+        SkillweaveError: an operation of it has no counterpart; the message begins with ``where``.
+        MissingExtra: the packages that write ONNX are not installed.
+    """
+    try:
+        import onnx  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra("exporting to ONNX", "onnx") from error
+    try:
+        with _quiet(), torch.no_grad():
+            program = torch.onnx.export(
+                module, tuple(given.values()), None, dynamo=True, verbose=False,
+                opset_version=OPSET, input_names=list(given), output_names=list(outputs),
+            )  # fmt: skip
+    except Exception as error:  # torch's own errors have no common class
+        raise SkillweaveError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
+    assert program is not None
+    model = program.model_proto
+    model.ClearField("metadata_props")
+    _strip(model.graph)
+    content: bytes = model.SerializeToString(deterministic=True)
+    return content
+
+
+def _strip(graph: Any) -> None:
+    """Forget where each operation was written: paths of this machine, and half of the size."""
+    for part in (graph, *graph.node, *graph.value_info):
+        part.ClearField("metadata_props")
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _strip(attribute.g)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Torch's exporter speaks of packages that nothing here needs, and prints whole graphs."""
+    logger = logging.getLogger("torch")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with (
+            warnings.catch_warnings(),
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

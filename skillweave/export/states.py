@@ -1,0 +1,179 @@
+"""A policy as data: its networks as files, and its state machine as JSON for the runner."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.collecting.calls import SkillSet
+from skillweave.export.foreign import file_graph, module_graph
+from skillweave.export.graphs import Graph, agent_graph, worth_graph
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.selectors import Automaton
+from skillweave.selectors.base import function_name
+from skillweave.selectors.function import FunctionSelector
+from skillweave.skills import Reflex
+from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.skills.torch_module import TorchPolicy
+from skillweave.types import Policy, SkillweaveError
+
+
+class States:
+    """What is gathered while a policy is described: files, and the code that it needs.
+
+    Args:
+        space: of the environment's actions.
+    """
+
+    def __init__(self, space: gym.Space[Any]) -> None:
+        self.space = space
+        self.files: dict[str, bytes] = {}
+        self.code: dict[str, str] = {}
+        """By name, what the runner must be given, and what it is."""
+        self._known: dict[str, Any] = {}
+
+    def policy(self, policy: Policy, name: str = "", sampled: bool = False) -> dict[str, Any]:
+        """A policy, and all below it, as JSON.
+
+        Args:
+            name: where it stands: ``landing``, of a skill in a nested hierarchy ``outer/landing``;
+                the whole policy has none.
+            sampled: it samples; else it is greedy.
+
+        Raises:
+            SkillweaveError: it cannot be exported; the message says why, and what to do.
+        """
+        where = f"the policy of {name!r}" if name else "the policy"
+        match policy:
+            case HierarchyPolicy():
+                return self._hierarchy(policy, f"{name}/" if name else "", sampled)
+            case AgentPolicy():
+                return self._network(agent_graph(policy, sampled, where), name)
+            case TorchPolicy():
+                return self._network(module_graph(policy, sampled, where), name)
+            case OnnxPolicy():
+                return self._network(file_graph(policy, sampled), name)
+            case ScriptedPolicy():
+                acts: Any = policy.function
+            case _:
+                acts = policy
+        if policy.start(1):
+            raise SkillweaveError(
+                f"{where} is a {type(policy).__name__}, which has a memory that nothing here can "
+                "write as ONNX: train the skill, or give it an ONNX file"
+            )
+        what = "observations (1, ...) to actions (1, ...)"
+        return {"kind": "Code", "code": self._asks(f"{name}.policy", acts, what)}
+
+    def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
+        skills, cuts, selector = policy.skills, policy.skills.interruption, policy.selector
+        told_ends = isinstance(selector, Automaton) or getattr(selector, "asks_last", False)
+        told: dict[str, Any] = {
+            "kind": "Hierarchy",
+            "selector": self._selector(policy, prefix, sampled),
+            "skills": [
+                self._skill(skills, i, prefix, told_ends) for i in range(len(skills.skills))
+            ],
+            "lengths": list(skills.lengths),
+            "reflexes": [self._reflex(reflex, prefix) for reflex in skills.reflexes],
+            "critic": None,
+            "margin": None,
+        }
+        if cuts is not None:
+            if not isinstance(cuts.critic, AgentPolicy):
+                raise SkillweaveError(f"the critic of {prefix or 'the selector'} is not trained")
+            graph = worth_graph(cuts.critic, "the skill critic")
+            told |= {"critic": self._network(graph, f"{prefix}critic"), "margin": cuts.margin}
+        return told
+
+    def _skill(self, skills: SkillSet, i: int, prefix: str, judged: bool) -> dict[str, Any]:
+        skill, name = skills.skills[i], prefix + skills.skills[i].name
+
+        def method(name: str, what: str) -> str | None:
+            if not skill.defines(name):
+                return None
+            return self._asks(f"{prefix}{skill.name}.{name}", getattr(skill, name), what)
+
+        return {
+            "name": skill.name,
+            "policy": self.policy(skills.policies[i], name, sampled=not skills.greedy),
+            "limit": skills.limit(i),
+            "max_steps": skill.max_steps,
+            "initiation": method("initiation", "observations (1, ...) to (1,) bool"),
+            "termination": method("termination", "a Step to (1,) bool"),
+            "success": method("success", "a Step to (1,) bool") if judged else None,
+        }
+
+    def _reflex(self, reflex: Reflex, prefix: str) -> list[Any]:
+        name, code, fixed = f"{prefix}{reflex.name}", None, None
+        what = "observations (1, ...) to (1,) bool"
+        condition = self._asks(f"{name}.condition", reflex.condition, what)
+        if callable(reflex.action):
+            what = "observations (1, ...) to actions (1, ...)"
+            code = self._asks(f"{name}.action", reflex.action, what)
+        else:
+            fixed = reflex.fixed(self.space).tolist()
+        return [condition, code, fixed]
+
+    def _network(self, graph: Graph, name: str) -> dict[str, Any]:
+        file = f"{name.replace('/', '.') or 'agent'}.onnx"
+        self.files[file] = graph.content
+        return {
+            "kind": "Network",
+            "file": file,
+            "choices": graph.choices,
+            "memory": {"memory": graph.memory} if graph.memory else {},
+            "noise": [list(n) for n in graph.noise],
+        }
+
+    def _selector(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
+        selector, name = policy.selector, f"{prefix}selector"
+        match selector:
+            case Automaton():
+                if sampled:
+                    raise SkillweaveError(
+                        f"{name} is an automaton that draws among the skills of a state, which the "
+                        "runner does not: let the skills around it be greedy (greedy_skills=True)"
+                    )
+                return self._automaton(selector, name)
+            case FunctionSelector():
+                last = ", and the LastCall," if selector.asks_last else ""
+                what = f"observations (1, ...){last} to skills (1,)"
+                return {
+                    "kind": "Function",
+                    "code": self._asks(name, selector.function, what),
+                    "names": list(policy.labels),
+                    "asks_last": selector.asks_last,
+                }
+            case AgentPolicy():
+                return self._network(agent_graph(selector, sampled, name), name)
+        raise SkillweaveError(
+            f"{name} is a {getattr(selector, 'kind', type(selector).__name__)}, which the runner "
+            "does not know: select by an Automaton, by a function, or train the selector"
+        )
+
+    def _automaton(self, selector: Automaton, name: str) -> dict[str, Any]:
+        ranks, transitions = selector.ranks, []
+        for origin, target, event in selector.arrows:
+            ends, code = event, None
+            if callable(event):
+                ends, what = "", "a Step to (1,) bool"
+                code = self._asks(f"{name}.{function_name(event)}", event, what)
+            transitions.append([origin, target, ends, code])
+        order = [[int(i) for i in np.argsort(-rank, kind="stable") if rank[i]] for rank in ranks]
+        start = selector.state_names.index(selector.start_state)
+        return {
+            "kind": "Automaton", "start": start, "skills": order, "transitions": transitions,
+        }  # fmt: skip
+
+    def _asks(self, name: str, function: Any, what: str) -> str:
+        """The name under which the runner is given a function; of two functions, a number too."""
+        names = [name, *(f"{name}#{i}" for i in range(2, 1000))]
+        free = next(n for n in names if self._known.get(n, function) == function)
+        self._known[free] = function
+        self.code[free] = what
+        return free

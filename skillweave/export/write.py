@@ -1,0 +1,114 @@
+"""The folder of an export: ONNX files, ``policy.json``, and the runner."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.export.graphs import leaves_of
+from skillweave.export.states import States
+from skillweave.runs.files import write_bytes
+from skillweave.spaces import obs_dtype, obs_shape
+from skillweave.spaces.packing import parts
+from skillweave.types import Policy
+
+FORMAT = 1
+"""Of ``policy.json``."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written."""
+
+    path: Path
+    files: tuple[str, ...]
+    code: dict[str, str]
+    """Python code that the runner must be given, by name, and what it is."""
+
+    def __str__(self) -> str:
+        said = f"{self.path}: {len(self.files)} files"
+        if not self.code:
+            return said
+        needs = "\n".join(f"  {name!r}: {what}" for name, what in self.code.items())
+        return f"{said}\nRunner({str(self.path)!r}, code={{name: function}}) needs\n{needs}"
+
+
+def write_export(path: Path, policy: Policy, env: str) -> Export:
+    """Write a policy for machines without this library; what has the same names is replaced.
+
+    Args:
+        path: the folder.
+        env: the environment's name, for who reads ``policy.json``.
+
+    Raises:
+        SkillweaveError: a part of it cannot be exported; the message says which, and what to do.
+        MissingExtra: the packages that write ONNX are not installed.
+    """
+    states = States(policy.action_space)
+    found = states.policy(policy)
+    space = policy.observation_space
+    told = {
+        "format": FORMAT,
+        "env": env,
+        "code": states.code,
+        "dtype": _dtype_to_json(obs_dtype(space)),
+        "shape": list(obs_shape(space)),
+        "inputs": _inputs(space),
+        "action": _action_to_json(policy.action_space),
+        "policy": found,
+    }
+    text = json.dumps(told, indent=1, allow_nan=False)
+    runner = Path(__file__).with_name("runner.py").read_bytes()
+    files = states.files | {"policy.json": text.encode(), "runner.py": runner}
+    for name, content in files.items():
+        write_bytes(path / name, content)
+    return Export(path, tuple(files), states.code)
+
+
+def _inputs(space: gym.Space[Any]) -> list[list[Any]]:
+    """Of each leaf its name, its fields in the packed array, and its keys in an observation."""
+
+    def within(space: gym.Space[Any], fields: list[str], keys: list[Any]) -> list[list[Any]]:
+        inner = parts(space)
+        if inner is None:
+            return [[".".join(["obs", *fields]), fields, keys]]
+        places = range(len(inner)) if isinstance(space, gym.spaces.Tuple) else inner
+        return [
+            found
+            for (name, part), key in zip(inner.items(), places, strict=True)
+            for found in within(part, [*fields, name], [*keys, key])
+        ]
+
+    found = within(space, [], [])
+    assert [name for name, _, _ in found] == [leaf.name for leaf in leaves_of(space)]
+    return found
+
+
+def _dtype_to_json(dtype: np.dtype[Any]) -> Any:
+    """What ``numpy.dtype`` makes the same of again."""
+    if dtype.subdtype is not None:
+        base, shape = dtype.subdtype
+        return f"({','.join(map(str, shape))},){base.str}"
+    if dtype.names is None:
+        return dtype.str
+    assert dtype.fields is not None
+    fields = [dtype.fields[name][:2] for name in dtype.names]
+    return {
+        "names": list(dtype.names),
+        "formats": [_dtype_to_json(d) for d, _ in fields],
+        "offsets": [at for _, at in fields],
+        "itemsize": dtype.itemsize,
+    }
+
+
+def _action_to_json(space: gym.Space[Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {"dtype": np.dtype(space.dtype).str, "shape": list(space.shape or ())}
+    if not isinstance(space, gym.spaces.Box):
+        return found | {"low": None, "high": None}
+    bounds = {"low": space.low, "high": space.high}  # infinities are no JSON
+    return found | {k: np.nan_to_num(v.astype(np.float64)).tolist() for k, v in bounds.items()}

@@ -1,0 +1,184 @@
+"""Ready selectors of a hierarchy: one that decides, or one that guides a selector that learns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium as gym
+
+from skillweave.algorithms.config import PPO
+from skillweave.collecting.guide import Guide
+from skillweave.collecting.lengths import Lengths
+from skillweave.hierarchy.nesting import inner_of
+from skillweave.messages import short
+from skillweave.selectors import Automaton, ReadySelector, ready_selector
+from skillweave.skills import Skill
+from skillweave.skills.foreign_policy import fitted, source_of
+from skillweave.training.plain_agent import check_algorithm
+from skillweave.training.stage import SELECTOR
+from skillweave.types import SkillweaveError
+
+if TYPE_CHECKING:
+    from skillweave.hierarchy.declaration import Declaration
+
+WAYS = ("apart", "together", "apart, then together")
+
+
+def check_selection(declared: Declaration) -> None:
+    """Raise a SkillweaveError where selector, guide and how they learn do not fit together."""
+    if declared.learn not in WAYS:
+        raise SkillweaveError(
+            f"learn is {short(declared.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
+        )
+    if declared.ready_selector is None:
+        check_algorithm(declared.selector, "selector", also="function, Automaton or tree")
+        if declared.guide is not None:
+            _check_guide(declared)
+        return
+    refused = {
+        "selector_target_return is given": declared.selector_target_return is not None,
+        "interrupt is True": declared.interrupt,
+        "call_steps are Lengths": isinstance(declared.call_steps, Lengths),
+        "a guide is given": declared.guide is not None,
+    }
+    for what, asked in refused.items():
+        if asked:
+            raise SkillweaveError(f"{what}, but the selector is ready: it does not learn")
+    if declared.weaves and not any(_learns(s) for s in declared.skills):
+        raise SkillweaveError(
+            f"learn is {declared.learn!r}, but the selector and all skills are ready: nobody "
+            "learns. Leave out learn, or give a selector that learns: selector=PPO()"
+        )
+
+
+def _learns(skill: Skill) -> bool:
+    """Whether a skill learns, or where it is a hierarchy, anyone in it."""
+    if (inner := inner_of(skill)) is None:
+        return skill.policy is None
+    return inner.ready_selector is None or any(_learns(s) for s in inner.skills)
+
+
+def _check_guide(declared: Declaration) -> None:
+    """Raise a SkillweaveError where a guide could not guide."""
+    nats: Any = declared.guide_nats
+    if ready_guide(declared) is None:
+        raise SkillweaveError(
+            f"guide is {short(declared.guide)}; it must be a function of observations, an "
+            "Automaton or a tree"
+        )
+    if nats is not None and (isinstance(nats, bool) or not isinstance(nats, int | float)):
+        raise SkillweaveError(f"guide_nats is {short(nats)}; it must be a number, or None")
+    if nats is not None and not 0.0 < nats < float("inf"):
+        raise SkillweaveError(f"guide_nats is {short(nats)}; it must be positive and finite")
+    if nats is not None and not isinstance(declared.selector, PPO):
+        raise SkillweaveError(
+            f"guide_nats is {nats:g}, but the selector learns by "
+            f"{type(declared.selector).__name__}: only PPO can be kept near a guide"
+        )
+    if nats is None and not declared.guide_restricts:
+        raise SkillweaveError(
+            "the guide has no effect: guide_restricts is False, and guide_nats is None"
+        )
+    if not declared.guide_restricts or isinstance(declared.guide, Automaton):
+        pass
+    elif not isinstance(declared.call_steps, Lengths):
+        raise SkillweaveError(
+            "the guide names one skill at each decision, so a selector that it restricts has "
+            "nothing to choose: write guide_restricts=False and guide_nats=0.1, or let the "
+            "selector choose lengths, or give an Automaton whose states have several skills"
+        )
+    elif not isinstance(declared.selector, PPO):
+        raise SkillweaveError(
+            f"a selector that learns by {type(declared.selector).__name__} asks what may be called "
+            "next, which a function or a tree says only at decisions: give an Automaton, or PPO"
+        )
+    if declared.guide_restricts and declared.interrupt:
+        raise SkillweaveError(
+            "interrupt is True, but the guide restricts which skill may be called instead: give "
+            "one of them"
+        )
+
+
+def ready_guide(declared: Declaration) -> ReadySelector | None:
+    """The guide, among the skills of the hierarchy; None: there is none."""
+    return ready_selector(declared.guide, tuple(s.name for s in declared.skills))
+
+
+def fitted_guide(
+    declared: Declaration, observation_space: gym.Space[Any], path: str = ""
+) -> Guide | None:
+    """The guide of a selector that learns, on these observations; None: there is none.
+
+    Args:
+        path: of the hierarchy, ``inner/`` for example.
+
+    Raises:
+        SkillweaveError: it fails on them.
+    """
+    if (found := ready_guide(declared)) is None:
+        return None
+    choices = gym.spaces.Discrete(len(declared.skills))
+    own = fitted(found, observation_space, choices, f"{path}guide", declared.spec.name)
+    tells = declared.guide_nats is not None
+    return Guide(cast(ReadySelector, own), declared.guide_restricts, tells)
+
+
+def restricting_guide(
+    declared: Declaration, observation_space: gym.Space[Any], path: str = ""
+) -> Guide | None:
+    """The guide that a selector keeps to after it has learnt; None: there is none."""
+    guide = fitted_guide(declared, observation_space, path)
+    return replace(guide, tells=False) if guide is not None and guide.restricts else None
+
+
+def own_guide(declared: Declaration) -> Guide | None:
+    """The guide of a selector that learns; None: there is none."""
+    if declared.guide is None:
+        return None
+    env = declared.spec.make()
+    try:
+        return fitted_guide(declared, env.observation_space)
+    finally:
+        env.close()
+
+
+def who_guides(declared: Declaration) -> Guide | None:
+    """Who is asked while the selector learns, or instead of it; None: nobody."""
+    if declared.ready_selector is None:
+        return own_guide(declared)
+    ready = declared.ready_selectors()[SELECTOR]
+    return Guide(cast(ReadySelector, ready), decides=True)
+
+
+def guide_entry(declared: Declaration) -> dict[str, Any]:
+    """What a run says of the guide of a trained selector; nothing where there is none."""
+    if (guide := ready_guide(declared)) is None:
+        return {}
+    return {
+        "guide": source_of(guide),
+        "guide_restricts": declared.guide_restricts,
+        "guide_nats": declared.guide_nats,
+    }
+
+
+def adopt_guide(declared: Declaration, told: Mapping[str, Any], where: str) -> None:
+    """Take over from a run how a selector keeps to its guide; ``told`` is its ``guide_entry``.
+
+    Raises:
+        SkillweaveError: of the run and the hierarchy one has a guide, and the other has none.
+    """
+    check_guided(declared.guide is not None, "guide" in told, where)
+    declared.guide_restricts = told.get("guide_restricts", True)
+    declared.guide_nats = told.get("guide_nats")
+
+
+def check_guided(mine: bool, theirs: bool, where: str) -> None:
+    """Raise a SkillweaveError where of two selectors one has a guide and the other has none."""
+    if mine != theirs:
+        has = ("no guide", "a guide")
+        raise SkillweaveError(
+            f"{where}: the selector has {has[theirs]}, but that of this hierarchy has {has[mine]}: "
+            "declare guide= as it was, or train anew"
+        )

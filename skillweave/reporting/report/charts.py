@@ -1,0 +1,202 @@
+"""The charts of reports, as specifications in Vega-Lite; the page gives them its colours.
+
+A specification is plain data, and the data that it shows stand in it. ``vega`` in a browser draws
+it (https://vega.github.io/vega-lite/docs/).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from skillweave.reporting.lineage import Born, Lineage
+from skillweave.reporting.palette import RGB
+
+Spec = dict[str, Any]
+STEPS = "environment steps"
+COMPLEMENT = ("gamma", "gae_lambda")
+"""Settings that are drawn as what they lack to one."""
+
+
+def chart(description: str, height: int, **rest: Any) -> Spec:
+    """What all charts have in common; as wide as the page lets it be."""
+    schema = "https://vega.github.io/schema/vega-lite/v6.json"
+    size = {
+        "width": "container",
+        "height": height,
+        "autosize": {"type": "fit", "contains": "padding"},
+    }
+    return {"$schema": schema, "description": description, **size, **rest}
+
+
+def number_axis(field: str, title: str, **rest: Any) -> dict[str, Any]:
+    """The encoding of a number that need not begin at zero."""
+    scale = {"zero": False, "nice": True} | rest.pop("scale", {})
+    return {"field": field, "type": "quantitative", "title": title, "scale": scale} | rest
+
+
+def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
+    """The encoding of steps: 200k, 1M."""
+    label = "datum.value === 0 ? '0' : format(datum.value, '~s')"
+    axis = {"labelExpr": label, "tickCount": 5, "labelOverlap": True}
+    return number_axis(field, title, axis=axis, scale={"zero": True, "nice": False})
+
+
+def hover(fields: Sequence[dict[str, Any]], color: dict[str, Any]) -> list[Spec]:
+    """Layers that show the nearest point under the pointer, with a box of its values."""
+    near = {"name": "near", "select": {"type": "point", "on": "pointerover", "nearest": True,
+            "encodings": ["x"], "clear": "pointerout"}}  # fmt: skip
+    opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
+    mark = {"type": "point", "filled": True, "size": 60, "aria": False}
+    return [
+        {"params": [near], "mark": mark,
+         "encoding": {"opacity": opacity, "color": color, "tooltip": list(fields)}}
+    ]  # fmt: skip
+
+
+def curve(label: str, color: str) -> Spec:
+    """One agent's metric over its steps; the page sets the values and the name of the metric."""
+    own = {"value": color}
+    told = [
+        {"field": "x", "type": "quantitative", "title": STEPS, "format": ",d"},
+        {"field": "y", "type": "quantitative", "title": "value", "format": ",.4~g"},
+    ]
+    mark = {"type": "line", "strokeWidth": 2, "strokeJoin": "round", "aria": False}
+    layers = [{"mark": mark, "encoding": {"color": own}}, *hover(told, own)]
+    encoding = {"x": steps_axis(), "y": number_axis("y", "", axis={"tickCount": 5})}
+    return chart(f"Learning curve of {label}", 190, encoding=encoding, layer=layers)
+
+
+def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
+    """Decisions over two coordinates, coloured by skill; the page sets values and names."""
+    scale = {"domain": list(skills), "range": list(colors)}
+    shapes = ["circle", "square", "triangle-up", "diamond", "cross", "triangle-down"]
+    shape = {"domain": list(skills), "range": [shapes[i % len(shapes)] for i in range(len(skills))]}
+    legend = {"orient": "top", "title": None, "symbolOpacity": 1}
+    encoding = {
+        "x": number_axis("x", "", axis={"tickCount": 8}), "y": number_axis("y", ""),
+        "color": {"field": "what", "type": "nominal", "scale": scale, "legend": legend},
+        "shape": {"field": "what", "type": "nominal", "scale": shape},
+        "tooltip": [{"field": "what", "title": "chosen"}, {"field": "x", "format": ".4~g"},
+                    {"field": "y", "format": ".4~g"}],
+    }  # fmt: skip
+    mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}
+    return chart("What the selector chose over two coordinates", 360, mark=mark, encoding=encoding)
+
+
+def family_tree(lineage: Lineage, color: str) -> Spec:
+    """Fitness by generation, each member joined to its parent; the winner's line in colour."""
+    path = {(b.generation, b.member) for b in lineage.path(lineage.winner)}
+    dots, lines = [], []
+    for key, born in lineage.born.items():
+        if born.fitness is None:
+            continue
+        told: dict[str, Any] = {
+            "x": born.generation + 1,
+            "y": round(born.fitness, 3),
+            "won": key in path,
+        }
+        what = "winner's line" if key in path else "other members"
+        told |= {"member": born.member, "how": what_changed(born), "what": what}
+        dots.append(told)
+        parent = lineage.parent(born)
+        if parent is not None and parent.fitness is not None:
+            ends: dict[str, Any] = {"x2": parent.generation + 1, "y2": round(parent.fitness, 3)}
+            lines.append({k: told[k] for k in ("x", "y", "won", "what")} | ends)
+    axis = {"tickMinStep": 1, "format": "d"}
+    x = number_axis("x", "generation", axis=axis)
+    y = number_axis("y", "fitness: mean return")
+    of = {"domain": ["winner's line", "other members"], "range": [color, "#8d8d97"]}
+    legend = {"orient": "top", "title": None, "symbolType": "circle"}
+    hue = {"field": "what", "type": "nominal", "scale": of, "legend": legend}
+    tooltip = [
+        {"field": "member"},
+        {"field": "x", "title": "generation"},
+        {"field": "y", "title": "fitness", "format": ",.1f"},
+        {"field": "how", "title": "changed"},
+    ]
+    joined = {"x": x, "y": y, "x2": {"field": "x2"}, "y2": {"field": "y2"}, "color": hue}
+    thick = {"condition": {"test": "datum.won", "value": 2.5}, "value": 1}
+    big = {"condition": {"test": "datum.won", "value": 70}, "value": 25}
+    layer: list[Spec] = [
+        {"data": {"values": lines}, "mark": {"type": "rule", "aria": False},
+         "encoding": joined | {"strokeWidth": thick}},
+        {"data": {"values": dots},
+         "mark": {"type": "circle", "opacity": 1, "aria": False},
+         "encoding": {"x": x, "y": y, "color": hue, "size": big, "tooltip": tooltip}},
+    ]  # fmt: skip
+    return chart("Fitness by generation, and the line of the winner", 320, layer=layer)
+
+
+def setting_paths(lineage: Lineage, color: str) -> list[tuple[str, Spec]]:
+    """For each setting that differed: its values by generation, the winner's line in colour."""
+    everyone = list(lineage.born.values())
+    path = lineage.path(lineage.winner)
+    shown = [k for k in lineage.winner.settings if len({str(b.settings[k]) for b in everyone}) > 1]
+    return [(k, _setting(k, everyone, path, color)) for k in shown]
+
+
+def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: str) -> Spec:
+    words = any(isinstance(b.settings[name], str) for b in everyone)
+
+    def value(born: Born) -> Any:
+        told = born.settings[name]
+        told = sum(told) if isinstance(told, list) else told
+        return 1.0 - told if name in COMPLEMENT else told
+
+    y: dict[str, Any] = {"field": "y", "type": "nominal", "title": None}
+    if not words:
+        values = [value(b) for b in everyone]
+        log = min(values) > 0 and max(values) > 5 * min(values)
+        y = number_axis("y", "", scale={"type": "log"} if log else {}, axis={"tickCount": 4})
+    axis = {"tickMinStep": 1, "format": "d"}
+    encoding = {"x": number_axis("x", "generation", axis=axis), "y": y}
+    rows = [{"x": b.generation + 1, "y": value(b)} for b in everyone]
+    line = [{"x": b.generation + 1, "y": value(b)} for b in path]
+    faint = {"type": "circle", "size": 20, "color": "#8d8d97", "aria": False}
+    bold = {
+        "type": "line",
+        "point": {"size": 35, "color": color},
+        "strokeWidth": 2,
+        "color": color,
+        "aria": False,
+    }
+    layer = [{"data": {"values": rows}, "mark": faint}, {"data": {"values": line}, "mark": bold}]
+    return chart(f"{setting_title(name)} by generation", 150, encoding=encoding, layer=layer)
+
+
+def setting_title(name: str) -> str:
+    """What the axis of a setting is called."""
+    if name == "hidden":
+        return "hidden units, all layers"
+    return f"1 − {name}" if name in COMPLEMENT else name
+
+
+def what_changed(born: Born) -> str:
+    """What a member's mutation did, in words."""
+    if not born.changes:
+        return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(
+            born.mutation, born.mutation
+        )
+    return ", ".join(
+        f"{k.removeprefix('network.')} {short(old)} → {short(new)}"
+        for k, (old, new) in born.changes.items()
+    )
+
+
+def short(value: Any) -> str:
+    """A setting's value in few letters."""
+    if isinstance(value, list):
+        return "-".join(map(str, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def hex_of(color: RGB) -> str:
+    """A colour as the web writes it."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+def ink_on(color: RGB) -> str:
+    """Black or white, whichever is read better on a colour (WCAG 2)."""
+    red, green, blue = ((c / 255) ** 2.2 for c in color)
+    return "#000" if 0.2126 * red + 0.7152 * green + 0.0722 * blue > 0.18 else "#fff"

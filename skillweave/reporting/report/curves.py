@@ -1,0 +1,66 @@
+"""Learning curves: what ``metrics.jsonl`` tells of each agent."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from skillweave.runs.directory import RunDirectory
+
+MOST_POINTS = 300
+TOLD_BY_ALL = ("stage", "update", "steps", "seconds")
+FIRST = ("return", "eval_return", "eval_success", "task_return", "length", "success", "fitness")
+"""Metrics that are offered first, in this order."""
+
+
+@dataclass
+class Curves:
+    """What one agent's metrics were in one stage."""
+
+    stage: str
+    agent: str
+    """The stage's name, or of those that learn together, one of them."""
+    points: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
+    """By metric: environment steps of the stage, and the value."""
+
+    @property
+    def label(self) -> str:
+        """What people call it."""
+        return self.stage if self.agent == self.stage else f"{self.agent} in {self.stage}"
+
+
+def read_curves(run: RunDirectory) -> list[Curves]:
+    """The curves of every agent, in the order of the schedule; stages without metrics have none.
+
+    Raises:
+        SkillweaveError: the file is damaged.
+    """
+    found: dict[tuple[str, str], Curves] = {}
+    stages = {entry["name"]: entry for entry in run.manifest["stages"]}
+    for line in run.metrics():
+        stage = str(line.get("stage"))
+        if stage not in stages or "steps" not in line:
+            continue
+        for key, value in line.items():
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if key in TOLD_BY_ALL or not number or not math.isfinite(value):
+                continue
+            agent, dot, metric = key.rpartition(".")
+            agent = agent if dot else stage
+            curves = found.setdefault((stage, agent), Curves(stage, agent))
+            curves.points.setdefault(metric, []).append((int(line["steps"]), float(value)))
+    order = list(stages)
+    return sorted(found.values(), key=lambda c: (order.index(c.stage), c.agent != c.stage, c.agent))
+
+
+def metrics_of(all_curves: list[Curves]) -> list[str]:
+    """The names of all metrics, those that people look at first before the others."""
+    names = {name for curves in all_curves for name in curves.points}
+    return sorted(names, key=lambda n: (FIRST.index(n) if n in FIRST else len(FIRST), n))
+
+
+def thinned(points: list[Any], most: int = MOST_POINTS) -> list[Any]:
+    """At most about ``most`` of the points, evenly, the last one among them."""
+    every = -(-len(points) // most)
+    return points[::-1][::every][::-1] if every > 1 else points

@@ -1,0 +1,140 @@
+"""What a run's files say in words: what was trained and how, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skillweave.reporting.report.skills_table import number
+from skillweave.runs.directory import RunDirectory
+
+LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
+MADE = {"steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers"}
+"""Of a stage's entry what training wrote: no settings."""
+
+
+def name_of(run: RunDirectory) -> str:
+    """What a run is called: the name of its directory."""
+    return run.path.resolve().name
+
+
+def facts(run: RunDirectory) -> list[tuple[str, str]]:
+    """What was trained, by name."""
+    m = run.manifest
+    found = [("Environment", m["env"])]
+    if m["env_kwargs"]:
+        found.append(("Made with", plain(m["env_kwargs"])))
+    found.append(("Recipe", m.get("recipe") or "declared in Python"))
+    found += [("Seed", str(m["seed"])), ("Made", m["created"].replace("T", " "))]
+    if m["kind"] == "hierarchy":
+        found.append(("Skills", ", ".join(s["name"] for s in m["skills"])))
+        found.append(("A call lasts", _call_length(m)))
+        selector = m.get("selector")
+        found.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
+        found.append(("Learning", m.get("learn", "apart")))
+        if m.get("interrupt") is not None:
+            found.append(("Calls are cut at", f"{m['interrupt']} deviations"))
+        if m.get("reflexes"):
+            found.append(("Reflexes", ", ".join(m["reflexes"])))
+    return found
+
+
+def _call_length(m: Mapping[str, Any]) -> str:
+    if "call_lengths" in m:
+        return f"{plain(m['call_lengths'])} steps at most, as the selector chooses"
+    most = m["call_steps"]
+    if most is None:
+        return "until the skill stops"
+    return "1 step" if most == 1 else f"at most {most:,} steps"
+
+
+def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, str]]:
+    """A row for each stage: how long it took, and how it ended; ``steps``: how far it is."""
+    rows = []
+    for entry in run.manifest["stages"]:
+        final = (entry.get("final") or {}).get("return")
+        notes = []
+        if reached := entry.get("reached"):
+            notes.append(f"target reached after {reached['steps']:,} steps")
+        if kept := entry.get("kept"):
+            before, after = kept["before"], kept["after"]
+            notes.append(f"return {before:.1f} before, {after:.1f} after: kept {kept['kept']}")
+        if winner := entry.get("winner"):
+            notes.append(f"winner: member {winner['member']}, fitness {winner['fitness']:.1f}")
+        done = entry["status"] == "done"
+        far = f"{steps.get(entry['name'], 0):,} of {entry['budget']:,}"
+        rows.append({
+            "name": entry["name"], "kind": entry["kind"],
+            "algorithm": entry["algorithm"].get("algorithm", "?"), "status": entry["status"],
+            "steps": f"{entry['steps']:,}" if done else far,
+            "seconds": f"{entry['seconds']:,.1f}" if done else "–",
+            "speed": f"{entry['steps_per_second']:,.0f}" if "steps_per_second" in entry else "–",
+            "return": number(final),
+            "notes": "; ".join(notes),
+        })  # fmt: skip
+    return rows
+
+
+def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
+    """A sentence for each stage that is not done; ``steps``: how far metrics say that it is."""
+    found = []
+    for entry in run.manifest["stages"]:
+        name, budget = entry["name"], entry["budget"]
+        if entry["status"] == "waiting":
+            found.append(f"The stage {name!r} has not begun.")
+        elif entry["status"] == "training":
+            far = f"after {steps[name]:,}" if name in steps else "before the first line of metrics"
+            found.append(
+                f"The stage {name!r} is not finished: it stands {far} of {budget:,} steps."
+            )
+    if found:
+        found.append(
+            "Only a finished run can be played, so there are no episodes and no film. To finish "
+            f"it: skillweave resume {run.path}"
+        )
+    return found
+
+
+def settings(run: RunDirectory) -> dict[str, Any]:
+    """Every setting of a run by its dotted name; neither its seed nor what came of it."""
+    m = run.manifest
+    found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
+    told: tuple[str, ...] = (
+        "kind",
+        "learn",
+        "call_steps",
+        "call_lengths",
+        "interrupt",
+        "greedy_skills",
+    )
+    told += ("reflexes", "reflexes_in_training", "cut_every", "eval_every", "eval_episodes")
+    found |= {k: m[k] for k in told if k in m}
+    for skill in m.get("skills", ()):
+        found |= flat(f"skills.{skill['name']}", {k: v for k, v in skill.items() if k != "name"})
+    for entry in m["stages"]:
+        own = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name"}}
+        found |= flat(entry["name"], own)
+    return found
+
+
+def flat(prefix: str, value: Any) -> dict[str, Any]:
+    """Nested dicts as one, with dotted names."""
+    if not isinstance(value, dict):
+        return {prefix: value}
+    found: dict[str, Any] = {}
+    for k, v in value.items():
+        found |= flat(f"{prefix}.{k}", v)
+    return found
+
+
+def plain(value: Any) -> str:
+    """A value of a setting, for people."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(plain(v) for v in value) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{k}={plain(v)}" for k, v in value.items())
+    return f"{value:g}" if isinstance(value, float) else str(value)

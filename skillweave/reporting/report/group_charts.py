@@ -1,0 +1,72 @@
+"""The charts of a comparison: several groups of seeds in one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from skillweave.reporting.report.charts import STEPS, Spec, chart, number_axis, steps_axis
+
+
+def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str, Any]:
+    """Colours of groups by their letters; the page has the legend."""
+    scale = {"domain": list(names), "range": list(colors)}
+    return {"field": field, "type": "nominal", "scale": scale, "legend": None}
+
+
+def scores(names: Sequence[str], colors: Sequence[str], rows: dict[str, Any]) -> Spec:
+    """A dot for each run; of each group the interquartile mean and its interval."""
+    y = {"field": "group", "type": "nominal", "title": None, "sort": list(names),
+         "axis": {"labelFontSize": 14, "labelFontWeight": "bold"}}  # fmt: skip
+    color = _color("group", names, colors)
+    x = number_axis("x", "mean return of a run", axis={"tickCount": 8})
+    told = [
+        {"field": "group"},
+        {"field": "x", "title": "interquartile mean", "format": ",.1f"},
+        {"field": "low", "title": "from", "format": ",.1f"},
+        {"field": "high", "title": "to", "format": ",.1f"},
+    ]
+    run = [
+        {"field": "group"},
+        {"field": "seed"},
+        {"field": "x", "title": "mean return", "format": ",.1f"},
+    ]
+    between = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
+    layer: list[Spec] = [
+        {"data": {"values": rows["bars"]},
+         "transform": [{"filter": "isValid(datum.low)"}],
+         "mark": {"type": "rule", "strokeWidth": 5, "opacity": 0.5, "aria": False},
+         "encoding": {**between, "y": y, "color": color, "tooltip": told}},
+        {"data": {"values": rows["dots"]},
+         "mark": {"type": "point", "size": 50, "strokeWidth": 1.5, "aria": False},
+         "encoding": {"x": x, "y": y, "color": color, "tooltip": run}},
+        {"data": {"values": rows["bars"]},
+         "mark": {"type": "tick", "thickness": 4, "size": 22, "aria": False},
+         "encoding": {"x": x, "y": y, "color": color, "tooltip": told}},
+    ]  # fmt: skip
+    if not any("low" in bar for bar in rows["bars"]):
+        del layer[0]  # an axis over nothing is warned of
+    return chart("Scores by group", 50 + 40 * len(names), layer=layer)
+
+
+def group_curves(label: str, names: Sequence[str], colors: Sequence[str]) -> Spec:
+    """An agent's metric over its steps, a line and a band for each group."""
+    color = _color("what", names, colors)
+    told = [
+        {"field": "what", "title": "group"},
+        {"field": "x", "title": STEPS, "format": ",d"},
+        {"field": "y", "title": "value", "format": ",.4~g"},
+        {"field": "lo", "title": "from", "format": ",.4~g"},
+        {"field": "hi", "title": "to", "format": ",.4~g"},
+    ]
+    band = {"type": "area", "opacity": 0.2, "aria": False, "tooltip": False}
+    line = {"type": "line", "strokeWidth": 2, "aria": False}
+    dot = {"type": "point", "opacity": 0, "size": 80, "filled": True, "aria": False}
+    low_high = {"y": number_axis("lo", ""), "y2": {"field": "hi"}}
+    encoding = {"x": steps_axis(), "color": color}
+    layer: list[Spec] = [
+        {"mark": band, "encoding": low_high},
+        {"mark": line, "encoding": {"y": number_axis("y", "")}},
+        {"mark": dot, "encoding": {"y": number_axis("y", ""), "tooltip": told}},
+    ]
+    return chart(f"Learning curves of {label}", 220, encoding=encoding, layer=layer)

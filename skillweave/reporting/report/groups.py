@@ -1,0 +1,92 @@
+"""Runs that differ by their seed alone are a group; what groups differ in, in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from skillweave.reporting.report import facts
+from skillweave.runs.directory import RunDirectory
+from skillweave.types import SkillweaveError
+
+
+@dataclass
+class Group:
+    """Seeds of one recipe."""
+
+    key: str
+    """A letter, for charts and tables."""
+    name: str
+    runs: list[RunDirectory]
+    settings: dict[str, Any]
+
+
+def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
+    """The groups, in the order of their first runs.
+
+    Raises:
+        SkillweaveError: no runs, or two that have the same seed and the same settings.
+    """
+    if not runs:
+        raise SkillweaveError("no runs were given; name at least one run's directory")
+    found: dict[str, Group] = {}
+    for run in runs:
+        own = facts.settings(run)
+        key = json.dumps([run.manifest.get("recipe"), own], sort_keys=True, default=str)
+        group = found.setdefault(key, Group(_letter(len(found)), _base(run), [], own))
+        for other in group.runs:
+            if other.manifest["seed"] == run.manifest["seed"]:
+                raise SkillweaveError(
+                    f"{other.path} and {run.path} have the same settings and the same seed, "
+                    f"{run.manifest['seed']}; name one of them"
+                )
+        group.runs.append(run)
+    groups = list(found.values())
+    for group in groups:
+        base = _base(group.runs[0])
+        same = [g for g in groups if _base(g.runs[0]) == base]
+        told = [f"{k} {_told(group, k)}" for k in _telling(same)]
+        group.name = ", ".join([base, *told])
+    return groups
+
+
+def differences(groups: Sequence[Group]) -> list[tuple[str, list[str]]]:
+    """Settings in which groups differ: the name, and the value of each group."""
+    names = list(dict.fromkeys(k for g in groups for k in g.settings))
+    table = [(k, [_told(g, k) for g in groups]) for k in names]
+    return [(k, values) for k, values in table if len(set(values)) > 1]
+
+
+def _told(group: Group, name: str) -> str:
+    return facts.plain(group.settings[name]) if name in group.settings else "–"
+
+
+def _base(run: RunDirectory) -> str:
+    recipe = run.manifest.get("recipe")
+    name = Path(recipe).stem if recipe else run.manifest["env"]
+    return f"{name}, plain agent" if recipe and run.manifest["kind"] == "agent" else name
+
+
+def _telling(groups: Sequence[Group]) -> list[str]:
+    """Few settings that tell the groups apart; each the one that parts them best."""
+    table = dict(differences(groups))
+    said: list[str] = []
+
+    def parts(names: Sequence[str]) -> int:
+        return len({tuple(table[k][i] for k in names) for i in range(len(groups))})
+
+    while table and parts(said) < len(groups):
+        best = max(table, key=lambda k: parts([*said, k]))  # the first of those that part as well
+        if parts([*said, best]) == parts(said):
+            break
+        said.append(best)
+    return said
+
+
+def _letter(number: int) -> str:
+    """A to Z, then A2, B2, …"""
+    turn, at = divmod(number, 26)
+    return chr(ord("A") + at) + (str(turn + 1) if turn else "")

@@ -1,0 +1,75 @@
+"""An HTML page that needs nothing but itself: the templates, the charts' library, the data."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import importlib
+import time
+from pathlib import Path
+from typing import Any
+
+from skillweave.reporting.report.film import Film
+from skillweave.runs.files import write_bytes
+from skillweave.types import MissingExtra
+
+HERE = Path(__file__).parent / "templates"
+
+
+def write_page(
+    path: Path, template: str, context: dict[str, Any], data: dict[str, Any], film: Film | None
+) -> dict[str, Any]:
+    """Fill a template and write the page, whole or not at all.
+
+    Args:
+        template: a file in ``templates``.
+        context: what its words are made of.
+        data: what its charts and timelines are made of, as plain JSON without NaN.
+
+    Returns:
+        ``path`` and ``bytes``.
+
+    Raises:
+        SkillweaveError: it cannot be written.
+        MissingExtra: the extra 'report' is not installed.
+    """
+    jinja2 = need("jinja2")
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    parts = {
+        "style": (HERE / "style.css").read_text(),
+        "script": (HERE / "page.js").read_text(),
+        "library": library(),
+        "data": data,
+        "film": None if film is None else base64.b64encode(film.data).decode(),
+        "made": time.strftime("%Y-%m-%d %H:%M"),
+    }
+    text = environment.get_template(template).render(parts | context).encode()
+    write_bytes(path, text)
+    return {"path": str(path), "bytes": len(text)}
+
+
+@functools.cache
+def library() -> str:
+    """Vega, Vega-Lite and Vega-Embed as one script, about 900 kB."""
+    bundle: str = need("vl_convert").javascript_bundle()
+    # Within a page, a script would end at these letters.
+    return bundle.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+def need(module: str) -> Any:
+    """A module of the extra 'report'.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtra("a report", "report") from error

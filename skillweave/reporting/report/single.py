@@ -1,0 +1,289 @@
+"""The report of one run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from skillweave.envs.checks import LONGEST_FILM
+from skillweave.envs.make import EnvSpec
+from skillweave.messages import whole_number
+from skillweave.reporting.lineage import read_lineage
+from skillweave.reporting.palette import RGB, color_of
+from skillweave.reporting.report import charts, facts
+from skillweave.reporting.report.calls import (
+    chosen_episodes,
+    decision_data,
+    episode_data,
+)
+from skillweave.reporting.report.curves import Curves, metrics_of, read_curves, thinned
+from skillweave.reporting.report.film import Film, make_film
+from skillweave.reporting.report.page import library, write_page
+from skillweave.reporting.report.skills_table import (
+    WHY,
+    number,
+    percent,
+    skill_rows,
+    transition_rows,
+    transitions,
+)
+from skillweave.runs.directory import RunDirectory
+from skillweave.skills.base import RecordedSkill
+from skillweave.training.call_log import CallLog
+from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
+from skillweave.training.evaluation_file import load_evaluation
+from skillweave.training.plain_agent import AGENT
+from skillweave.types import Policy, SkillweaveError
+
+EPISODES, FILMED = 20, 3
+
+
+@dataclass(frozen=True)
+class Played:
+    """Episodes that were played for a report."""
+
+    score: Evaluation
+    log: CallLog
+    film: Film | None
+    shown: list[dict[str, Any]]
+    """The episodes as plain JSON."""
+    missing: list[str]
+    """Sentences on what there is not."""
+    colors: list[RGB]
+    """Of each of the log's labels."""
+
+
+def play_episodes(
+    policy: Policy, spec: EnvSpec, episodes: int, filmed: int, seed: int, deterministic: bool
+) -> Played:
+    """Play episodes with seeds that training never used, and film some of them."""
+    log = CallLog(policy, episode_seeds(seed, episodes))
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
+    score = evaluate(policy, spec, watch=log.add, max_steps=LONGEST_FILM, **how)
+    film, missing = None, []
+    if filmed:
+        try:
+            film = make_film(spec, log.episodes, chosen_episodes(log.episodes, filmed))
+        except SkillweaveError as error:
+            missing.append(f"There is no film: {_sentence(error)}")
+    if any(isinstance(skill, RecordedSkill) for skill in log.skills):
+        missing.append(
+            "Of the calls, neither the skills' own rewards nor their successes are known, as the "
+            "run was loaded without the code of its skills: --recipe FILE.py gives it."
+        )
+    wanted = [skill.color for skill in log.skills]
+    wanted += [None] * (len(log.labels) - len(wanted))
+    colors = [color_of(i, color) for i, color in enumerate(wanted)]
+    shown, left_out = episode_data(log, film)
+    return Played(score, log, film, shown, missing + left_out, colors)
+
+
+def write_report(
+    run: RunDirectory,
+    path: Path,
+    policy: Policy | None = None,
+    spec: EnvSpec | None = None,
+    *,
+    why_not: str | None = None,
+    episodes: int = EPISODES,
+    filmed: int = FILMED,
+    seed: int = 0,
+    deterministic: bool = True,
+) -> dict[str, Any]:
+    """Write a run's report: one HTML file.
+
+    Args:
+        policy, spec: what was trained, and on what; None: no episodes are played.
+        why_not: a sentence on why there is no policy, where the run itself is finished.
+        episodes: to play, with seeds that training never used.
+        filmed: of these, so many are in the film, from the worst to the best.
+        seed: picks the episodes, as in ``evaluate``.
+        deterministic: act greedily, else sample.
+
+    Returns:
+        ``path``, ``bytes``, ``seconds``, and ``missing``: sentences on what is not in it.
+
+    Raises:
+        SkillweaveError: the run is damaged, or the file cannot be written.
+        MissingExtra: the extra 'report' is not installed.
+    """
+    began = time.perf_counter()
+    episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
+    filmed = whole_number(filmed, "films", 0)
+    library()  # a missing extra is said before anything is played
+    all_curves = read_curves(run)
+    reached = _reached(all_curves)
+    missing = facts.missing_stages(run, reached)
+    missing += [why_not] if why_not and run.finished else []
+    played = None
+    if policy is not None and spec is not None:
+        try:
+            played = play_episodes(policy, spec, episodes, filmed, seed, deterministic)
+            missing += played.missing
+        except SkillweaveError as error:
+            missing.append(f"There are no episodes and no film: {_sentence(error)}")
+    if not all_curves and run.manifest["stages"]:
+        missing.append("There are no learning curves: no metrics were written yet.")
+    colors = _colors(run, played)
+    data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
+    context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
+    context |= _lineages(run, data, colors)
+    context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
+    context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False}
+    if played is not None:
+        context |= _skills(played)
+        data |= _episodes(played)
+    film = None if played is None else played.film
+    told = write_page(path, "report.html", context, {**data, "why": WHY}, film)
+    return told | {"seconds": round(time.perf_counter() - began, 2), "missing": missing}
+
+
+def _sentence(error: SkillweaveError) -> str:
+    return f"{str(error).rstrip('.')}."
+
+
+def _reached(all_curves: Sequence[Curves]) -> dict[str, int]:
+    """By stage, the steps of the last line of its metrics."""
+    return {
+        c.stage: max(points[-1][0] for points in c.points.values()) for c in all_curves if c.points
+    }
+
+
+def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
+    """Colours by name: skills as in timelines, then the other agents that learnt."""
+    names = [skill["name"] for skill in run.manifest.get("skills", ())]
+    found = {name: color_of(i) for i, name in enumerate(names)}
+    if played is not None:
+        found |= dict(zip(played.log.labels, played.colors, strict=True))
+    for entry in run.manifest["stages"]:
+        for name in (entry["name"], *entry["learns"], *entry.get("algorithms", ())):
+            found.setdefault(name, color_of(len(found)))
+    return {name: charts.hex_of(color) for name, color in found.items()}
+
+
+def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
+    """The curves with their charts, as plain JSON."""
+    usual = charts.hex_of(color_of(1))
+    return [
+        {
+            "spec": charts.curve(c.label, colors.get(c.agent, usual)),
+            "points": {
+                metric: [[x, float(f"{y:.5g}")] for x, y in thinned(points)]
+                for metric, points in c.points.items()
+            },
+        }
+        for c in all_curves
+    ]
+
+
+def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) -> dict[str, Any]:
+    m = run.manifest
+    return {
+        "title": facts.name_of(run),
+        "kind": "hierarchy" if m["kind"] == "hierarchy" else "plain agent",
+        "env": m["env"],
+        "facts": facts.facts(run),
+        "stages": facts.stage_rows(run, reached),
+        "settings": [(k, facts.plain(v)) for k, v in facts.settings(run).items()],
+        "versions": list(m["versions"].items()),
+        "steps": sum(e.get("steps", reached.get(e["name"], 0)) for e in m["stages"]),
+        "training_seconds": sum(entry.get("seconds", 0.0) for entry in m["stages"]),
+        "missing": missing,
+        "finished": run.finished,
+    }
+
+
+def _scores(
+    run: RunDirectory, played: Played | None, seed: int, deterministic: bool
+) -> dict[str, Any]:
+    """The score and the skills' table: of the saved evaluation, or of the report's episodes."""
+    saved = load_evaluation(run)
+    score = None if played is None else played.score
+    words = _how("played for this report", seed, deterministic)
+    if saved is not None and (score is None or len(saved.evaluation.returns) > len(score.returns)):
+        score = saved.evaluation
+        words = _how("of the run's evaluation", saved.seed, saved.deterministic)
+    if score is None:
+        return {"score": None, "skill_table": [], "transitions": []}
+    told = score.to_json()
+    counts = transitions(score.skills)
+    return {
+        "score": {
+            "mean": number(told["mean"]),
+            "low": number(told["ci95"][0]),
+            "high": number(told["ci95"][1]),
+            "iqm": number(told["iqm"]),
+            "range": f"{number(told['min'])} to {number(told['max'])}",
+            "solved": percent(told["solved_fraction"]),
+            "threshold": None if score.threshold is None else f"{score.threshold:g}",
+            "length": number(told["length_mean"]),
+            "cut": told["cut"],
+            "of": f"{told['episodes']} episodes {words}",
+        },
+        "skill_table": skill_rows(score.skills),
+        "transitions": [] if counts is None else transition_rows(list(score.skills), counts),
+    }
+
+
+def _how(whose: str, seed: int, deterministic: bool) -> str:
+    return f"{whose} ({'greedy' if deterministic else 'sampled'}, seed {seed})"
+
+
+def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
+    """A section for each stage whose population evolved."""
+    sections, data["trees"] = [], []
+    for entry in run.manifest["stages"]:
+        lineage = read_lineage(run, entry["name"])
+        if lineage is None:
+            continue
+        color = colors[entry["name"]]
+        paths = charts.setting_paths(lineage, color)
+        data["trees"].append(
+            {"tree": charts.family_tree(lineage, color), "paths": [spec for _, spec in paths]}
+        )
+        line = [
+            (b.generation + 1, b.member, charts.what_changed(b), number(b.fitness))
+            for b in lineage.path(lineage.winner)
+        ]
+        names = [
+            (charts.setting_title(k), charts.short(lineage.winner.settings[k])) for k, _ in paths
+        ]
+        sections.append({"stage": entry["name"], "line": line, "settings": names})
+    return {"lineages": sections}
+
+
+def _skills(played: Played) -> dict[str, Any]:
+    """Words and tables of the episodes that were played."""
+    log = played.log
+    named = zip(log.labels, played.colors, strict=True)
+    legend = [(k, charts.hex_of(c), charts.ink_on(c)) for k, c in named]
+    return {
+        "legend": legend,
+        "episodes": len(log.episodes),
+        "filmed": 0 if played.film is None else len(played.film.first),
+        "has_skills": log.labels != (AGENT,),
+    }
+
+
+def _episodes(played: Played) -> dict[str, Any]:
+    """What the page's script shows of the episodes that were played."""
+    log = played.log
+    colors = [charts.hex_of(c) for c in played.colors]
+    found: dict[str, Any] = {
+        "labels": list(log.labels),
+        "colors": colors,
+        "inks": [charts.ink_on(c) for c in played.colors],
+        "episodes": played.shown,
+    }
+    if played.film is not None:
+        found["film"] = {"fps": played.film.fps, "every": played.film.every}
+    if log.labels != (AGENT,):
+        decisions = decision_data(log)
+        used = sorted({row[-2] for row in decisions["rows"]})
+        names = [log.labels[i] for i in used]
+        decisions["spec"] = charts.choices(names, [colors[i] for i in used])
+        found["decisions"] = decisions
+    return found

@@ -1,0 +1,272 @@
+"use strict";
+// Draws the charts and the timelines from the data in the page, and joins timelines and film.
+(() => {
+  const $ = (id) => document.getElementById(id);
+  const data = JSON.parse($("data").textContent);
+  const make = (tag, attributes = {}, ...children) => {
+    const element = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    element.append(...children);
+    return element;
+  };
+  const signed = (x) => (x > 0 ? "+" : "") + x.toLocaleString("en", { maximumFractionDigits: 2 }).replace("-", "−");
+
+  // Charts
+
+  const drawn = new Map(); // by element, how to draw it again when the colours change
+  const colours = () => {
+    const css = getComputedStyle(document.documentElement);
+    const [ink, soft, grid] = ["--ink", "--soft", "--grid"].map((k) => css.getPropertyValue(k).trim());
+    const font = getComputedStyle(document.body).fontFamily;
+    const axis = { labelColor: soft, titleColor: soft, gridColor: grid, domainColor: grid, tickColor: grid };
+    const sizes = { labelFontSize: 12, titleFontSize: 12, titleFontWeight: "normal", titlePadding: 8 };
+    return {
+      background: "transparent", font,
+      axis: { ...axis, ...sizes },
+      legend: { labelColor: ink, titleColor: soft, labelFontSize: 13, symbolSize: 90, columns: 4, labelLimit: 240 },
+      view: { stroke: null },
+      rule: { color: soft }, text: { color: ink },
+    };
+  };
+  const draw = (element, spec) => {
+    const again = async () => {
+      drawn.get(element).view?.finalize();
+      const options = { actions: false, renderer: "svg", config: colours(), tooltip: { disableDefaultStyle: true } };
+      drawn.get(element).view = (await vegaEmbed(element, structuredClone(spec), options)).view;
+    };
+    drawn.set(element, { again, view: drawn.get(element)?.view });
+    return again();
+  };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    for (const { again } of drawn.values()) again();
+  });
+
+  // Learning curves
+
+  const drawCurves = () => {
+    const metric = $("metric").value;
+    (data.curves ?? []).forEach((curve, i) => {
+      const element = $(`curve-${i}`);
+      const points = curve.points[metric];
+      element.hidden = !points;
+      element.parentElement.hidden = !points; // this agent has no such metric
+      if (!points) return;
+      const spec = structuredClone(curve.spec);
+      // A run's points are steps and a value; a group's have an interval and the group's name, too.
+      spec.data = { values: points.map(([x, y, lo, hi, what]) => ({ x, y, lo, hi, what })) };
+      // A line of one point is not to be seen.
+      if (points.length < 3) for (const { mark } of spec.layer) if (mark.type === "line") mark.point = true;
+      const title = metric.replaceAll("_", " ");
+      for (const part of [spec, ...(spec.layer ?? [])]) if (part.encoding?.y) part.encoding.y.title = title;
+      draw(element, spec);
+    });
+  };
+  if (data.curves && $("metric")) {
+    $("metric").addEventListener("change", drawCurves);
+    drawCurves();
+  }
+  (data.trees ?? []).forEach((tree, i) => {
+    draw($(`tree-${i}`), tree.tree);
+    tree.paths.forEach((spec, k) => draw($(`path-${i}-${k}`), spec));
+  });
+  for (const [id, spec] of Object.entries(data.charts ?? {})) draw($(id), spec);
+
+  // The selector's choices
+
+  const drawChoices = () => {
+    const { names, rows, spec } = data.decisions;
+    const [across, up] = [$("across"), $("up")].map((s) => Number(s.value));
+    const bySuccess = $("hue").value === "success";
+    const word = (row) => {
+      if (!bySuccess) return data.labels[row[names.length]];
+      const succeeded = row[names.length + 1];
+      return succeeded === null ? "not known" : succeeded ? "success" : "no success";
+    };
+    const values = rows.map((row) => ({ x: row[across], y: row[up], what: word(row) }));
+    const shown = structuredClone(spec);
+    shown.data = { values };
+    const titles = { x: names[across], y: names[up] };
+    shown.encoding.x.title = titles.x;
+    shown.encoding.y.title = titles.y;
+    shown.encoding.tooltip[1].title = titles.x;
+    shown.encoding.tooltip[2].title = titles.y;
+    if (bySuccess) {
+      const domain = ["success", "no success", "not known"];
+      shown.encoding.tooltip[0].title = "call";
+      shown.encoding.color.scale = { domain, range: ["#009e73", "#d55e00", "#8d8d97"] };
+      shown.encoding.shape.scale = { domain, range: ["circle", "cross", "square"] };
+    }
+    draw($("choices"), shown);
+  };
+  if (data.decisions) {
+    const { names, rows } = data.decisions;
+    $("choices-none").hidden = rows.length > 0;
+    $("choices-some").hidden = rows.length === 0;
+    if (rows.length) {
+      for (const id of ["across", "up"]) {
+        $(id).append(...names.map((name, i) => make("option", { value: i }, name)));
+        $(id).addEventListener("change", drawChoices);
+      }
+      $("up").value = Math.min(1, names.length - 1);
+      const known = rows.some((row) => row[names.length + 1] !== null);
+      $("hue").parentElement.hidden = !known;
+      $("hue").addEventListener("change", drawChoices);
+      drawChoices();
+    }
+  }
+
+  // Episodes: timelines, the chosen call, the film
+
+  if (!data.episodes) return;
+  const video = $("video");
+  const shownFirst = (e, place) => (data.episodes[0].frame === null ? place < 3 : e.frame !== null);
+  // Bars of one list have one scale.
+  const longest = [true, false].map((first) =>
+    Math.max(1, ...data.episodes.filter((e, place) => shownFirst(e, place) === first).map((e) => e.steps)));
+  const room = (name) => (name.length < 6 ? "few" : name.length < 11 ? "some" : "many");
+  const tracks = []; // by place in data.episodes: the listbox and its options
+  let chosen = { episode: -1, call: -1 };
+
+  const nameOf = (episode) => {
+    const filmed = data.episodes.filter((e) => e.frame !== null).length;
+    const place = data.episodes.indexOf(episode);
+    if (episode.frame === null || filmed < 2) return "";
+    return place === 0 ? "the worst" : place === filmed - 1 ? "the best" : filmed === 3 ? "the median" : "";
+  };
+  const words = ([skill, start, steps, why, reward, , succeeded], i) =>
+    `call ${i + 1}: ${data.labels[skill]}, from step ${start}, ${steps} steps, ended ${data.why[why] ?? "–"}, ` +
+    `reward ${signed(reward)}${succeeded === null ? "" : succeeded ? ", success" : ", no success"}`;
+
+  const timeline = (episode, place) => {
+    const called = nameOf(episode);
+    const cut = episode.cut ? ", cut before its end" : "";
+    const count = episode.calls.length === 1 ? "1 call" : `${episode.calls.length} calls`;
+    const title = make("h3", { id: `episode-${place}` }, make("strong", {}, `Episode ${episode.number}`),
+      `${called ? ` (${called})` : ""}: return ${signed(episode.return)}, ${episode.steps} steps, ${count}${cut}`);
+    const track = make("div", {
+      class: "track", role: "listbox", tabindex: 0, "aria-labelledby": `episode-${place}`,
+      "aria-orientation": "horizontal", style: `width:${(100 * episode.steps) / longest[shownFirst(episode, place) ? 0 : 1]}%`,
+    });
+    const options = episode.calls.map((call, i) => {
+      const [skill, start, steps] = call;
+      const option = make("div", {
+        class: "call", role: "option", id: `call-${place}-${i}`, "aria-selected": "false", title: words(call, i),
+        "aria-label": words(call, i),
+        style: `left:${(100 * start) / episode.steps}%;width:${(100 * steps) / episode.steps}%`,
+      }, make("span", { style: `background:${data.colors[skill]};color:${data.inks[skill]}` },
+        make("b", { class: room(data.labels[skill]) }, data.labels[skill])));
+      option.addEventListener("click", () => choose(place, i));
+      return option;
+    });
+    track.append(...options);
+    track.addEventListener("keydown", (event) => press(event, place));
+    track.addEventListener("focus", () => {
+      if (chosen.episode !== place && track.matches(":focus-visible")) choose(place, 0);
+    });
+    tracks[place] = { track, options };
+    return make("div", { class: "row" }, title, track);
+  };
+
+  const press = (event, place) => {
+    const last = data.episodes[place].calls.length - 1;
+    const at = chosen.episode === place ? chosen.call : 0;
+    const to = { ArrowLeft: at - 1, ArrowRight: at + 1, ArrowUp: at - 1, ArrowDown: at + 1, Home: 0, End: last }[event.key];
+    if (to !== undefined) choose(place, Math.min(Math.max(to, 0), last));
+    else if ((event.key === " " || event.key === "Enter") && video) video.paused ? video.play() : video.pause();
+    else return;
+    event.preventDefault();
+  };
+
+  const choose = (place, i, seek = true) => {
+    const changed = chosen.episode !== place;
+    tracks[chosen.episode]?.options[chosen.call]?.setAttribute("aria-selected", "false");
+    chosen = { episode: place, call: i };
+    const { track, options } = tracks[place];
+    options[i].setAttribute("aria-selected", "true");
+    track.setAttribute("aria-activedescendant", options[i].id);
+    const episode = data.episodes[place];
+    tell(episode, i);
+    if (changed) fillTable(place);
+    [...$("calls").tBodies[0].rows].forEach((row, k) => row.setAttribute("aria-current", String(k === i)));
+    if (seek && video && episode.frame !== null) {
+      const frame = episode.frame + Math.ceil(episode.calls[i][1] / data.film.every);
+      video.currentTime = (frame + 0.5) / data.film.fps;
+    }
+  };
+
+  const outcome = (succeeded) => (succeeded === null ? "–" : succeeded ? "yes" : "no");
+  const tell = (episode, i) => {
+    const [skill, start, steps, why, reward, own, succeeded] = episode.calls[i];
+    const chip = make("span", { class: "chip", style: `background:${data.colors[skill]}` });
+    $("call-title").replaceChildren(chip, `Call ${i + 1} of ${episode.calls.length}: ${data.labels[skill]}`);
+    const rows = [
+      ["Episode", `${episode.number}, seed ${episode.seed}`],
+      ["Steps", `${start} to ${start + steps} (${steps})`],
+      ["Ended", data.why[why] ?? "–"],
+      ["Reward", signed(reward)],
+    ];
+    if (own !== null) rows.push(["Its own reward", signed(own)]);
+    if (succeeded !== null) rows.push(["Success", outcome(succeeded)]);
+    if (video && episode.frame === null) rows.push(["Film", "this episode is not in it"]);
+    $("call").replaceChildren(...rows.map(([k, v]) => make("div", {}, make("dt", {}, k), make("dd", {}, v))));
+  };
+
+  const fillTable = (place) => {
+    const rows = data.episodes[place].calls.map(([skill, start, steps, why, reward, own, succeeded], i) => {
+      const button = make("button", { type: "button", "aria-label": `Show call ${i + 1}` }, String(i + 1));
+      button.addEventListener("click", () => choose(place, i));
+      const cell = (text, numeric) => make("td", numeric ? { class: "num" } : {}, String(text));
+      const first = make("td", { class: "num" }, button);
+      return make("tr", {}, first, cell(data.labels[skill]), cell(start, true), cell(steps, true),
+        cell(data.why[why] ?? "–"), cell(signed(reward), true), cell(own === null ? "–" : signed(own), true),
+        cell(outcome(succeeded)));
+    });
+    $("calls").tBodies[0].replaceChildren(...rows);
+  };
+
+  data.episodes.forEach((episode, place) => {
+    (shownFirst(episode, place) ? $("timelines") : $("more-timelines")).append(timeline(episode, place));
+  });
+  const more = $("more-timelines").children.length;
+  $("more").hidden = !more;
+  const without = data.episodes[0].frame === null ? "" : " without film";
+  $("more").querySelector("summary").textContent = `${more} more ${more === 1 ? "episode" : "episodes"}${without}`;
+
+  if (!video) return choose(0, 0, false);
+  const bytes = Uint8Array.from(atob($("film").textContent.trim()), (c) => c.charCodeAt(0));
+  video.src = URL.createObjectURL(new Blob([bytes], { type: "video/mp4" }));
+  const filmed = data.episodes.map((e, place) => ({ e, place })).filter(({ e }) => e.frame !== null);
+  const lastFrame = ({ e }) => e.frame + Math.ceil(e.steps / data.film.every);
+
+  // Captions say who acts, in full screen too.
+  const stamp = (frame) => new Date((1000 * frame) / data.film.fps).toISOString().slice(11, 23);
+  const cues = filmed.flatMap((f) => f.e.calls.map(([skill, start, steps]) => {
+    const [from, to] = [start, start + steps].map((s) => f.e.frame + Math.ceil(s / data.film.every));
+    return to > from ? `${stamp(from)} --> ${stamp(to)}\n${data.labels[skill]}\n` : "";
+  }));
+  const captions = new Blob([`WEBVTT\n\n${cues.filter(Boolean).join("\n")}`], { type: "text/vtt" });
+  video.append(make("track", { kind: "captions", label: "Skills", srclang: "en", src: URL.createObjectURL(captions) }));
+
+  const head = make("div", { class: "head" });
+  const follow = () => {
+    const frame = Math.floor(video.currentTime * data.film.fps + 1e-3);
+    const at = filmed.findLast(({ e }) => e.frame <= frame) ?? filmed[0];
+    const step = Math.min((frame - at.e.frame) * data.film.every, at.e.steps);
+    const over = frame >= lastFrame(at);
+    const found = at.e.calls.findLastIndex(([, start]) => start <= step);
+    const total = step === 0 ? 0 : at.e.totals[step - 1];
+    tracks[at.place].track.append(head);
+    head.style.left = `${(100 * step) / at.e.steps}%`;
+    $("now").textContent = `Episode ${at.e.number} · step ${step} of ${at.e.steps} · ` +
+      `${over ? "over" : data.labels[at.e.calls[found][0]]} · return so far ${signed(total)}`;
+    if (!video.paused && (chosen.episode !== at.place || chosen.call !== found)) choose(at.place, found, false);
+  };
+  video.addEventListener("timeupdate", follow);
+  video.addEventListener("seeked", follow);
+  const everyFrame = () => {
+    follow();
+    if (!video.paused) requestAnimationFrame(everyFrame);
+  };
+  video.addEventListener("play", everyFrame);
+  video.addEventListener("loadedmetadata", () => choose(filmed.at(-1).place, 0), { once: true });
+})();

@@ -1,0 +1,144 @@
+"""What a collector makes of a guide: masks, chances, and what is known of the next decision."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, OpenDoor, Wait, bound, got_key
+from toy_acting import Choices, requests
+
+from skillweave.collecting.acting import Acted
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.collector import side_by_side
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.guide import SMOOTHED, AskedElsewhere, Guide, as_logits
+from skillweave.collecting.lengths import Lengths
+from skillweave.envs.make import make_engine
+from skillweave.seeding import Seeds
+from skillweave.selectors import Automaton
+
+N = 3
+SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
+AUTOMATON = Automaton(
+    {"search": {"get_key", "wait"}, "unlock": ["wait", "open_door"], "free": "leave"},
+    {("search", "unlock"): got_key, ("unlock", "free"): "success"},
+)
+
+
+class Drawn(Choices):
+    """Chooses at random among what is allowed."""
+
+    def __init__(self, num_envs, actions):
+        super().__init__(num_envs, actions)
+        self.rng = np.random.default_rng(0)
+
+    def some(self, rows, obs, mask, memory):
+        action = (mask[rows] * self.rng.random(mask[rows].shape)).argmax(1)
+        return Acted(action, None, None)
+
+
+def of_state(obs):
+    """The skills that the automaton allows: here its state can be told from the observation."""
+    key, door = obs[..., KEY] == 1, obs[..., DOOR] == 1
+    return np.stack([~key, key & ~door, door, ~door], -1)
+
+
+def collector_of(guide, call_steps=2):
+    skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=call_steps)
+    acting = Drawn(N, skills.choices)
+    found = DecisionCollector(make_engine(SPEC, N), acting, skills, guide=guide)
+    found.start(Seeds(2))
+    return found
+
+
+@pytest.mark.parametrize("call_steps", [2, Lengths(1, 3)])
+def test_only_what_the_automatons_state_allows_is_called(call_steps):
+    collector, seen = collector_of(Guide(bound(AUTOMATON)), call_steps), set()
+    lengths = collector.skills.choices // 4
+    for request in itertools.islice(requests(60), 3):
+        found = collector.collect(request).experience
+        assert found.guide is None
+        valid = np.ones(found.reward.shape, bool) if found.valid is None else found.valid
+        allowed = of_state(found.obs).repeat(lengths, -1)
+        np.testing.assert_array_equal(found.obs_mask[valid], allowed[valid])
+        on = valid & ~found.terminated
+        ahead = of_state(found.next_obs).repeat(lengths, -1)
+        np.testing.assert_array_equal(found.next_obs_mask[on], ahead[on])
+        seen |= set(np.unique(found.action[valid] // lengths).tolist())
+    assert seen == {0, 1, 2, 3}
+
+
+def test_who_is_not_restricted_is_told_what_the_guide_would_do():
+    collector = collector_of(Guide(bound(AUTOMATON), restricts=False, tells=True))
+    found = collector.collect(next(requests(80))).experience
+    valid = np.ones(found.reward.shape, bool) if found.valid is None else found.valid
+    key = found.obs[..., KEY] == 1
+    starts = np.stack([key | True, key, key | True, key | True], -1)
+    np.testing.assert_array_equal(found.obs_mask[valid], starts[valid])
+    assert (found.action[valid] == 2).any(), "leave is called where the automaton would not"
+    chances = np.exp(found.guide[valid])
+    np.testing.assert_allclose(chances.sum(1), 1.0, atol=1e-6)
+    search = valid & ~key
+    expected = np.float32([0.95 / 2, 1e-8, 0, 0.95 / 2]) + np.float32([1, 0, 1, 1]) * 0.05 / 3
+    np.testing.assert_allclose(np.exp(found.guide[search])[0], expected, atol=1e-6)
+
+
+def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy():
+    skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=2)
+    for greedy in (False, True):
+        collector = DecisionCollector(
+            make_engine(SPEC, N), AskedElsewhere(N), skills,
+            guide=Guide(bound(AUTOMATON), decides=True),
+        )  # fmt: skip
+        collector.start(Seeds(2))
+        request = next(requests(80))
+        request = type(request)(80, (), request.gamma, request.seeds, greedy=greedy)
+        found = collector.collect(request).experience
+        valid = np.ones(found.reward.shape, bool) if found.valid is None else found.valid
+        taken = set(np.unique(found.action[valid & (found.obs[..., KEY] == 0)]).tolist())
+        assert taken == ({0} if greedy else {0, 3})
+
+
+def test_logits_are_smoothed_among_what_is_allowed():
+    chances = np.float32([[1, 0, 0], [0.5, 0.5, 0]])
+    may = np.array([[True, True, False], [True, True, True]])
+    found = np.exp(as_logits(chances, may))
+    assert found[0].tolist() == pytest.approx([1 - SMOOTHED / 2, SMOOTHED / 2, 0], abs=1e-6)
+    assert found[1].tolist() == pytest.approx(
+        [(1 - SMOOTHED) / 2 + SMOOTHED / 3] * 2 + [SMOOTHED / 3]
+    )
+
+
+def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts():
+    def late(step):
+        return step.elapsed == 4
+
+    clock = Automaton({"early": "get_key", "late": "wait"}, {("early", "late"): late})
+    skills = (Leave(), Wait(), type("Again", (Leave,), {"name": "get_key"})())
+    skill_set = SkillSet(skills, tuple(s.policy for s in skills), call_steps=1)
+    names = tuple(s.name for s in skills)
+    guide = Guide(bound(clock, names), decides=True)
+    collector = DecisionCollector(make_engine(SPEC, N), AskedElsewhere(N), skill_set, guide=guide)
+    collector.start(Seeds(2))
+    found = collector.collect(next(requests(60))).experience
+    for n in range(N):
+        t = 0
+        for row in np.flatnonzero(found.valid[:, n]) if found.valid is not None else range(60):
+            assert names[found.action[row, n]] == ("get_key" if t < 4 else "wait"), t
+            t = 0 if found.ended[row, n] else t + int(found.steps[row, n])
+
+
+@pytest.mark.parametrize("tells", [False, True])
+def test_collectors_agree_on_what_they_tell_also_where_no_call_has_ended(tells):
+    found = []
+    for call_steps, rows in ((30, 1), (1, 2)):
+        collector = collector_of(Guide(bound(AUTOMATON), tells=tells), call_steps)
+        if rows == 1:  # it waits for two steps
+            collector.acting.some = lambda ids, *seen: Acted(np.full(len(ids), 3), None, None)
+        found.append(collector.collect(next(requests(rows))))
+    assert not found[0].experience.valid.any(), "no call has ended"
+    joined = side_by_side(found, 1).experience
+    assert (joined.guide is not None) == tells
+    assert joined.reward.shape[1] == 2 * N

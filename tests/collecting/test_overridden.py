@@ -1,0 +1,82 @@
+"""Collectors tell in which rows a reflex acted instead of the learner."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from reference_calls import POSITION, Walk
+from test_woven import Choices, Down, Learner, N, Stay, Up, Values, asked
+from toy_acting import requests
+
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.woven import WovenCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.hierarchy.schedule import stages_of
+from skillweave.seeding import Seeds
+from skillweave.skills import Reflex
+
+
+def far(obs):
+    return obs[:, POSITION] > 1
+
+
+BACK = Reflex(far, 0)
+
+
+class Begins(Down):
+    """May start where the position is even."""
+
+    def initiation(self, obs):
+        return obs[:, POSITION] % 2 == 0
+
+
+@pytest.mark.parametrize("skill", [None, Down(), Begins()])
+def test_rows_of_a_skill_that_learns_by_itself(skill):
+    engine = make_engine(EnvSpec(Walk, engine="sync"), N)
+    collector = SkillCollector(engine, Choices(N, 3), skill, (BACK,))
+    collector.start(Seeds(0))
+    for request in itertools.islice(requests(30), 2):
+        found = collector.collect(request).experience
+        moved = found.next_obs[..., POSITION] - found.obs[..., POSITION]
+        np.testing.assert_array_equal(found.overridden, found.obs[..., POSITION] > 1)
+        own = ~found.overridden if found.valid is None else found.valid & ~found.overridden
+        np.testing.assert_array_equal(moved[own], found.action[own] - 1)
+        assert found.overridden.any()
+    without = SkillCollector(make_engine(EnvSpec(Walk, engine="sync"), N), Choices(N, 3), skill)
+    without.start(Seeds(0))
+    assert without.collect(next(requests(5))).experience.overridden is None
+
+
+def test_rows_of_skills_that_learn_under_a_selector():
+    skills = SkillSet((Up(), Down(), Stay()), (None, None, Stay.policy), (BACK,), 3)
+    engine = make_engine(EnvSpec(Walk, engine="sync"), N)
+    learners = {"up": Learner(N), "down": Learner(N), "skill_critic": Values(N)}
+    collector = WovenCollector(engine, Choices(N, 3), skills, learners)
+    collector.start(Seeds(7))
+    seen = 0
+    for request in itertools.islice(asked(40), 3):
+        *own, stream = collector.collect(request).experience.parts
+        assert stream.overridden is None
+        for rows in own:
+            moved = rows.next_obs[..., POSITION] - rows.obs[..., POSITION]
+            np.testing.assert_array_equal(rows.overridden, far(rows.obs.reshape(-1, 4)).reshape(
+                rows.overridden.shape))  # fmt: skip
+            mine = rows.valid & rows.overridden
+            assert (moved[mine] == -1).all()
+            clear = rows.valid & ~rows.overridden
+            np.testing.assert_array_equal(moved[clear], rows.action[clear] - 1)
+            seen += mine.sum()
+    assert seen > 4
+
+
+@pytest.mark.parametrize("heeded", [True, False])
+def test_reflexes_are_out_of_force_while_skills_learn_if_that_is_asked(heeded):
+    from test_together import declare
+
+    hierarchy = declare(reflexes=[BACK], reflexes_in_training=heeded)
+    (stage,) = stages_of(hierarchy)
+    skills = stage.scene(hierarchy.ready_policies()).skills
+    assert skills.reflexes == ((BACK,) if heeded else ())

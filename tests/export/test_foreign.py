@@ -1,0 +1,117 @@
+"""Networks from elsewhere act in an export as they act here, for every kind of action."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from test_networks import NESTED, one_by_one, same
+
+from skillweave import from_onnx, from_torch
+from skillweave.api.player import Player
+from skillweave.export.foreign import file_graph
+from skillweave.export.runner import Runner
+from skillweave.export.write import write_export
+
+pytest.importorskip("onnxscript")
+torch.set_num_threads(1)
+OBS = gym.spaces.Box(-3, 3, (4,), np.float64)
+SPACES: dict[str, tuple[gym.Space[Any], int]] = {  # and how many numbers the network returns
+    "Discrete": (gym.spaces.Discrete(3, start=-1), 3),
+    "MultiDiscrete": (gym.spaces.MultiDiscrete([[2, 3]]), 5),
+    "MultiBinary": (gym.spaces.MultiBinary(2), 2),
+    "Box": (gym.spaces.Box(-1, 1, (2, 1), np.float32), 2),
+}
+
+
+def linear(path: Path, outputs: int, opset: int, whole: bool = False) -> Path:
+    """An ONNX file: numbers, or the place of the largest of them."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    rng = np.random.default_rng(outputs)
+    weight = onnx.numpy_helper.from_array(rng.normal(size=(4, outputs)).astype(np.float32), "w")
+    nodes = [helper.make_node("MatMul", ["x", "w"], ["y"])]
+    found = helper.make_tensor_value_info("y", TensorProto.FLOAT, ["n", outputs])
+    if whole:
+        nodes.append(helper.make_node("ArgMax", ["y"], ["z"], axis=1, keepdims=0))
+        found = helper.make_tensor_value_info("z", TensorProto.INT64, ["n"])
+    given = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 4])
+    graph = helper.make_graph(nodes, "linear", [given], [found], [weight])
+    opsets = [helper.make_opsetid("", opset)]
+    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
+    return path
+
+
+def compare(policy: Any, folder: Path, choices: int) -> set[str]:
+    write_export(folder, policy, "toy")
+    runner, player, told = Runner(folder), Player(policy), set()
+    rng = np.random.default_rng(0)
+    for i, obs in enumerate(one_by_one(policy.observation_space, 30)):
+        mask = None
+        if choices and i % 2:
+            mask = rng.random(choices) < 0.5
+            mask[[0, choices - 1]] = True  # one of each part
+        action = player.act(obs, mask=mask)
+        assert same(runner.act(obs, mask=mask), action)
+        told.add(str(np.round(action, 4)))
+    return told
+
+
+@pytest.mark.parametrize("opset", [11, 17])
+@pytest.mark.parametrize("kind", SPACES)
+def test_a_file_acts_as_here(kind: str, opset: int, tmp_path: Path) -> None:
+    space, outputs = SPACES[kind]
+    policy = from_onnx(linear(tmp_path / "net.onnx", outputs, opset)).bind(OBS, space, "it")
+    masked = kind in ("Discrete", "MultiDiscrete")
+    assert len(compare(policy, tmp_path / "out", outputs if masked else 0)) > 1
+
+
+def test_whole_numbers_of_a_file_are_actions(tmp_path: Path) -> None:
+    space = gym.spaces.Discrete(3)
+    policy = from_onnx(linear(tmp_path / "net.onnx", 3, 17, whole=True)).bind(OBS, space, "it")
+    assert len(compare(policy, tmp_path / "out", 0)) > 1
+
+
+@pytest.mark.parametrize(("kind", "noise"), [("Discrete", "gumbel"), ("MultiBinary", "logistic")])
+def test_logits_of_a_file_are_sampled_with_the_noise_given(
+    kind: str, noise: str, tmp_path: Path
+) -> None:
+    import onnxruntime
+
+    space, outputs = SPACES[kind]
+    policy = from_onnx(linear(tmp_path / "net.onnx", outputs, 17)).bind(OBS, space, "it")
+    graph = file_graph(policy, True)
+    assert graph.noise == ((noise, outputs),)
+    session = onnxruntime.InferenceSession(graph.content)
+    feeds = {"obs": np.zeros((1, 4)), "noise.0": np.full((1, outputs), -1.0, np.float32)}
+    if kind == "Discrete":
+        feeds |= {"mask": np.ones((1, 3), bool)}
+    for best in range(outputs):
+        feeds["noise.0"][:] = -1.0
+        feeds["noise.0"][0, best] = 1.0
+        wanted = best - 1 if kind == "Discrete" else np.eye(outputs, dtype=np.int8)[best]
+        assert (session.run(["action"], feeds)[0][0] == wanted).all()
+
+
+class Sees(torch.nn.Module):
+    """Reads parts of a nested observation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = torch.nn.Linear(3, 5)
+
+    def forward(self, obs: Any) -> torch.Tensor:
+        brightness = obs["image"].mean((1, 2, 3))[:, None] / 255.0
+        return self.head(torch.cat([brightness, obs["inner"][1]], 1)) * 5.0
+
+
+def test_a_module_acts_as_here(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    space = SPACES["MultiDiscrete"][0]
+    policy = from_torch(Sees()).bind(NESTED, space, "it")
+    assert len(compare(policy, tmp_path, 5)) > 1

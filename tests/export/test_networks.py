@@ -1,0 +1,176 @@
+"""Exported networks act as the trained ones do, whatever the algorithm and the spaces."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from toys import ASKS, SHOWS
+
+from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.api.player import Player
+from skillweave.export import runner as runner_module
+from skillweave.export.graphs import agent_graph
+from skillweave.export.runner import Runner
+from skillweave.export.write import write_export
+from skillweave.seeding import Seeds
+from skillweave.skills.foreign_policy import made_up
+from skillweave.spaces import unpack
+
+pytest.importorskip("onnxscript")
+torch.set_num_threads(1)
+
+SMALL = Network((8,), cnn=CNN.small())
+REPLAY: dict[str, Any] = {"buffer_size": 100, "network": SMALL, "normalize_obs": True}
+BOX64 = gym.spaces.Box(np.array([-2.0, -np.inf]), np.array([1.0, np.inf]), dtype=np.float64)
+NESTED = gym.spaces.Dict(
+    image=gym.spaces.Box(0, 255, (5, 5, 3), np.uint8),
+    inner=gym.spaces.Tuple(
+        (gym.spaces.Discrete(3, start=1), gym.spaces.Box(-1, 1, (2,), np.float64))
+    ),
+)
+CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
+    "ppo, normalised": (PPO(network=SMALL), SHOWS["vector"], ASKS["Discrete"][0]),
+    "ppo, elu, layer norm": (
+        PPO(network=Network((8, 8), "elu", layer_norm=True)), SHOWS["discrete"], ASKS["Box"][0]
+    ),
+    "ppo squashed": (PPO(network=SMALL, squash_actions=True), SHOWS["dict"], ASKS["Box"][0]),
+    "ppo, a part without bounds": (PPO(network=SMALL), SHOWS["multi-binary"], BOX64),
+    "ppo, lstm": (
+        PPO(network=Network((8,), rnn=RNN("lstm", 4))), SHOWS["tuple"], ASKS["MultiDiscrete"][0]
+    ),
+    "ppo, gru": (
+        PPO(network=Network((8,), rnn=RNN("gru", 4))), SHOWS["vector"], ASKS["MultiBinary"][0]
+    ),
+    "ppo, nested": (PPO(network=SMALL), NESTED, ASKS["Discrete"][0]),
+    "ppo, cells": (
+        PPO(network=Network((8,), encoder="cells")), SHOWS["image, channels last"],
+        ASKS["Discrete"][0],
+    ),
+    "dqn, impala": (
+        DQN(**REPLAY | {"network": Network((8,), cnn=CNN.impala((4,)))}),
+        SHOWS["image, channels first"], ASKS["Discrete"][0],
+    ),
+    "rainbow": (DQN.rainbow(**REPLAY), SHOWS["multi-discrete"], ASKS["Discrete"][0]),
+    "td3": (TD3(**REPLAY), SHOWS["vector"], ASKS["Box"][0]),
+    "sac": (SAC(**REPLAY), SHOWS["vector"], ASKS["Box"][0]),
+    "sac, discrete": (SAC(**REPLAY), SHOWS["multi-discrete"], ASKS["Discrete"][0]),
+}  # fmt: skip
+
+
+def agent(config: AlgorithmConfig, *spaces: gym.Space[Any], seed: int = 0) -> AgentPolicy:
+    """An untrained agent whose weights and moments are far from their first values."""
+    algorithm = make_algorithm(config, *spaces)
+    policy = AgentPolicy.of(algorithm, algorithm.init([Seeds(seed)]))
+    generator = torch.Generator().manual_seed(seed)
+    weights = {}
+    for name, value in policy.weights.items():
+        noise = torch.randn(value.shape, generator=generator)
+        weights[name] = value + (0.2 if "bias" in name or "obs" in name else 1.5) * noise
+    if "obs_var" in weights:
+        weights["obs_var"] = weights["obs_var"].abs() + 0.1
+    return AgentPolicy(algorithm, weights)
+
+
+def one_by_one(space: gym.Space[Any], n: int) -> list[Any]:
+    """Observations as an environment gives them."""
+    batch = made_up(space, n)
+    return [unpack(space, batch[i]) for i in range(n)]
+
+
+def same(a: Any, b: Any) -> bool:
+    """Actions that are the same, numbers up to rounding."""
+    a, b = np.asarray(a), np.asarray(b)
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return False
+    return np.allclose(a, b, rtol=1e-4, atol=1e-5) if a.dtype.kind == "f" else bool((a == b).all())
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_a_plain_agent_acts_as_here(case: Any, tmp_path: Path) -> None:
+    config, obs_space, action_space = case
+    policy = agent(config, obs_space, action_space)
+    export = write_export(tmp_path, policy, "toy")
+    assert export.code == {}
+    written = (tmp_path / "agent.onnx").read_bytes()
+    assert b"skillweave" not in written  # no paths of the machine that wrote it
+    theirs, mine = Runner(tmp_path), Player(policy)
+    rng = np.random.default_rng(0)
+    seen = one_by_one(obs_space, 40)
+    choices = 0 if isinstance(action_space, gym.spaces.Box) else policy.algorithm.codec.size
+    told = []
+    for i, obs in enumerate(seen):
+        if i == 20:
+            theirs.reset(), mine.reset()
+        mask = None
+        if choices and i % 3 == 0:
+            mask = rng.random(choices) < 0.5
+            mask[np.cumsum([1, *policy.algorithm.codec.parts[:-1]])] = True  # one of each part
+        told.append(mine.act(obs, mask=mask))
+        assert same(theirs.act(obs, mask=mask), told[-1])
+        assert action_space.contains(told[-1])
+    assert len({str(np.round(x, 3)) for x in told}) > 1  # a constant would agree with anything
+
+
+@pytest.mark.parametrize("name", ["ppo, normalised", "rainbow", "td3"])
+def test_a_sampling_agent_takes_its_noise_as_an_input(name: str) -> None:
+    import onnxruntime
+
+    config, obs_space, action_space = CASES[name]
+    policy = agent(config, obs_space, action_space)
+    graph = agent_graph(policy, True, "it")
+    session = onnxruntime.InferenceSession(graph.content)
+    algorithm, rng = policy.algorithm, np.random.default_rng(1)
+    drawn = {"gumbel": rng.gumbel, "standard_normal": rng.standard_normal, "random": rng.random}
+    actions = []
+    for row in made_up(obs_space, 30):
+        feeds = {"obs": row[None]}
+        if graph.choices:
+            feeds["mask"] = np.ones((1, graph.choices), bool)
+        noise = [drawn[kind](size=(1, n)).astype(np.float32) for kind, n in graph.noise]
+        given = [torch.from_numpy(x) for x in noise]
+        found = session.run(None, feeds | {f"noise.{i}": x for i, x in enumerate(noise)})[0]
+        own: Any = given[0][None] if len(given) == 1 else (given[0][None], given[1])
+        obs = torch.from_numpy(row)[None, None]
+        wanted = algorithm.act(policy.params, obs, None, own, None)[0]
+        assert same(found, algorithm.to_env(wanted[0].numpy()))
+        actions.append(str(found))
+    assert len(set(actions)) > 1
+
+
+def test_an_operation_that_onnx_does_not_know_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = agent(*CASES["ppo, normalised"])
+
+    def act(*args: Any) -> Any:
+        return torch.from_numpy(np.zeros(int(args[1][0].sum().item()))), None, None
+
+    monkeypatch.setattr(policy.algorithm, "act", act)
+    with pytest.raises(SkillweaveError, match="the policy of 'land' cannot be written as ONNX"):
+        agent_graph(policy, False, "the policy of 'land'")
+
+
+def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(SkillweaveError, match=r"skillweave\[onnx\]"):
+        agent_graph(agent(*CASES["ppo, normalised"]), False, "it")
+
+
+def test_the_runner_is_short_and_needs_numpy_and_onnxruntime_alone() -> None:
+    source = Path(runner_module.__file__).read_text()
+    assert len(source.splitlines()) <= 200
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {a.name.split(".")[0] for a in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level
+            found.add((node.module or "").split(".")[0])
+    assert found - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}

@@ -1,0 +1,111 @@
+"""Acting on one observation at a time: as in evaluations, with the memory that is due."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from reference_calls import Counter, Left, Right, Walk, Zigzag, shy
+from test_networks import NESTED, agent, one_by_one
+from test_state_machine import LongWalk, nested, skill_set, trained
+
+from skillweave import PPO, EnvSpec, Hierarchy, Network, SkillweaveError, evaluate, from_function
+from skillweave.api.player import Player
+from skillweave.cli import main
+
+torch.set_num_threads(1)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [nested, lambda: trained(skill_set(Counter, Right, Zigzag, reflexes=(shy(),)))],
+    ids=["nested", "memory"],
+)
+def test_a_player_gets_the_returns_of_an_evaluation(make: Any) -> None:
+    policy = make()
+    found = evaluate(policy, EnvSpec(LongWalk), episodes=4, num_envs=2)
+    env, player, returns = LongWalk(), Player(policy), []
+    for i in range(4):
+        obs, info = env.reset(seed=1_000_000 + i)
+        player.reset()
+        reward, total, over = 0.0, 0.0, False
+        while not over:
+            action = player.act(obs, reward=reward, info=info)
+            obs, reward, terminated, truncated, info = env.step(action)
+            total, over = total + reward, terminated or truncated
+        returns.append(total)
+    assert returns == pytest.approx(found.returns, rel=1e-5)
+
+
+def test_a_run_acts_and_forgets_when_told(tmp_path: Path) -> None:
+    class Up(Counter):
+        policy = from_function(lambda obs: np.full(len(obs), 2))
+
+    class Down(Left):
+        max_steps = 3
+        policy = from_function(lambda obs: np.zeros(len(obs), np.int64))
+
+    hierarchy = Hierarchy(
+        EnvSpec(Walk, engine="sync"), [Down(), Up()],
+        selector=lambda obs, last: np.where(last.skill == 0, 1, 0),
+    )  # fmt: skip
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    obs = np.zeros(4, np.float32)
+    assert [run.act(obs) for _ in range(5)] == [0, 0, 0, 2, 2]
+    run.reset()
+    assert [run.act(obs) for _ in range(4)] == [0, 0, 0, 2]
+    other = run.player()  # has a memory of its own
+    assert [other.act(obs), run.act(obs)] == [0, 2]
+
+
+def test_parts_of_an_observation_may_come_in_any_order() -> None:
+    policy = agent(PPO(network=Network((8,))), NESTED, gym.spaces.Discrete(4))
+    player = Player(policy)
+    for obs in one_by_one(NESTED, 5):
+        turned = dict(reversed(list(obs.items())))
+        assert player.act(obs) == player.act(turned)
+
+
+def test_an_observation_of_another_shape_is_refused() -> None:
+    policy = agent(PPO(network=Network((8,))), gym.spaces.Box(-1, 1, (3,)), gym.spaces.Discrete(2))
+    with pytest.raises(SkillweaveError, match=r"shape \(2,\), not \(3,\)"):
+        Player(policy).act(np.zeros(2))
+    policy = agent(PPO(network=Network((8,))), NESTED, gym.spaces.Discrete(2))
+    with pytest.raises(SkillweaveError, match="image"):
+        Player(policy).act({"inner": (1, np.zeros(2))})
+
+
+def test_the_command_exports_and_its_runner_runs_without_the_library(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("onnxscript")
+    run = Hierarchy.pretrained("lunar-lander")
+    out = tmp_path / "out"
+    ask = ["export", "lunar-lander", "--pretrained", "-o", str(out)]
+    assert main(ask) == 1
+    assert "--onnx" in capsys.readouterr().err
+    assert main([*ask, "--onnx", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["code"] == {"engines off.condition": "observations (1, ...) to (1,) bool"}
+    obs = np.random.default_rng(0).normal(size=(30, 8)).astype(np.float32)
+    wanted = [int(run.act(x)) for x in obs]
+    program = f"""
+import sys
+sys.modules["skillweave"] = sys.modules["torch"] = None
+import numpy as np
+from runner import Runner
+landed = lambda obs: (obs[:, 6] > 0) | (obs[:, 7] > 0)
+runner = Runner(".", code={{"engines off.condition": landed}})
+print([int(runner.act(x)) for x in {obs.tolist()}])
+"""
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=out, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == wanted
+    assert len(set(wanted)) > 1

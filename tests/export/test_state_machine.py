@@ -1,0 +1,296 @@
+"""A hierarchy's state machine: the runner calls the same skills as the hierarchy, step by step."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
+from test_networks import agent
+
+from skillweave import PPO, RNN, Automaton, Lengths, Network, Reflex, SkillweaveError, tree
+from skillweave.algorithms.config import SkillCritic
+from skillweave.api.player import Player
+from skillweave.collecting.calls import SkillSet
+from skillweave.export import states
+from skillweave.export.graphs import agent_graph
+from skillweave.export.runner import Runner
+from skillweave.export.write import write_export
+from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
+from skillweave.selectors import ready_selector
+from skillweave.skills import Skill, from_onnx, from_torch
+from skillweave.types import Array, Step
+
+pytest.importorskip("onnxscript")
+torch.set_num_threads(1)
+
+
+@cache
+def traced_before(policy: Any, sampled: bool) -> Any:
+    return agent_graph(policy, sampled, "a network of these tests")
+
+
+@pytest.fixture(autouse=True)
+def traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tracing takes a second, and these policies share their networks."""
+    monkeypatch.setattr(states, "agent_graph", lambda p, sampled, _: traced_before(p, sampled))
+
+
+class LongWalk(Walk):
+    """Episodes of 30 to 60 steps, whose numbers are of about one size."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.tag, self.length = self.tag % 7, int(self.np_random.integers(30, 60))
+        return self._obs(), {}
+
+
+OBS, ACTIONS = Walk.observation_space, Walk.action_space
+
+
+@cache
+def network(choices: int, rnn: RNN | None = None, seed: int = 0) -> Any:
+    config = PPO(network=Network((8,), rnn=rnn), normalize_obs=False)
+    return agent(config, OBS, gym.spaces.Discrete(choices), seed=seed)
+
+
+class Careful(Skill):
+    """May start at even positions; stops where its last action led to an odd one."""
+
+    max_steps = 7
+    policy = scripted(lambda obs: (obs[:, T].astype(int) // 2 + obs[:, TAG].astype(int)) % 3)
+
+    def initiation(self, obs: Array) -> Array:
+        return obs[:, POSITION] % 2 == 0
+
+    def termination(self, step: Step) -> Array:
+        return step.timed_out | (step.info["t"] % 5 == 0) | (step.obs[:, T] > step.elapsed + 20)
+
+    def success(self, step: Step) -> Array:
+        return step.elapsed > 2
+
+
+class Remembers(Skill):
+    """A recurrent network."""
+
+    call_steps = 2
+    policy = network(3, RNN("gru", 4))
+
+
+class Free(Skill):
+    """A network that may start everywhere."""
+
+    policy = network(3, seed=3)
+
+
+def skill_set(*kinds: Any, call_steps: Any = 4, **more: Any) -> SkillSet:
+    skills = tuple(k() for k in kinds)
+    return SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps, **more)
+
+
+def ready(value: Any, skills: SkillSet) -> HierarchyPolicy:
+    selector = ready_selector(value, tuple(s.name for s in skills.skills))
+    assert selector is not None
+    choices = gym.spaces.Discrete(len(skills.skills))
+    return HierarchyPolicy(selector.bind(OBS, choices, "selector"), skills)
+
+
+def trained(skills: SkillSet, seed: int = 1) -> HierarchyPolicy:
+    return HierarchyPolicy(network(skills.choices, seed=seed), skills)
+
+
+def by_place(obs: Array, last: Any) -> Array:
+    """Goes on with a skill whose call succeeded."""
+    turn = (obs[:, T].astype(int) + last.why) % 3
+    again = np.where(last.succeeded & (last.skill == 1), 1, turn)
+    return np.where(obs[:, POSITION] % 2 == 0, again, 2 * (turn > 0))  # where it may start
+
+
+def far(step: Step) -> Array:
+    return np.abs(step.next_obs[:, POSITION]) + step.reward * 0 > 2
+
+
+def nested() -> HierarchyPolicy:
+    inner = trained(skill_set(Left, Careful, Zigzag, call_steps=3, reflexes=(shy(),)))
+
+    class Inner(Skill):
+        max_steps = 5
+        policy = inner
+
+    return trained(skill_set(Inner, Zigzag, call_steps=8), seed=5)
+
+
+def interrupted() -> HierarchyPolicy:
+    algorithm = SkillCritic(network=Network((8,)), normalize_obs=False)
+    critic = agent(algorithm, OBS, gym.spaces.Discrete(3), seed=2)
+    skills = with_interruption(skill_set(Careful, Left, Free, call_steps=9), critic, 0.5)
+    return trained(skills)
+
+
+AUTOMATON = Automaton(
+    {"near": ["careful", "left"], "far": "zigzag", "home": ["right", "zigzag"]},
+    {("near", "far"): far, ("far", "home"): "failure", ("home", "near"): "success",
+     ("home", "far"): "failure"},
+)  # fmt: skip
+POLICIES: dict[str, Any] = {
+    "initiation and termination": lambda: trained(skill_set(Careful, Right, Free)),
+    "lengths": lambda: trained(skill_set(Left, Right, Free, call_steps=Lengths(1, 3, 8)), 4),
+    "memories": lambda: trained(skill_set(Remembers, Left, Free), 2),
+    "reflexes": lambda: trained(skill_set(
+        Left, Zigzag, Free,
+        reflexes=(shy(), Reflex(lambda o: o[:, T] % 4 == 1, lambda o: o[:, T].astype(int) % 3)),
+    )),
+    "nested": nested,
+    "interrupted": interrupted,
+    "an automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
+    "a function": lambda: ready(by_place, skill_set(Left, Careful, Zigzag, call_steps=5)),
+}  # fmt: skip
+
+
+def code_of(policy: HierarchyPolicy, prefix: str = "") -> dict[str, Any]:
+    """All functions that a policy has, under the names of the export."""
+    found: dict[str, Any] = {}
+    for skill, own in zip(policy.skills.skills, policy.skills.policies, strict=True):
+        name = f"{prefix}{skill.name}"
+        for method in ("initiation", "termination", "success"):
+            found[f"{name}.{method}"] = getattr(skill, method)
+        found[f"{name}.policy"] = getattr(own, "function", None)
+        if isinstance(own, HierarchyPolicy):
+            found |= code_of(own, f"{name}/")
+    for reflex in policy.skills.reflexes:
+        found[f"{prefix}{reflex.name}.condition"] = reflex.condition
+        found[f"{prefix}{reflex.name}.action"] = reflex.action
+    found[f"{prefix}selector"] = getattr(policy.selector, "function", None)
+    found[f"{prefix}selector.far"] = far
+    return found
+
+
+def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple[int, int, bool]]:
+    """Whole episodes, in which both act alike; of each step the skill, the action, a decision."""
+    env, player, told = LongWalk(), Player(policy), []
+    for episode in range(episodes):
+        obs, info = env.reset(seed=episode)
+        player.reset(), runner.reset()
+        reward, over = 0.0, False
+        while not over:
+            action = player.act(obs, reward=reward, info=info)
+            assert runner.act(obs, reward=reward, info=info) == action
+            memory = player.memory
+            assert runner.root.skill == memory["skill"][0]
+            told.append((int(memory["skill"][0]), int(action), memory["elapsed"][0] == 0))
+            obs, reward, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+    return told
+
+
+@pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES)
+def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
+    policy = make()
+    export = write_export(tmp_path, policy, "walk")
+    code = {k: v for k, v in code_of(policy).items() if k in export.code}
+    told = played(policy, Runner(tmp_path, code), 6)
+    skills, actions, decisions = (set(x) for x in zip(*told, strict=True))
+    assert len(skills) > 1  # so that choices are compared, and calls of several steps
+    assert len(actions) > 1
+    assert decisions == {True, False}
+
+
+def test_why_calls_are_interrupted_is_the_same(tmp_path: Path) -> None:
+    policy = interrupted()
+    export = write_export(tmp_path, policy, "walk")
+    runner = Runner(tmp_path, {k: v for k, v in code_of(policy).items() if k in export.code})
+    env, player, whys = LongWalk(), Player(policy), set()
+    obs, info = env.reset(seed=1)
+    for _ in range(29):
+        assert player.act(obs, info=info) == runner.act(obs, info=info)
+        obs, _, _, _, info = env.step(1)
+        seen = runner.root
+        whys.add((seen.why, seen.skill))
+    assert len(whys) > 1
+
+
+def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
+    policy = trained(skill_set(Careful, Left, Free, reflexes=(shy(),)))
+    export = write_export(tmp_path, policy, "walk")
+    needs = {"careful.initiation", "careful.termination", "careful.policy", "left.policy"}
+    assert set(export.code) == needs | {"shy.condition"}
+    assert "'shy.condition': observations (1, ...) to (1,) bool" in str(export)
+    with pytest.raises(ValueError, match=r"shy\.condition.*observations .* bool"):
+        Runner(tmp_path)
+    given = {"careful.policy": lambda o: [1], "left.policy": lambda o: [0]}
+    assert Runner(tmp_path, given, policy.skills).root is not None  # has skills and reflexes
+
+
+def test_two_functions_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    twice = tuple(Reflex(lambda o, i=i: o[:, T] == i, action=i) for i in range(2))
+    export = write_export(tmp_path, trained(skill_set(Free, Free, reflexes=twice)), "walk")
+    assert set(export.code) == {"<lambda>.condition", "<lambda>.condition#2"}
+
+
+def test_what_cannot_be_exported_says_what_to_do(tmp_path: Path) -> None:
+    policy = trained(skill_set(Counter, Left))
+    with pytest.raises(SkillweaveError, match=r"policy of 'counter'.*memory.*train the skill"):
+        write_export(tmp_path, policy, "walk")
+    chosen = ready(tree.Fallback("free", "left"), skill_set(Left, Free))
+    with pytest.raises(SkillweaveError, match=r"selector is a tree.*Automaton"):
+        write_export(tmp_path, chosen, "walk")
+    assert not list(tmp_path.iterdir())
+
+
+def linear_file(path: Path) -> Path:
+    """An ONNX file of float64 logits, as another framework may write it."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    weight = onnx.numpy_helper.from_array(np.random.default_rng(0).normal(size=(4, 3)), "w")
+    given, found = (
+        [helper.make_tensor_value_info(name, TensorProto.DOUBLE, ["n", size])]
+        for name, size in (("x", 4), ("y", 3))
+    )
+    graph = helper.make_graph([helper.make_node("MatMul", ["x", "w"], ["y"])], "linear", given,
+                              found, [weight])  # fmt: skip
+    opset = [helper.make_opsetid("", 17)]
+    onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=9), path)
+    return path
+
+
+def test_networks_from_elsewhere_are_exported_too(tmp_path: Path) -> None:
+    from torch import nn
+
+    torch.manual_seed(0)
+    module = nn.Sequential(nn.Linear(4, 8), nn.Tanh(), nn.Linear(8, 3)).eval()
+    file = linear_file(tmp_path / "net.onnx")
+
+    class Module(Skill):
+        policy = from_torch(module).bind(OBS, ACTIONS, "module")
+
+    class File(Skill):
+        policy = from_onnx(file).bind(OBS, ACTIONS, "file")
+
+    policy = trained(skill_set(Module, File, Free))
+    export = write_export(tmp_path / "out", policy, "walk")
+    assert export.code == {}
+    assert len({skill for skill, _, _ in played(policy, Runner(tmp_path / "out"), 4)}) > 1
+    runner, player = Runner(tmp_path / "out"), Player(policy)
+    with_mask = np.array([False, True, True])
+    for obs in np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32):
+        assert runner.act(obs, mask=with_mask) == player.act(obs, mask=with_mask) != 0
+
+
+def test_skills_that_sample_draw_as_often_as_their_network_says(tmp_path: Path) -> None:
+    policy = trained(skill_set(Free, greedy=False))
+    export = write_export(tmp_path, policy, "walk")
+    told = json.loads((tmp_path / "policy.json").read_text())
+    assert told["policy"]["skills"][0]["policy"]["noise"] == [["gumbel", 3]]
+    assert export.files == ("selector.onnx", "free.onnx", "policy.json", "runner.py")
+    obs, runner = np.array([1.0, 0.5, 2.0, 0.0], np.float32), Runner(tmp_path, seed=0)
+    head = Free.policy.heads(obs[None])[0]
+    wanted = np.exp(head - head.max()) / np.exp(head - head.max()).sum()
+    drawn = np.bincount([runner.act(obs) for _ in range(2000)], minlength=3) / 2000
+    np.testing.assert_allclose(drawn, wanted, atol=4 * np.sqrt(0.25 / 2000))

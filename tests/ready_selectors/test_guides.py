@@ -1,0 +1,336 @@
+"""Skills that learn under a ready selector, and selectors that learn with a guide."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from ready_selectors import chain
+from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, got_key, has_key
+from test_resume import assert_same, lines, stopped_run
+from test_together import SMALL
+
+from skillweave import (
+    DQN,
+    PPO,
+    Automaton,
+    Evolution,
+    Hierarchy,
+    LastCall,
+    Lengths,
+    Skill,
+    SkillweaveError,
+    Step,
+    Together,
+    evaluate,
+    tree,
+)
+from skillweave.runs.directory import RunDirectory
+
+ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
+OFF = DQN(
+    num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
+)
+
+
+class GetKey(Skill):
+    """Learns to get the key."""
+
+    max_steps = 8
+
+    def reward(self, step):
+        return step.obs[:, PLACE] - step.next_obs[:, PLACE]
+
+    def termination(self, step):
+        return step.next_obs[:, KEY] == 1
+
+
+class Open(Skill):
+    """Learns to open the door; it may start with the key only."""
+
+    max_steps = 8
+
+    def initiation(self, obs):
+        return obs[:, KEY] == 1
+
+    def reward(self, step):
+        return step.next_obs[:, PLACE] - step.obs[:, PLACE]
+
+    def termination(self, step):
+        return step.next_obs[:, DOOR] == 1
+
+    def success(self, step):
+        return step.next_obs[:, DOOR] == 1
+
+
+class Leave(Skill):
+    """Is ready: a step to the right."""
+
+    max_steps = 1
+
+    def policy(self, obs):
+        return np.full(len(obs), 2)
+
+
+class Wait(Skill):
+    """Is ready: nothing."""
+
+    max_steps = 2
+
+    def policy(self, obs):
+        return np.ones(len(obs), int)
+
+
+AUTOMATON = Automaton(
+    {"search": {"get_key", "wait"}, "unlock": ["open", "wait"], "free": "leave"},
+    {("search", "unlock"): got_key, ("unlock", "free"): "success"},
+)
+
+
+def by_rule(obs):
+    with_key = np.where(obs[:, DOOR] == 1, "leave", "open")
+    return np.where(obs[:, KEY] == 1, with_key, "get_key")
+
+
+TREE = tree.Sequence(tree.Fallback(has_key, "get_key"), "open", "leave")
+READY = {"automaton": AUTOMATON, "function": by_rule, "tree": TREE}
+
+
+def declare(*skills, **how):
+    options: dict[str, Any] = {
+        "env": SPEC,
+        "skills": skills or [GetKey(), Open(), Leave(), Wait()],
+        "call_steps": 4,
+        "algorithm": ON,
+        "selector": ON,
+        "skill_steps": 300,
+        "selector_steps": 400,
+        "together_steps": 900,
+        "cut_every": 150,
+    }
+    return Hierarchy(**options | how)
+
+
+KINDS = {
+    "automaton": lambda: declare(
+        selector=AUTOMATON, learn="together", together=Together(task_weight=0.5)
+    ),
+    "function": lambda: declare(selector=by_rule, learn="together", algorithm=OFF),
+    "tree, then": lambda: declare(selector=TREE, learn="apart, then together"),
+    "restricted": lambda: declare(guide=AUTOMATON, learn="together"),
+    "restricted, from replay": lambda: declare(guide=AUTOMATON, selector=OFF, selector_steps=900),
+    "near a tree": lambda: declare(guide=TREE, guide_restricts=False, guide_nats=0.05),
+    "near and restricted, then": lambda: declare(
+        guide=AUTOMATON, guide_nats=0.1, learn="apart, then together", call_steps=Lengths(1, 4)
+    ),
+    "lengths by a rule": lambda: declare(guide=by_rule, call_steps=Lengths(1, 2, 4)),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run of each kind, made once."""
+    made: dict[str, Any] = {}
+
+    def make(kind):
+        if kind not in made:
+            path = tmp_path_factory.mktemp("whole") / "run"
+            made[kind] = KINDS[kind]().train(path, seed=3, quiet=True), path
+        return made[kind]
+
+    return make
+
+
+STOPS = [(kind, tick) for kind in KINDS for tick in (3, 5, 22) if tick < 20 or "then" in kind]
+
+
+@pytest.mark.parametrize(("kind", "tick"), STOPS)
+def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, tick):
+    run = stopped_run(KINDS[kind](), tmp_path / "run", tick)
+    assert not run.finished
+    KINDS[kind]().resume(run.path, quiet=True)
+    assert_same(run.path, whole(kind)[1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
+    run, path = whole(kind)
+    scores = run.evaluate(6)
+    assert KINDS[kind]().load(path).evaluate(6) == scores
+    run.save_weights(tmp_path / "weights")
+    assert KINDS[kind]().load_weights(tmp_path / "weights").evaluate(6) == scores
+    assert evaluate(run.policy, SPEC, episodes=6, num_envs=1) == scores
+
+
+def test_skills_learn_where_a_ready_selector_calls_them(whole):
+    _, path = whole("automaton")
+    (entry,) = RunDirectory.open(path).manifest["stages"]
+    assert entry["learns"] == ["get_key", "open", "skill_critic"]
+    told = [name for line in lines(path) for name in line]
+    assert "get_key.samples" in told
+    assert not any(name.startswith("selector.") for name in told)
+
+
+def test_skills_that_learn_under_a_ready_selector_solve_the_corridor(tmp_path):
+    skilled = declare(
+        selector=AUTOMATON, learn="together", together_steps=12_000, cut_every=100_000,
+        algorithm=PPO(num_envs=8, n_steps=32, batch_size=64, network=SMALL, learning_rate=3e-3),
+    )  # fmt: skip
+    assert skilled.train(tmp_path / "run", seed=0, quiet=True).evaluate(30).mean > 0.9
+
+
+def calls_of(policy, guide, seeds=6):
+    """(state of the automaton at each decision, the skill that was called)."""
+    found = []
+    for seed in range(seeds):
+        env = Corridor()
+        obs, _ = env.reset(seed=seed)
+        memory = policy.start(1)
+        for t in range(40):
+            decides = memory["why"][0] != 0
+            state = guide.state_names[int(memory["guide.state"][0])]
+            action, memory = policy.act(memory, obs[None], deterministic=False)
+            if decides:
+                found.append((state, policy.labels[int(memory["skill"][0])]))
+            before = obs
+            obs, reward, terminated, truncated, _ = env.step(int(action[0]))
+            memory = policy.observe(memory, Step(
+                before[None], action, obs[None], np.float32([reward]), np.array([terminated]),
+                np.array([truncated]), np.zeros(1, bool), np.array([t + 1]), {},
+            ))  # fmt: skip
+            if terminated or truncated:
+                break
+    return found
+
+
+CHAIN = Automaton(
+    {"search": {"get_key", "wait"}, "unlock": ["open_door", "wait"], "free": "leave"},
+    {("search", "unlock"): got_key, ("unlock", "free"): "success"},
+)
+
+
+@pytest.mark.parametrize("selector", [ON, OFF])
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_a_restricted_selector_calls_nothing_else_also_when_it_is_trained(
+    selector, learn, tmp_path
+):
+    skills = [chain.GetKey(), chain.OpenDoor(), chain.Leave(), chain.Wait()]
+    run = declare(*skills, guide=CHAIN, selector=selector, learn=learn).train(
+        tmp_path / "run", quiet=True
+    )
+    calls = calls_of(run.policy, CHAIN)
+    for state, skill in calls:
+        assert skill in CHAIN.states[state]
+    if selector is ON:  # a DQN that waits once waits for ever
+        assert {state for state, _ in calls} == {"search", "unlock", "free"}
+        assert run.evaluate(40, deterministic=False).mean > 0.5
+
+
+def test_a_selector_near_its_guide_does_what_the_guide_does(tmp_path):
+    def shares(**how):
+        # What the task pays says nothing here: no call is worth more than another.
+        skills = [Wait(), type("Other", (Wait,), {"name": "other"})()]
+        hierarchy = Hierarchy(
+            SPEC, skills, selector=PPO(num_envs=4, n_steps=32, network=SMALL, learning_rate=1e-2),
+            selector_steps=6_000, call_steps=2, cut_every=100_000, **how,
+        )  # fmt: skip
+        run = hierarchy.train(tmp_path / str(len(how)), seed=1, quiet=True)
+        told = [line for line in lines(run.path) if "anchor_kl" in line]
+        found = run.evaluate(20, deterministic=False).skill_steps
+        return found["other"] / sum(found.values()), told
+
+    free, told = shares()
+    assert not told
+    near, told = shares(guide=lambda obs: ["other"] * len(obs), guide_restricts=False,
+                        guide_nats=0.02)  # fmt: skip
+    assert near > 0.8 > free
+    assert told[-1]["anchor_kl"] < 0.2 * told[0]["anchor_kl"]
+
+
+def test_a_function_that_is_told_of_calls_hears_of_those_that_were_made(tmp_path):
+    heard = []
+
+    def follow(obs, last: LastCall):
+        heard.append(last.skill.copy())
+        return np.zeros(len(obs), int)
+
+    declare(guide=follow, guide_restricts=False, guide_nats=1.0, skill_steps=64).train(
+        tmp_path / "run", quiet=True
+    )
+    assert len(np.unique(np.concatenate(heard))) > 2
+
+
+def test_a_population_of_restricted_selectors_evolves(tmp_path):
+    skills = [
+        Leave(),
+        Wait(),
+        type("Back", (Wait,), {"policy": lambda s, obs: np.zeros(len(obs), int)})(),
+    ]
+    for skill in skills:
+        skill.max_steps = 2
+    guide = Automaton({"a": {"back"}, "b": {"leave", "wait"}}, {("a", "b"): got_key})
+    hierarchy = declare(*skills, guide=guide, selector_steps=400)
+    evolve = {"selector": Evolution(population=2, generations=2, episodes=2)}
+    run = hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
+    for state, skill in calls_of(run.policy, guide):
+        assert skill in guide.states[state]
+    near = declare(*skills, guide=guide, guide_nats=0.1)
+    with pytest.raises(SkillweaveError, match="not kept near a guide"):
+        near.train(tmp_path / "near", quiet=True, evolve=evolve)
+
+
+WRONG: dict[str, dict[str, Any]] = {
+    "guide is 3; it must be a function": {"guide": 3},
+    "guide_nats is -1": {"guide": AUTOMATON, "guide_nats": -1},
+    "guide_nats is 'x'; it must be a number": {"guide": AUTOMATON, "guide_nats": "x"},
+    "the guide has no effect": {"guide": AUTOMATON, "guide_restricts": False},
+    "only PPO can be kept near": {"guide": AUTOMATON, "guide_nats": 0.1, "selector": OFF},
+    "has nothing to choose": {"guide": by_rule},
+    "says only at decisions": {
+        "guide": by_rule, "call_steps": Lengths(1, 2), "selector": OFF
+    },
+    "the guide restricts which skill": {"guide": AUTOMATON, "interrupt": True},
+    "a guide is given, but the selector is ready": {"guide": TREE, "selector": by_rule},
+    "names 'fly', which is no skill": {"guide": Automaton({"a": "fly"}, {})},
+    "nobody learns": {"skills": [Leave(), Wait()], "selector": by_rule, "learn": "together"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("says", WRONG)
+def test_a_wrong_declaration_is_told(says):
+    with pytest.raises(SkillweaveError, match=says):
+        declare(**WRONG[says])
+
+
+def test_a_guide_that_fails_is_told_before_anything_is_trained(tmp_path):
+    def wrong(obs):
+        return np.full(len(obs), 9)
+
+    hierarchy = declare(guide=wrong, guide_restricts=False, guide_nats=0.1)
+    with pytest.raises(SkillweaveError, match=r"guide: function wrong\(\) returned 9"):
+        hierarchy.train(tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_with_another_guide_is_refused(whole, tmp_path):
+    run, path = whole("restricted")
+    weights = run.save_weights(tmp_path / "weights")
+    other = Automaton({"a": "wait"}, {})
+    for declared, message in (
+        (declare(learn="together"), "has a guide, but that of this hierarchy has no guide"),
+        (declare(learn="together", guide=other), "another checksum"),
+    ):
+        with pytest.raises(SkillweaveError, match=message):
+            declared.load(path)
+        with pytest.raises(SkillweaveError, match=message):
+            declared.load_weights(weights)
+    plain = declare().train(tmp_path / "plain", quiet=True)
+    with pytest.raises(SkillweaveError, match="has no guide, but that of this hierarchy has a"):
+        declare(guide=AUTOMATON).load(plain.path)
+
+
+def test_no_skill_of_a_state_may_start(tmp_path):
+    stuck = Automaton({"search": "open", "x": "wait"}, {})
+    with pytest.raises(SkillweaveError, match=r"'search' none of its skills \(open\) may start"):
+        declare(guide=stuck, learn="together").train(tmp_path / "run", quiet=True)

@@ -1,0 +1,236 @@
+"""Reports in a real browser: no errors, no network, the film follows clicks and keys, axe."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from reporting.walkway import CALLS, declare
+
+from skillweave.cli import main
+from skillweave.reporting.report.compare import write_comparison
+from skillweave.reporting.report.film import HOLD
+from skillweave.reporting.report.single import write_report
+from skillweave.runs.directory import RunDirectory
+
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser here: apt-get install chromium")
+pytest.importorskip("vl_convert")
+pytest.importorskip("imageio_ffmpeg")
+playwright = pytest.importorskip("playwright.sync_api")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+
+RECIPE = """
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill
+
+class Left(Skill):
+    max_steps = 10
+    def success(self, step):
+        return step.next_obs[:, 0] < 0
+
+class Balance(Skill):
+    pass
+
+small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
+hierarchy = Hierarchy(
+    env=EnvSpec("CartPole-v1", engine="sync"), skills=[Left(), Balance()], call_steps=5,
+    algorithm=small, selector=small, skill_steps=512, selector_steps=512,
+)
+"""
+EVOLVE = ("left.population=2", "left.generations=2", "left.episodes=1")
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A report by hand, one of a run with a population, one unfinished, and a comparison."""
+    folder = tmp_path_factory.mktemp("pages")
+    run = declare().train(folder / "walk", quiet=True)
+    found = {k: folder / f"{k}.html" for k in ("walk", "evolved", "unfinished", "comparison")}
+    how: dict[str, Any] = {"episodes": 5, "filmed": 2}
+    opened = RunDirectory.open(folder / "walk")
+    write_report(opened, found["walk"], run.policy, run.declaration.spec, **how)
+    recipe = folder / "cart.py"
+    recipe.write_text(RECIPE)
+    train = ["train", str(recipe), "--quiet", "--evaluate", "3", "-o"]
+    evolve = [word for setting in EVOLVE for word in ("--evolve", setting)]
+    assert main([*train, str(folder / "evolved"), *evolve]) == 0
+    for name, words in (("a", ()), ("b", ("--seed", "1")), ("c", ("--set", "call_steps=3"))):
+        assert main([*train, str(folder / name), *words]) == 0
+    words = [folder / "evolved", "-o", found["evolved"], "--recipe", recipe, "--episodes", 4]
+    assert main(["report", *map(str, words)]) == 0
+    write_comparison([RunDirectory.open(folder / n) for n in "abc"], found["comparison"])
+    stopped = RunDirectory.open(folder / "c")
+    stopped.stage("selector")["status"] = "training"
+    stopped.save()
+    write_report(stopped, found["unfinished"])
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        chromium = started.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+class Opened:
+    """A page with all that its console said and all that it asked for."""
+
+    def __init__(self, browser: Any, path: Path, width: int = 1000, scheme: str = "light") -> None:
+        size = {"width": width, "height": 800}
+        self.page = browser.new_page(viewport=size, color_scheme=scheme)
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(path.as_uri())
+        # All charts that are to be seen are drawn.
+        charts = "[...document.querySelectorAll('.chart:not([hidden])')]"
+        self.page.wait_for_function(f"{charts}.every(chart => chart.querySelector('svg'))")
+        self.own = path.as_uri()
+
+    def foreign(self) -> list[str]:
+        """What was asked of anyone but the file itself."""
+        return [url for url in self.asked if url != self.own and not url.startswith("blob:")]
+
+
+@pytest.fixture
+def film(browser: Any, pages: dict[str, Path]) -> Iterator[Any]:
+    """The page made by hand, its film ready."""
+    opened = Opened(browser, pages["walk"])
+    opened.page.wait_for_function("document.getElementById('video').readyState >= 2")
+    yield opened.page
+    assert (opened.said, opened.foreign()) == ([], [])
+    opened.page.close()
+
+
+def shown_frame(page: Any) -> float:
+    page.wait_for_function("!document.getElementById('video').seeking")
+    at: float = page.evaluate("document.getElementById('video').currentTime")
+    return at * 10 - 0.5  # ten frames a second; the middle of one
+
+
+def selected(page: Any) -> list[str]:
+    found: list[str] = page.eval_on_selector_all(
+        "[aria-selected=true]", "all => all.map(e => e.id)"
+    )
+    return found
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", ["walk", "evolved", "unfinished", "comparison"])
+def test_it_opens_without_errors_and_network_at_any_width(
+    browser: Any, pages: dict[str, Path], name: str, scheme: str
+) -> None:
+    opened = Opened(browser, pages[name], 1000, scheme)
+    for width in (400, 700, 1000, 2000):
+        opened.page.set_viewport_size({"width": width, "height": 800})
+        opened.page.wait_for_timeout(100)  # charts follow their frames
+        assert opened.page.evaluate("document.documentElement.scrollWidth") <= width
+        for summary in opened.page.query_selector_all(
+            "details:not([open]):not([hidden]) > summary"
+        ):
+            summary.click()
+        assert opened.page.evaluate("document.documentElement.scrollWidth") <= width
+        if width == (400 if scheme == "light" else 1000):
+            found = axe.Axe().run(opened.page).response["violations"]
+            serious = [(v["id"], [n["html"][:80] for n in v["nodes"]]) for v in found]
+            assert serious == []
+    assert (opened.said, opened.foreign()) == ([], [])
+    opened.page.close()
+
+
+def test_the_film_jumps_to_the_call_that_is_clicked(film: Any) -> None:
+    for place, first in ((0, 0), (1, 5 + HOLD)):
+        for i, (skill, start, steps, *_) in enumerate(CALLS):
+            film.click(f"#call-{place}-{i}")
+            assert selected(film) == [f"call-{place}-{i}"]
+            # A frame stands for two steps; that of the first step of the call, or the one after.
+            assert shown_frame(film) == pytest.approx(first + -(-start // 2))
+            told = film.inner_text("#call-title"), film.inner_text("#call")
+            assert told[0] == f"Call {i + 1} of 4: {('go', 'stay')[skill]}"
+            assert f"{start} to {start + steps} ({steps})" in told[1]
+    film.wait_for_function("document.getElementById('now').textContent.includes('return so far +')")
+    # The last call of the second episode begins at step 7, which no frame shows; 8 is in one.
+    assert "step 8 of 9 · go · return so far +21" in film.inner_text("#now")
+
+
+def test_the_picture_is_that_of_the_step(film: Any) -> None:
+    red = """() => {
+        const video = document.getElementById('video'), canvas = document.createElement('canvas');
+        canvas.width = video.videoWidth; canvas.height = video.videoHeight;
+        const context = canvas.getContext('2d'); context.drawImage(video, 0, 0);
+        const row = context.getImageData(0, canvas.height / 2, canvas.width, 1).data;
+        let count = 0;
+        for (let i = 0; i < row.length; i += 4) count += row[i] > 120 && row[i + 1] < 100;
+        return count / canvas.width;
+    }"""
+    # At steps 0, 2, 6 (a frame for two steps) and 8 the walker stands at metre 0, 2, 3 and 5.
+    for i, metres in enumerate((0, 2, 3, 5)):
+        film.click(f"#call-0-{i}")
+        shown_frame(film)
+        film.wait_for_timeout(100)
+        assert film.evaluate(red) == pytest.approx(metres / 6, abs=0.03)
+
+
+def test_keys_go_from_call_to_call_and_play(film: Any) -> None:
+    film.focus("#timelines .track")
+    for key, call in (
+        ("Home", 0),
+        ("ArrowRight", 1),
+        ("End", 3),
+        ("ArrowRight", 3),
+        ("ArrowLeft", 2),
+    ):
+        film.keyboard.press(key)
+        assert selected(film) == [f"call-0-{call}"]
+    assert shown_frame(film) == pytest.approx(3)
+    film.keyboard.press("Space")
+    film.wait_for_function("!document.getElementById('video').paused")
+    # It plays on into the next call, and the timeline follows.
+    film.wait_for_function("document.querySelector('[aria-selected=true]').id === 'call-0-3'")
+    film.keyboard.press("Space")
+    film.wait_for_function("document.getElementById('video').paused")
+
+
+def test_an_episode_without_film_is_told_and_the_film_stays(film: Any) -> None:
+    film.click("#more summary")
+    film.click("#call-0-1")
+    before = shown_frame(film)
+    film.click("#call-3-2")
+    assert shown_frame(film) == before
+    assert "this episode is not in it" in film.inner_text("#call")
+    film.click("#table summary")
+    film.click("#calls button[aria-label='Show call 4']")
+    assert selected(film) == ["call-3-3"]
+    cells = film.eval_on_selector_all(
+        "#calls tbody tr:nth-child(4) td", "all => all.map(e => e.innerText)"
+    )
+    assert cells == ["4", "go", "7", "2", "with the episode", "+11", "+4", "yes"]
+
+
+def test_charts_follow_what_is_chosen(browser: Any, pages: dict[str, Path]) -> None:
+    page = Opened(browser, pages["evolved"]).page
+    page.select_option("#up", label="obs[2]")
+    page.wait_for_function("document.getElementById('choices').textContent.includes('obs[2]')")
+    page.select_option("#hue", "success")
+    page.wait_for_function("document.getElementById('choices').textContent.includes('no success')")
+    page.locator("#curve-2 svg").scroll_into_view_if_needed()
+    page.hover("#curve-2 svg", position={"x": 150, "y": 60})
+    page.wait_for_selector("#vg-tooltip-element.visible")
+    assert "environment steps" in page.inner_text("#vg-tooltip-element")
+    page.select_option("#metric", "entropy")
+    page.wait_for_function("document.getElementById('curve-0').textContent.includes('entropy')")
+    ink = "getComputedStyle(document.querySelector('#choices .role-axis-label text')).fill"
+    light = page.evaluate(ink)
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_function(f"{ink} !== {json.dumps(light)}")
+    page.close()

@@ -1,0 +1,293 @@
+"""What reports show: calls by hand, transitions, films, seeds, groups, what is missing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from reporting.walkway import CALLS, Moody, Walkway, declare
+
+from skillweave import EnvSpec, SkillweaveError
+from skillweave.cli import main
+from skillweave.reporting.report import calls, charts
+from skillweave.reporting.report.curves import read_curves, thinned
+from skillweave.reporting.report.film import HOLD, make_film
+from skillweave.reporting.report.group_charts import scores
+from skillweave.reporting.report.groups import grouped
+from skillweave.reporting.report.seeds import on_one_grid, over_seeds
+from skillweave.reporting.report.skills_table import transition_rows, transitions
+from skillweave.runs.directory import RunDirectory
+from skillweave.training.call_log import CallLog, EpisodeLog
+from skillweave.training.evaluation import episode_seeds, evaluate
+
+RECIPE = """
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill
+
+class Left(Skill):
+    max_steps = 10
+    def reward(self, step):
+        return -step.next_obs[:, 0]
+    def success(self, step):
+        return step.next_obs[:, 0] < 0
+
+class Balance(Skill):
+    pass
+
+small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
+hierarchy = Hierarchy(
+    env=EnvSpec("CartPole-v1", engine="sync"),
+    skills=[Left(), Balance()],
+    call_steps=5,
+    algorithm=small,
+    selector=small,
+    skill_steps=256,
+    selector_steps=512,
+)
+"""
+
+
+def test_transitions_by_hand(tmp_path: Path) -> None:
+    run = declare().train(tmp_path / "run", quiet=True)
+    skills = run.evaluate(2).skills
+    assert transitions(skills) == [[2, 0, 0], [2, 2, 2], [2, 0, 0]]
+    older = {name: replace(report, first=0, followed={}) for name, report in skills.items()}
+    assert transitions(older) is None
+    start, go, stay = transition_rows(("go", "stay"), transitions(skills) or [])
+    assert [cell["share"] for cell in start["cells"]] == [1, 0, 0]
+    assert [cell["count"] for cell in go["cells"]] == ["2", "2", "2"]
+    assert (stay["name"], stay["total"]) == ("stay", 2)
+
+
+def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> CallLog:
+    run = declare(env).train(tmp_path / "run", quiet=True)
+    log = CallLog(run.policy, episode_seeds(0, episodes))
+    evaluate(run.policy, run.declaration.spec, episodes=episodes, watch=log.add)
+    return log
+
+
+def test_calls_by_hand(tmp_path: Path) -> None:
+    log = logged(tmp_path)
+    assert log.labels == ("go", "stay")
+    for i, episode in enumerate(log.episodes):
+        told = [
+            (c.skill, c.start, c.steps, c.why, c.reward, c.own, c.succeeded) for c in episode.calls
+        ]
+        assert told == CALLS
+        assert [c.obs.tolist() for c in episode.calls] == [[0, 0], [2, 2], [2, 5], [4, 7]]
+        assert episode.rewards == [1, 2, 2, 2, 2, 3, 4, 5, 6]
+        assert (episode.total, episode.seed, episode.cut) == (27, episode_seeds(0, 2)[i], False)
+
+
+def test_many_calls_are_shown_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = logged(tmp_path, 3)
+    shown, missing = calls.episode_data(log, None)
+    assert ([e["number"] for e in shown], missing) == ([1, 2, 3], [])
+    assert shown[0]["calls"] == [list(call) for call in CALLS]
+    monkeypatch.setattr(calls, "MOST_CALLS", 5)
+    monkeypatch.setattr(calls, "MOST_CALLS_OF_ONE", 3)
+    shown, missing = calls.episode_data(log, None)
+    assert [len(e["calls"]) for e in shown] == [3]
+    assert missing == [
+        "Of the 4 calls of episode 1, 3 are shown.",
+        "1 of 3 episodes are shown, as all have too many calls.",
+    ]
+
+
+def test_decisions_are_coordinates_the_skill_and_its_success(tmp_path: Path) -> None:
+    found = calls.decision_data(logged(tmp_path, 1))
+    assert found["names"] == ["obs[0]", "obs[1]", "step of the episode"]
+    rows = [[0, 0, 0, 0, False], [2, 2, 2, 1, None], [2, 5, 5, 0, False], [4, 7, 7, 0, True]]
+    assert found["rows"] == rows
+
+
+def test_coordinates_of_unlike_observations() -> None:
+    assert list(calls.coordinates(np.zeros(3, np.int64))) == ["obs"]
+    assert list(calls.coordinates(np.zeros((3, 2, 2)))) == [f"obs[{i}]" for i in range(4)]
+    assert calls.coordinates(np.zeros((3, 84, 84, 3), np.uint8)) == {}
+    parts = np.zeros(3, [("place", "f4", (2,)), ("camera", "u1", (64, 64)), ("key", "i8")])
+    names = ['obs["place"][0]', 'obs["place"][1]', 'obs["key"]']
+    assert list(calls.coordinates(parts)) == names
+    assert calls.coordinates(np.array([[np.inf], [0.0]])) == {}
+
+
+def test_filmed_are_the_worst_the_median_and_the_best() -> None:
+    episodes = [EpisodeLog(i, rewards=[r]) for i, r in enumerate([5.0, 1.0, 9.0, 3.0, 7.0])]
+    assert calls.chosen_episodes(episodes, 3) == [1, 0, 2]
+    assert calls.chosen_episodes(episodes, 1) == [1]
+    assert sorted(calls.chosen_episodes(episodes, 9)) == [0, 1, 2, 3, 4]
+
+
+def test_a_film_says_where_each_episode_begins(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    log = logged(tmp_path)
+    film = make_film(EnvSpec(Walkway, engine="sync"), log.episodes, [1, 0])
+    # Nine steps, a frame for two, and the end, which stands for HOLD frames.
+    assert film.first == {1: 0, 0: 5 + HOLD}
+    assert (film.fps, film.every) == (10, 2)
+    assert film.data[4:8] == b"ftyp"
+
+
+def test_an_environment_that_does_not_repeat_itself_is_told(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    log = logged(tmp_path, env=Moody)
+    with pytest.raises(SkillweaveError, match="does not repeat itself"):
+        make_film(EnvSpec(Moody, engine="sync"), log.episodes, [0])
+
+
+class Unseen(Walkway):
+    """Has no pictures."""
+
+    metadata: dict[str, Any] = {}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+
+
+def test_an_environment_without_pictures_has_no_film_and_all_the_rest(tmp_path: Path) -> None:
+    pytest.importorskip("vl_convert")
+    run = declare(Unseen).train(tmp_path / "run", quiet=True)
+    told = run.report(episodes=2)
+    (missing,) = told["missing"]
+    assert missing.startswith("There is no film: ")
+    assert told["path"] == str(tmp_path / "run" / "report.html")
+    text = (tmp_path / "run" / "report.html").read_text()
+    assert "Episodes, call by call" in text
+    with pytest.raises(SkillweaveError, match="episodes is 0"):
+        run.report(episodes=0)
+
+
+def test_interquartile_means_and_intervals_over_seeds() -> None:
+    alone = over_seeds(np.array([[1.0, 2.0]]))
+    assert (alone.mean.tolist(), alone.low, alone.high) == ([1, 2], None, None)
+    many = np.random.default_rng(0).normal(5, 1, (40, 3))
+    found = over_seeds(many)
+    assert found.low is not None
+    assert found.high is not None
+    ordered = np.sort(many, axis=0)[10:30].mean(axis=0)
+    np.testing.assert_allclose(found.mean, ordered)
+    assert (found.low < found.mean).all()
+    assert (found.mean < found.high).all()
+    # About 1.96 standard errors of a mean of normal values, a little more for the middle half.
+    width = (found.high - found.low) / 2
+    assert ((width > 0.2) & (width < 0.6)).all()
+    same = over_seeds(np.full(5, 3.0))
+    assert (same.mean, same.low, same.high) == (3, 3, 3)
+
+
+def test_groups_of_one_seed_have_no_interval_to_draw() -> None:
+    dot, bar = {"group": "A", "x": 1.0, "seed": 0}, {"group": "A", "x": 1.0}
+    alone = scores("A", ["#000"], {"dots": [dot], "bars": [bar]})
+    assert [layer["mark"]["type"] for layer in alone["layer"]] == ["point", "tick"]
+    several = scores("A", ["#000"], {"dots": [dot], "bars": [bar | {"low": 0.0, "high": 2.0}]})
+    assert [layer["mark"]["type"] for layer in several["layer"]] == ["rule", "point", "tick"]
+
+
+def test_curves_of_several_seeds_on_one_grid() -> None:
+    found = on_one_grid([[(0, 0.0), (100, 10.0)], [(50, 5.0), (150, 25.0)]])
+    assert found is not None
+    grid, values = found
+    assert (grid[0], grid[-1]) == (50, 100)
+    np.testing.assert_allclose(values[0], grid / 10)
+    np.testing.assert_allclose(values[1], 5 + (grid - 50) / 5)
+    assert on_one_grid([[(0, 0.0), (10, 1.0)], [(20, 0.0), (30, 1.0)]]) is None
+
+
+def test_thinned_keeps_the_last_point() -> None:
+    assert thinned(list(range(10)), 4) == [0, 3, 6, 9]
+    assert thinned([1, 2], 4) == [1, 2]
+
+
+def test_a_word_on_a_colour_is_black_or_white() -> None:
+    assert (charts.ink_on((255, 255, 255)), charts.ink_on((0, 0, 60))) == ("#000", "#fff")
+    assert charts.hex_of((1, 255, 16)) == "#01ff10"
+
+
+# Of runs that were trained
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of one recipe: two seeds, one seed with another setting, and one unfinished."""
+    found = tmp_path_factory.mktemp("runs")
+    (found / "cart.py").write_text(RECIPE)
+    train = ["train", str(found / "cart.py"), "--quiet", "--evaluate", "3"]
+    for name, words in (("a", ()), ("b", ("--seed", "1")), ("c", ("--set", "call_steps=3"))):
+        assert main([*train, "-o", str(found / name), *words]) == 0
+    run = RunDirectory.open(found / "c")
+    run.stage("balance")["status"] = "training"
+    run.stage("selector")["status"] = "waiting"
+    run.save()
+    return found
+
+
+def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder: Path) -> None:
+    runs = [RunDirectory.open(folder / name) for name in "abc"]
+    first, second = grouped(runs)
+    assert [r.manifest["seed"] for r in first.runs] == [0, 1]
+    assert (first.key, first.name) == ("A", "cart, call_steps 5")
+    assert (second.key, second.name) == ("B", "cart, call_steps 3")
+    assert [g.name for g in grouped(runs[:2])] == ["cart"]
+    with pytest.raises(SkillweaveError, match="the same settings and the same seed, 0"):
+        grouped([runs[0], runs[0]])
+
+
+def test_curves_are_of_all_agents(folder: Path) -> None:
+    curves = read_curves(RunDirectory.open(folder / "a"))
+    assert [c.label for c in curves] == ["left", "balance", "selector"]
+    steps = [x for x, _ in curves[0].points["policy_loss"]]
+    assert steps == [64, 128, 192, 256]
+
+
+def report(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
+    assert main([str(w) for w in ("report", *words, "--json", "--episodes", "2")]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_an_unfinished_run_is_shown_as_far_as_it_is(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("vl_convert")
+    out = tmp_path / "c.html"
+    told = report(capsys, folder / "c", "-o", out)
+    first, second, third = told["missing"]
+    assert first == "The stage 'balance' is not finished: it stands after 256 of 256 steps."
+    assert second == "The stage 'selector' has not begun."
+    assert third.endswith(f"To finish it: skillweave resume {folder / 'c'}")
+    text = out.read_text()
+    assert told["bytes"] == len(text.encode())
+    assert 'id="curve-0"' in text
+    assert "256 of 256" in text  # the steps of the stage under way
+    assert 'id="video"' not in text
+
+
+def test_without_the_recipe_the_report_says_so_and_shows_the_rest(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("vl_convert")
+    pytest.importorskip("imageio_ffmpeg")
+    out = tmp_path / "a.html"
+    coded = tmp_path / "coded"
+    recipe = tmp_path / "coded.py"
+    reflex = '    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.1, action=1, name="<catch>")],\n'
+    text = RECIPE.replace("import PPO", "import Reflex, PPO")
+    recipe.write_text(text.replace("    call_steps=5", reflex + "    call_steps=5"))
+    train = ["train", recipe, "--quiet", "--evaluate", "2", "-o", coded, "--scale", "0.1"]
+    assert main([str(w) for w in train]) == 0
+    capsys.readouterr()
+    (missing,) = report(capsys, coded, "-o", out)["missing"]
+    assert "--recipe FILE.py" in missing
+    assert "What each skill did" in out.read_text()
+    assert report(capsys, coded, "-o", out, "--recipe", recipe)["missing"] == []
+    assert "&lt;catch&gt;" in out.read_text()
+    assert "<catch>" not in out.read_text()
+
+
+def test_errors_are_plain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["report", str(tmp_path)], ["compare", str(tmp_path)]):
+        assert main(words) == 1
+        assert f"{tmp_path} holds no run" in capsys.readouterr().err

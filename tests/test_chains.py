@@ -1,0 +1,136 @@
+"""Chains of skills that nothing leads along: who may never start, or is never called, is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, got_key
+from test_resume import StopAt, Stopped, assert_same, new_run
+from test_together import ON, declare
+
+from skillweave import Automaton, SkillweaveError, Together
+from skillweave.collecting import skill_rows
+from skillweave.hierarchy import training
+from skillweave.skills import Skill
+from skillweave.training.stage_log import StageLog
+
+
+class Beyond(Skill):
+    """May start behind the door only."""
+
+    max_steps = 3
+
+    def initiation(self, obs):
+        return obs[:, DOOR] == 1
+
+
+class Unlock(Skill):
+    """May start with the key."""
+
+    max_steps = 8
+
+    def initiation(self, obs):
+        return obs[:, KEY] == 1
+
+
+class Heard:
+    """A listener that keeps messages."""
+
+    def __init__(self):
+        self.said = []
+
+    def stage(self, *told): ...
+    def tick(self, *told): ...
+    def done(self, *told): ...
+
+    def message(self, text):
+        self.said.append(text)
+
+
+def chain(*skills, **how):
+    options = {"env": SPEC, "together_steps": 500, "call_steps": 4} | how
+    return declare(*skills, **options)
+
+
+def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monkeypatch):
+    monkeypatch.setattr(skill_rows, "PATIENCE", 60)
+    hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart")
+    says = (
+        r"'beyond': initiation\(\) held nowhere in 60 steps of calling 'get_key', so .*"
+        r"observation was \[.*before it in skills"
+    )
+    with pytest.raises(SkillweaveError, match=says):
+        hierarchy.train(tmp_path / "run", quiet=True)
+
+
+def test_no_skill_may_start_where_learning_together_begins(tmp_path):
+    with pytest.raises(
+        SkillweaveError, match=r"no skill may start.*after 0 steps.*'beyond', 'unlock'"
+    ):
+        chain(Beyond(), Unlock()).train(tmp_path / "run", quiet=True)
+
+
+def never(selector=None):
+    automaton = Automaton({"a": "get_key", "b": {"unlock", "leave"}, "c": "beyond"},
+                          {("a", "b"): got_key})  # fmt: skip
+    return chain(GetKey(), Unlock(), Leave(), Beyond(), selector=selector or automaton)
+
+
+def test_a_skill_that_was_never_called_is_told_in_the_end_also_after_a_stop(tmp_path):
+    heard, again = Heard(), Heard()
+    whole = new_run(never(), tmp_path / "whole")
+    training.train(never(), whole, (heard,))
+    whole.close()
+    (said,) = [text for text in heard.said if "never called" in text]
+    assert said.startswith("together: skill 'beyond' was never called in 5")
+    run = new_run(never(), tmp_path / "run")
+    with pytest.raises(Stopped):
+        training.train(never(), run, (StopAt(4),))
+    training.train(never(), run, (again,))
+    run.close()
+    assert [text for text in again.said if "skill" in text] == [
+        text for text in heard.said if "skill" in text
+    ]
+    assert_same(run.path, whole.path)
+
+
+def test_a_skill_that_acted_too_seldom_to_learn_is_told(tmp_path):
+    heard = Heard()
+    often = replace(ON, learning_rate=1e-5)
+    few = chain(
+        GetKey(), Unlock(), Leave(), selector=often, together=Together(quota=1.0, floor=0.0),
+        together_steps=70,
+    )  # fmt: skip
+    run = new_run(few, tmp_path / "run")
+    training.train(few, run, (heard,))
+    run.close()
+    assert any("'unlock'" in text and "quota" in text for text in heard.said), heard.said
+
+
+def test_every_state_of_an_automaton_needs_a_skill_and_every_event_a_state():
+    with pytest.raises(SkillweaveError, match="state 'b' has no skill"):
+        Automaton({"a": "x", "b": []}, {})
+    with pytest.raises(SkillweaveError, match=r"\('a', 'c'\) names the state 'c', which is not"):
+        Automaton({"a": "x", "b": "y"}, {("a", "c"): "success"})
+
+
+def test_a_run_killed_right_after_its_last_checkpoint_says_what_it_would_have_said(
+    tmp_path, monkeypatch
+):
+    heard, again = Heard(), Heard()
+    whole, run = new_run(never(), tmp_path / "whole"), new_run(never(), tmp_path / "run")
+    training.train(never(), whole, (heard,))
+
+    def killed(*told):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StageLog, "done", killed)
+        with pytest.raises(KeyboardInterrupt):
+            training.train(never(), run)
+    training.train(never(), run, (again,))
+    assert again.said == heard.said
+    assert_same(run.path, whole.path)
+    for each in (run, whole):
+        each.close()

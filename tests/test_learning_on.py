@@ -1,0 +1,108 @@
+"""Apart, then together: who learns on goes on with all it has learnt, also after a kill."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_resume import assert_same, new_run
+from test_together import Left, Other, Push, declare
+
+from skillweave import SkillweaveError
+from skillweave.hierarchy import training
+from skillweave.training.stage_log import StageLog
+from skillweave.training.woven_learner import WovenLearner
+
+
+def then(**how):
+    return declare(Left(), Other(), Push(), learn="apart, then together", **how)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run, and the states that stages ended and began with."""
+    ended, begun = {}, {}
+    with pytest.MonkeyPatch.context() as patch:
+        save, init = StageLog.save, WovenLearner.__init__
+
+        def saved(self, state, *more, **named):
+            ended[self.entry["name"]] = state
+            save(self, state, *more, **named)
+
+        def made(self, parts, how, *more):
+            for name, part in parts.items():
+                begun[name] = {k: v.clone() for k, v in vars(part.stacks[0].state).items()}
+            init(self, parts, how, *more)
+
+        patch.setattr(StageLog, "save", saved)
+        patch.setattr(WovenLearner, "__init__", made)
+        path = tmp_path_factory.mktemp("then") / "run"
+        then().train(path, seed=3, quiet=True)
+    return path, ended, begun
+
+
+@pytest.mark.parametrize("name", ["left", "other", "selector"])
+def test_the_whole_state_of_the_stage_before_is_what_it_begins_with(whole, name):
+    _, ended, begun = whole
+    for field, value in vars(ended[name]).items():
+        assert torch.equal(begun[name][field], value), field
+    assert float(begun[name]["mu"].abs().sum()) > 0
+    assert int(begun[name]["count"].max()) > 0
+    if name != "other":  # of DQN's returns nothing is kept
+        assert float(begun[name]["return_count"][0]) > 10
+
+
+class StopAfter:
+    """A listener that raises when a stage is done."""
+
+    def __init__(self, stage):
+        self.at = stage
+
+    def stage(self, *told): ...
+    def tick(self, *told): ...
+    def message(self, *told): ...
+
+    def done(self, name, *told):
+        if name == self.at:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("stage", ["left", "selector", "together"])
+def test_a_run_killed_between_stages_ends_as_if_it_had_not_been(whole, stage, tmp_path):
+    run = new_run(then(), tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt):
+        training.train(then(), run, (StopAfter(stage),))
+    run.close()
+    then().resume(run.path, quiet=True)
+    assert_same(run.path, whole[0])
+    assert not (run.path / "states").exists()
+
+
+def test_a_run_killed_while_it_was_judged_is_judged_when_it_is_resumed(
+    whole, tmp_path, monkeypatch
+):
+    def killed(*args, **named):
+        raise KeyboardInterrupt
+
+    run = new_run(then(), tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "evaluate", killed)
+        with pytest.raises(KeyboardInterrupt):
+            training.train(then(), run)
+    run.close()
+    assert not run.finished
+    with pytest.raises(SkillweaveError, match=r"not judged yet.*skillweave resume"):
+        then().load(run.path)
+    then().resume(run.path, quiet=True)
+    assert_same(run.path, whole[0])
+    assert then().load(run.path).evaluate(3) == then().load(whole[0]).evaluate(3)
+
+
+def test_a_damaged_state_is_told(tmp_path):
+    run = new_run(then(), tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt):
+        training.train(then(), run, (StopAfter("selector"),))
+    run.close()
+    file = run.path / "states" / "left.safetensors"
+    file.write_bytes(file.read_bytes()[:-8])
+    with pytest.raises(SkillweaveError, match=r"left\.safetensors"):
+        then().resume(run.path, quiet=True)

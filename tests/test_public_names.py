@@ -1,0 +1,94 @@
+"""What users import: the list of names, and that README and examples need nothing else."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import skillweave as sw
+from skillweave import SkillweaveError
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+NAMES = """
+ActingParams ActionHead Agent AgentState Algorithm Array Automaton CNN DQN Encoder EnvSpec
+Evaluation Evolution Export Heir Hierarchy HierarchyPolicy LastCall Layout Lengths Mutations Net
+Network OnPolicy OptionsEnv PPO ParameterGroup Player Policy PoolWrapper RNN Range Reflex Report
+Rollout Run SAC Sample Seeds Selection Skill SkillweaveError Step TD3 Together Tournament
+Truncation adam_ clip_grad_norm_ envpool evaluate from_function from_onnx from_sb3 from_torch gae
+make_options_env mask_logits masked_mean normalise register_algorithm register_encoder
+train_agent tree
+"""
+
+
+def test_the_public_names_are_these() -> None:
+    assert sorted(sw.__all__) == sorted(NAMES.split())
+
+
+def imported_deeper(source: str) -> list[str]:
+    """Modules within the library that a program of a user's imports from."""
+    found: list[str] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            found.append(node.module or "")
+        elif isinstance(node, ast.Import):
+            found += [a.name for a in node.names]
+    return [name for name in found if name.startswith("skillweave.")]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_import_from_the_package_alone(path: Path) -> None:
+    assert imported_deeper(path.read_text()) == []
+
+
+def test_the_readme_imports_from_the_package_alone() -> None:
+    code = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.S)
+    assert code
+    assert [name for block in code for name in imported_deeper(block)] == []
+
+
+class Left(sw.Skill):
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), np.int64))
+
+
+class Right(sw.Skill):
+    policy = sw.from_function(lambda obs: (obs[:, 2] > 0).astype(np.int64))
+
+
+def test_a_policy_is_evaluated_on_an_environment_by_its_id() -> None:
+    found = sw.evaluate(Right.policy, "CartPole-v1", episodes=3)
+    spec = sw.EnvSpec("CartPole-v1")
+    bound = Right.policy.bind(spec.make().observation_space, spec.make().action_space, "right")
+    assert found == sw.evaluate(bound, spec, episodes=3)
+    assert found.mean > sw.evaluate(Left.policy, "CartPole-v1", episodes=3).mean
+
+
+def test_an_options_env_is_made_of_a_declaration_and_of_a_run(tmp_path: Path) -> None:
+    hierarchy = sw.Hierarchy(
+        "CartPole-v1", [Left(), Right()], call_steps=3, selector=lambda obs: np.zeros(len(obs), int)
+    )
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    seen = []
+    for source in (hierarchy, run):
+        env = sw.make_options_env(source, 2, 0.9)
+        env.reset(seed=4)
+        assert env.single_action_space.n == 2
+        seen.append(env.step(np.array([1, 0])))
+        env.close()
+    assert (seen[0][0] == seen[1][0]).all()
+    assert seen[0][1] == pytest.approx([1 + 0.9 + 0.81] * 2)
+
+
+def test_what_cannot_be_an_options_env_is_said() -> None:
+    class Learns(sw.Skill):
+        pass
+
+    hierarchy = sw.Hierarchy("CartPole-v1", [Left(), Learns()])
+    with pytest.raises(SkillweaveError, match="skill 'learns' has no policy"):
+        sw.make_options_env(hierarchy, 2, 0.9)
+    with pytest.raises(SkillweaveError, match="gamma is 2"):
+        sw.make_options_env(hierarchy, 2, 2)
