@@ -155,7 +155,7 @@ class SkillTally:
             tally.cut(played.episode[acting != i])
             rows = np.flatnonzero(acting == i)
             if len(rows):
-                tally.add(_below(played, i, rows))
+                tally.add(played_below(played, i, rows))
 
     def cut(self, episodes: Array) -> None:
         """Another skill acts in ``episodes`` (k,): calls that might have gone on are over."""
@@ -195,7 +195,7 @@ class SkillTally:
         return int(self._succeeded[i])
 
 
-def _below(played: Played, i: int, rows: Array) -> Played:
+def played_below(played: Played, i: int, rows: Array) -> Played:
     """A step of ``rows`` (m,) as it was in the hierarchy that is skill ``i``."""
     assert played.elapsed is not None
     assert played.chosen is not None
@@ -208,6 +208,14 @@ def _below(played: Played, i: int, rows: Array) -> Played:
         played.cut[rows], chosen["skill"], chosen["elapsed"] == 0, after["elapsed"], after["why"],
         chosen, after,
     )  # fmt: skip
+
+
+def levels_of(skills: Mapping[str, SkillReport]) -> dict[str, dict[str, SkillReport]]:
+    """The reports by the path of the hierarchy that skills are of; the first path is empty."""
+    found: dict[str, dict[str, SkillReport]] = {}
+    for name, report in skills.items():
+        found.setdefault(name.rpartition("/")[0], {})[name] = report
+    return found
 
 
 def all_steps(skills: Mapping[str, SkillReport]) -> int:
