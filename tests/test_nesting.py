@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +14,12 @@ from skillweave import (
     PPO,
     RNN,
     TD3,
+    Automaton,
     EnvSpec,
     Hierarchy,
     Lengths,
     Network,
+    Reflex,
     Skill,
     SkillweaveError,
     Together,
@@ -25,6 +28,9 @@ from skillweave.cli import main
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy.nesting import every_skill
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.states import load_state
+from skillweave.training.call_log import CallLog
+from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.play import SeededEpisodes, play
 
 SMALL = Network(hidden=(8,))
@@ -114,6 +120,11 @@ def three():
 
 
 BUSY = {"call_steps": Lengths(1, ..., 8), "interrupt": True}
+SHORT = {"skill_steps": 100, "selector_steps": 100, "together_steps": 300}
+MODES = Automaton({"low": ["balance", "right"], "high": "right"}, {
+    ("low", "high"): lambda step: step.next_obs[:, 2] > 0.02,
+    ("high", "low"): lambda step: step.next_obs[:, 2] < 0,
+})  # fmt: skip
 KINDS = {
     "together": lambda: declare(learn="together", together=Together(task_weight=0.5)),
     "apart": lambda: declare(),
@@ -132,7 +143,32 @@ KINDS = {
         inside(Balance(), learn="apart, then together", together_steps=200)
     ),
     "three": three,
+    "guides": lambda: declare(
+        inside(guide=MODES, guide_nats=0.05, reflexes=[Reflex(leans, 0)]),
+        learn="together",
+        guide=lambda obs: np.where(obs[:, 1] > 0, "left", "inner"),
+        guide_restricts=False,
+        guide_nats=0.1,
+        reflexes=[Reflex(far, 1)],
+    ),
+    "guides, start calls": lambda: declare(
+        inside(guide=MODES, start_calls=2), skill_steps=100, selector_steps=100
+    ),
+    "then, inside and outside": lambda: declare(
+        inside(learn="apart, then together", **SHORT), learn="apart, then together", **SHORT
+    ),
+    "a ready selector above": lambda: declare(
+        selector=lambda obs: np.where(obs[:, 1] > 0, "left", "inner"), learn="together"
+    ),
 }
+
+
+def leans(obs):
+    return obs[:, 2] > 0.05
+
+
+def far(obs):
+    return obs[:, 0] < -0.2
 
 
 def ready(obs):
@@ -187,6 +223,73 @@ def test_all_learn_at_every_level_in_one_stream(whole, kind):
     for name in deep:
         assert any(k.startswith(f"{name}.") for k in told), f"{name} has learnt nothing"
     assert 900 <= entry["steps"] <= 900 + 64
+
+
+def test_selectors_at_all_levels_stay_near_their_guides(whole):
+    run, path = whole("guides")
+    told = {name for line in lines(path) if line["stage"] == "together" for name in line}
+    assert {"selector.anchor_kl", "inner/selector.anchor_kl"} <= told
+    inner = run.policy.skills.policies[1]
+    assert run.policy.guide is None
+    assert inner.guide.restricts
+
+
+def test_a_guide_in_a_hierarchy_below_is_kept_to(whole):
+    run, _ = whole("guides, start calls")
+    called = set()
+
+    def look(memory):
+        high = memory["1.guide.state"] == 1
+        acts = (memory["skill"] == 1) & (memory["1.elapsed"] == 0)
+        called.update(memory["1.skill"][acts & high].tolist())
+
+    engine = make_engine(CARTPOLE, 1)
+    engine.reset(0)
+    rng = np.random.default_rng(0)
+    episodes = SeededEpisodes(engine, range(9), 100)
+    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=look))
+    assert called == {1}
+
+
+def test_another_guide_below_is_refused_by_its_path(tmp_path, whole):
+    run, path = whole("guides, start calls")
+    other = declare(inside(guide=lambda obs: 0, call_steps=Lengths(1, 2)))
+    for plain, said in ((declare(), "inner: the selector has a guide"), (other, "guide of inner")):
+        with pytest.raises(SkillweaveError, match=said):
+            plain.load(path)
+    run.save_weights(tmp_path / "weights")
+    with pytest.raises(SkillweaveError, match="inner: the selector has a guide"):
+        declare().load_weights(tmp_path / "weights")
+
+
+def test_all_go_on_with_their_whole_states_by_path(tmp_path):
+    """Stopped in the last stage, the states of all who learn there lie in the run."""
+    run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
+    found = {f.name.removesuffix(".safetensors") for f in (run.path / "states").iterdir()}
+    assert found == {"left", "selector", "inner.balance", "inner.right", "inner.selector"}
+    KINDS["then, inside and outside"]().resume(run.path, quiet=True)
+    assert not (run.path / "states").exists()
+
+
+def test_a_state_that_was_not_kept_is_not_gone_on_with(tmp_path):
+    run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
+    like = SimpleNamespace()
+    run.stage("inner/together")["kept"]["kept"] = "before"
+    assert load_state(run, "inner/right", like) is None
+
+
+def test_calls_are_logged_by_the_paths_of_who_acts(whole):
+    run, _ = whole("together")
+    log = CallLog(run.policy, episode_seeds(0, 4))
+    score = evaluate(run.policy, CARTPOLE, episodes=4, watch=log.add)
+    assert log.labels == ("left", "inner/balance", "inner/right", "push")
+    for i, name in enumerate(log.labels):
+        own = [c for e in log.episodes for c in e.calls if c.skill == i]
+        told = score.skills[name]
+        assert (len(own), sum(c.steps for c in own)) == (told.calls, told.steps)
+        ends = {end: sum(c.why == end for c in own) for end in told.ended}
+        assert ends == told.ended
+    assert [len(e.rewards) for e in log.episodes] == list(score.lengths)
 
 
 def test_a_run_has_everyones_file_with_a_checksum(whole):
