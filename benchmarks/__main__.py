@@ -35,6 +35,7 @@ ALL = (
     ["search"],
     ["four_rooms"],
     ["together"],
+    ["nested"],
     ["export"],
 )
 

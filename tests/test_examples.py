@@ -9,12 +9,13 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 7
+COUNT = 8
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
     "doorkey.py": ("--steps", "3000", "--out", "{folder}/run"),
     "foreign_skills.py": ("--steps", "3000"),
     "four_rooms.py": ("--steps", "3000"),
+    "nested.py": ("--steps", "5000", "--out", "{folder}/run"),
     "own_algorithm.py": ("--steps", "2000", "--out", "{folder}/run"),
     "sb3_selector.py": ("--steps", "3000", "--episodes", "2"),
     "tutorial.py": ("--scale", "0.01", "--episodes", "2", "--out", "{folder}/run"),
@@ -30,6 +31,7 @@ SAYS = {
     "doorkey.py": "solved: ",
     "foreign_skills.py": "woven by the selector: ",
     "four_rooms.py": "steps from the corner to the goal: ",
+    "nested.py": "both errands done: ",
     "own_algorithm.py": "mean return: ",
     "ready_selectors.py": "automaton  return 1.00",
     "sb3_selector.py": "woven by the selector: ",

@@ -10,7 +10,7 @@ from test_together import Left, Other, Push, declare
 from skillweave import SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.training.stage_log import StageLog
-from skillweave.training.woven import WovenLearner
+from skillweave.training.woven_learner import WovenLearner
 
 
 def then(**how):

@@ -89,6 +89,9 @@ class StopAt:
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         pass
 
+    def message(self, text: str) -> None:
+        pass
+
 
 def write_recipe(folder: Path, engine: str = "sync") -> Path:
     path = folder / f"{engine}.py"

@@ -89,14 +89,15 @@ class SkillCriticAlgorithm(Algorithm):
     ) -> tuple[AgentState, Report]:
         """Learn λ-returns of the skills that acted, in place; ``rng`` orders the minibatches."""
         cfg = self.config
-        self.update_obs_stats(state, batch.obs.flatten(1, 2))
-        advantage, value = self._judged(state, batch)
-        returns = (advantage + value).flatten(1)
+        obs = _valid(batch, batch.obs)
+        self.update_obs_stats(state, obs)
+        advantage, value = (_valid(batch, x) for x in self._judged(state, batch))
+        returns = advantage + value
         self.update_return_stats(state, returns)
         target = (returns - state.return_mean) / state.return_scale
         leaves = self.layout.leaves(state.params)
-        inputs = self.inputs(self.learning_params(state), batch.obs.flatten(1, 2))
-        action, size = batch.action.flatten(1), target.shape[1]
+        inputs = self.inputs(self.learning_params(state), obs)
+        action, size = _valid(batch, batch.action), target.shape[1]
         rate, loss = state.learning_rate * (1.0 - batch.progress), target.new_zeros(len(target))
         parts = max(1, round(size / cfg.batch_size))
         for _ in range(cfg.update_epochs):
@@ -108,7 +109,7 @@ class SkillCriticAlgorithm(Algorithm):
                 grad = self.layout.gradient(loss, leaves)
                 clip_grad_norm_(grad, torch.full_like(rate, cfg.max_grad_norm))
                 adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=cfg.adam_eps)
-        explained = explained_variance(value.flatten(1), returns)
+        explained = explained_variance(value, returns)
         return state, Report({"value_loss": loss.detach(), "explained_variance": explained})
 
     @torch.no_grad()
@@ -134,3 +135,9 @@ class SkillCriticAlgorithm(Algorithm):
         raw = self.net(params.views, self.inputs(params, obs.flatten(1, 2)))
         chosen = raw.gather(2, skill.flatten(1)[..., None]).squeeze(-1)
         return chosen * state.return_scale + state.return_mean
+
+
+def _valid(batch: Rollout, rows: Tensor) -> Tensor:
+    """The valid ones of rows (P, T, B, …), as (P, K, …); of one member where some are not."""
+    flat = rows.flatten(1, 2)
+    return flat if batch.valid is None else flat[:, batch.valid[0].flatten()]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +12,22 @@ import gymnasium as gym
 from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.api.adoption import adopt, check_run
 from skillweave.api.run import Run, as_path
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.guidance import adopt_guide
-from skillweave.hierarchy.weights import check_selector, open_weights, read_agent, read_weights
+from skillweave.hierarchy.nesting import below
+from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
 from skillweave.messages import short, whole_number
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import CRITIC, SELECTOR, assign_workers, check_replay, check_stages
+from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
 from skillweave.types import SkillweaveError
 
 
@@ -52,13 +52,13 @@ class Agent(PlainAgent):
     def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
         """Finish a run that was stopped; as ``Hierarchy.resume``."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        _check_run(self, run)
+        check_run(self, run)
         return _go_on(self, run, quiet, evolve)
 
     def load(self, run_dir: str | Path) -> Run:
         """A finished run of this agent."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        _check_run(self, run)
+        check_run(self, run)
         return Run(self, run.path, training.load(self, run))
 
     @classmethod
@@ -151,28 +151,29 @@ class Hierarchy(Declaration):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
         """The hierarchy of a run that needs none of the user's code (plain data says it all)."""
-        told = ("name", "max_steps", "call_steps")
-        skills = [
-            type(s["name"], (RecordedSkill,), {k: s[k] for k in told if k in s})()
-            for s in manifest["skills"]
-        ]
-        calls = calls_from_json(manifest)
-        return cls(_spec_of(manifest), skills, call_steps=calls)
+        entries = {s["name"]: s for s in manifest["skills"]}
+        return cls._recorded(_spec_of(manifest), manifest, entries)
+
+    @classmethod
+    def _recorded(
+        cls, spec: EnvSpec, told: dict[str, Any], entries: dict[str, dict[str, Any]]
+    ) -> Hierarchy:
+        """A hierarchy of a run, or one below it, from the entries of its skills by their paths."""
+        skills = []
+        for name, entry in entries.items():
+            if "/" in name:
+                continue
+            own = {k: entry[k] for k in ("max_steps", "call_steps") if k in entry} | {"name": name}
+            if "hierarchy" in entry:
+                own["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
+            skills.append(type(name, (RecordedSkill,), own)())
+        return cls(spec, skills, call_steps=calls_from_json(told))
 
     def _adopt_run_config(self, run: RunDirectory) -> None:
         """Take over from a run how its skills are called, after a check that it fits."""
-        _check_run(self, run)
+        check_run(self, run)
         if run.manifest["kind"] == "hierarchy":
-            adopt_guide(self, run.manifest, str(run.path))
-            self.call_steps = calls_from_json(run.manifest)
-            margin = run.manifest.get("interrupt")
-            self.interrupt = margin is not None
-            if margin is not None:
-                self.together = replace(self.together, margin=margin)
-            self.learn = run.manifest.get("learn", "apart")
-            self.reflexes_in_training = run.manifest.get("reflexes_in_training", True)
-            self.start_calls = run.manifest.get("start_calls")
-            self.greedy_skills = run.manifest["greedy_skills"]
+            adopt(self, run)
 
 
 def train_agent(
@@ -233,12 +234,14 @@ def _train(
     assign_workers(content["stages"], declared.spec)
     for stage in content["stages"]:
         acts: Any = action_space
-        if SELECTOR in stage["learns"] and isinstance(declared, Hierarchy):
-            acts = gym.spaces.Discrete(declared.choices)
+        if stage["decides"] in stage["learns"] and isinstance(declared, Hierarchy):
+            acts = declared.chooses_from(stage["decides"], action_space)
         check_replay(stage, observation_space, acts)
         for name, config in stage.get("algorithms", {}).items():
-            if name != CRITIC:  # it keeps nothing
-                check_replay(stage | {"algorithm": config}, observation_space, action_space)
+            if not name.endswith(CRITIC):  # it keeps nothing
+                assert isinstance(declared, Hierarchy)
+                acts = declared.chooses_from(name, action_space)
+                check_replay(stage | {"algorithm": config}, observation_space, acts)
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
@@ -266,28 +269,6 @@ def _declared(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Age
     if run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy):
         return declared.plain_agent()
     return declared
-
-
-def _check_run(declared: Hierarchy | Agent, run: RunDirectory) -> None:
-    """Raise a SkillweaveError where a run is not one of this declaration."""
-    if run.manifest["kind"] == "hierarchy":
-        if isinstance(declared, Agent):
-            raise SkillweaveError(f"{run.path} is the run of a hierarchy, not of a plain agent")
-        mine = [s.name for s in declared.skills]
-        theirs = [s["name"] for s in run.manifest["skills"]]
-        if mine != theirs:
-            raise SkillweaveError(
-                f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
-                f"has {', '.join(mine)}"
-            )
-        ready = declared.ready_selector is not None
-        check_selector(ready, "selector" in run.manifest, str(run.path))
-    if run.manifest["env"] != declared.spec.name:
-        what = "agent" if isinstance(declared, Agent) else "hierarchy"
-        raise SkillweaveError(
-            f"{run.path} was trained on {run.manifest['env']}, but this {what} is on "
-            f"{declared.spec.name}"
-        )
 
 
 def _spec_of(told: dict[str, Any]) -> EnvSpec:

@@ -9,6 +9,7 @@ import numpy as np
 
 from skillweave.api.player import Player
 from skillweave.export.write import Export, write_export
+from skillweave.hierarchy.nesting import every_skill
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
 from skillweave.messages import short, whole_number
@@ -94,17 +95,19 @@ class Run:
     ) -> dict[str, Any]:
         """Write a captioned GIF or MP4; ``skill`` shows one skill alone, as in ``evaluate``."""
         plain = isinstance(self.declaration, PlainAgent)
-        skills = () if plain else self.hierarchy.skills
-        colors = {s.name: color_of(i, s.color) for i, s in enumerate(skills)}
+        skills = {} if plain else dict(every_skill(self.hierarchy.skills))
+        colors = {name: color_of(i, s.color) for i, (name, s) in enumerate(skills.items())}
 
         def label(memory: Memory) -> tuple[str, tuple[int, int, int]]:
-            if skill is not None:
-                return skill, colors[skill]
-            acting = policy.acting(memory)
-            if acting is None:
+            if plain:
                 return AGENT, color_of(len(colors), None)
-            name = policy.labels[int(acting[0])]
-            return name, colors[name]
+            acting = policy.policy if isinstance(policy, SkillAlone) else policy
+            below = acting.acts(memory) if isinstance(acting, HierarchyPolicy) else None
+            name = "/".join(filter(None, (skill, below)))
+            known = name
+            while known not in colors:  # a run that is a ready skill has skills of its own
+                known = known.rpartition("/")[0]
+            return name, colors[known]
 
         policy, path = self._policy(skill), as_path(path, "path")
         seed = whole_number(seed, "seed", 0)
@@ -200,7 +203,7 @@ class Run:
         return path
 
     def as_skill(self, name: str, **attributes: Any) -> Skill:
-        """All of it as one skill of another hierarchy."""
+        """All of it, as it was trained, as one skill of another hierarchy."""
         kind = type(name, (Skill,), {"name": name, "policy": self.policy, **attributes})
         skill: Skill = kind()
         return skill
@@ -214,10 +217,16 @@ class Run:
     def _policy(self, skill: str | None) -> Policy:
         if skill is None:
             return self.policy
-        if not isinstance(self.policy, HierarchyPolicy):
+        policy = self.policy
+        if not isinstance(policy, HierarchyPolicy):
             raise SkillweaveError("this is a plain agent: it has no skills")
         self.hierarchy.skill(skill)
-        return SkillAlone(self.policy.skills, skill)
+        *nodes, name = skill.split("/")
+        for node in nodes:
+            below = policy.skills.policies[policy.labels.index(node)]
+            assert isinstance(below, HierarchyPolicy)
+            policy = below
+        return SkillAlone(policy.skills, name)
 
 
 def as_path(path: str | Path, name: str) -> Path:

@@ -6,45 +6,16 @@ Collectors (training) and ``HierarchyPolicy`` (everything else) both run skills 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, cast
 
 import numpy as np
 
+from skillweave.collecting.ends import ENDED, Interruption, Why, skill_step
 from skillweave.collecting.lengths import Lengths
-from skillweave.envs.infos import allowed_rows, info_rows
-from skillweave.skills import Reflex, Skill, apply_reflexes, asked
+from skillweave.envs.infos import allowed_rows
+from skillweave.skills import Reflex, Skill, apply_reflexes, asked, path_of
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
-
-
-class Why(IntEnum):
-    """Why a call ended."""
-
-    RUNNING = 0
-    """It goes on."""
-    OWN = 1
-    """The skill's ``termination`` ended it."""
-    LIMIT = 2
-    """It had lasted as long as it may: ``max_steps``, or ``call_steps``."""
-    INTERRUPTED = 3
-    """The selector cut it, as another skill was worth more."""
-    EPISODE = 4
-    """The episode ended, or has just begun: there is no call."""
-
-
-@dataclass(frozen=True)
-class Interruption:
-    """When a call is cut (Sutton, Precup & Singh 1999, sec. 4)."""
-
-    worth: Callable[[Array], Array]
-    """Observations (n, …) to what each skill is worth there, (n, S), in deviations of the return.
-    """
-    margin: float
-    """By how much another skill must be worth more, in the same unit."""
-    critic: Policy | None = None
-    """Who says what skills are worth, where it is trained."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +43,8 @@ class SkillSet:
     """What a selector that learns pays for each call, in units of reward."""
     interruption: Interruption | None = None
     """When the selector cuts a call; None: never."""
+    reflexes_apart: bool = False
+    """``act`` leaves reflexes to its caller, who asks ``override``."""
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -105,12 +78,12 @@ class SkillSet:
         Raises:
             SkillweaveError: in some observation no skill may start.
         """
-        if not any(s.defines("initiation") for s in self.skills):
+        if not self.restricts:
             return None
         mask = self.startable(obs)
         if not mask.any(axis=1).all():
             row = int(np.flatnonzero(~mask.any(axis=1))[0])
-            names = ", ".join(repr(s.name) for s in self.skills)
+            names = ", ".join(repr(path_of(s)) for s in self.skills)
             where = np.array2string(obs[row], precision=3)
             where += "" if age is None else f", after {int(age[row])} steps of the episode"
             raise SkillweaveError(
@@ -121,13 +94,25 @@ class SkillSet:
 
     def startable(self, obs: Array) -> Array:
         """Choices whose skill may start, (n, choices) bool; perhaps none in some observation."""
-        may = [
-            asked(s, "initiation", obs, len(obs))
-            if s.defines("initiation")
-            else np.ones(len(obs), bool)
-            for s in self.skills
-        ]
+        may = [self._may_start(i, obs) for i in range(len(self.skills))]
         return np.stack(may, axis=1).repeat(max(1, len(self.lengths)), axis=1)
+
+    @property
+    def restricts(self) -> bool:
+        """Whether some skill, here or in a hierarchy below, may not start everywhere."""
+        below = (skills_below(p) for p in self.policies)
+        own = any(s.defines("initiation") for s in self.skills)
+        return own or any(skills.restricts for skills in below if skills is not None)
+
+    def _may_start(self, i: int, obs: Array) -> Array:
+        """Where skill ``i`` may start, (n,); a hierarchy only where one of its skills may."""
+        skill, below = self.skills[i], skills_below(self.policies[i])
+        may = np.ones(len(obs), bool)
+        if skill.defines("initiation"):
+            may = asked(skill, "initiation", obs, len(obs))
+        if below is not None and below.restricts:
+            may = may & below.startable(obs).any(axis=1)
+        return may
 
     def start(self, n: int) -> Memory:
         """Memory of n environments in which no call has begun."""
@@ -196,9 +181,13 @@ class SkillSet:
                 actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
             actions[mine] = some
         assert actions is not None, "act() before begin()"
-        if not self.reflexes:
+        if not self.reflexes or self.reflexes_apart:
             return actions
-        return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)[0]
+        return self.override(obs, actions)[0]
+
+    def override(self, obs: Array, actions: Array) -> tuple[Array, Array]:
+        """Actions (k, …) with the reflexes in force, and (k,) bool: where one of them acted."""
+        return apply_reflexes(self.reflexes, obs, actions, self.policies[0].action_space)
 
     def limit(self, i: int) -> int | None:
         """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""
@@ -231,13 +220,27 @@ class SkillSet:
                 continue
             part = skill_step(step, mine, elapsed[mine], skill.max_steps)
             own = self._own(memory, i, rows[mine])
-            self._put(memory, i, rows[mine], policy.observe(own, part))
+            after = policy.observe(own, part)
+            self._put(memory, i, rows[mine], after)
+            why[mine[self._stuck(policy, after, part.next_obs)]] = Why.LIMIT
             if skill.defines("termination"):
                 stops = asked(skill, "termination", part, len(mine), elapsed[mine], rows[mine])
                 why[mine[stops]] = Why.OWN
         if self.interruption is not None:
             self._interrupt(self.interruption, running, step.next_obs, why)
         return why
+
+    def _stuck(self, policy: Policy, memory: Memory, obs: Array) -> Array:
+        """(m,) bool: the policy is a hierarchy that must decide, and none of its skills may start.
+
+        Its own call ends there.
+        """
+        stuck = np.zeros(len(obs), bool)
+        below = skills_below(policy)
+        if below is not None and below.restricts:
+            waits = np.flatnonzero(np.isin(memory[ENDED], (Why.RUNNING, Why.EPISODE), invert=True))
+            stuck[waits] = ~below.startable(obs[waits]).any(axis=1)
+        return stuck
 
     def _interrupt(self, how: Interruption, running: Array, obs: Array, why: Array) -> None:
         """Cut calls where another skill that may start is worth more, in place."""
@@ -279,19 +282,10 @@ class SkillSet:
             memory[f"{i}.{k}"][rows] = v
 
 
-def skill_step(step: Step, rows: Array, elapsed: Array, max_steps: int | None) -> Step:
-    """Rows (m,) of a step, ascending, with the time as the running skill counts it.
+def skills_below(policy: Policy | None) -> SkillSet | None:
+    """The skills of a policy that is a hierarchy; None: it is none."""
+    found = getattr(policy, "skills", None)
+    return found if isinstance(found, SkillSet) else None
 
-    ``elapsed`` (m,) are the steps of its calls so far.
-    """
-    every = len(rows) == len(step.reward)  # then there is nothing to copy
-    at = slice(None) if every else rows
-    terminated = step.terminated[at]
-    timed_out = np.zeros(len(rows), bool)
-    if max_steps is not None:
-        timed_out = (elapsed >= max_steps) & ~terminated
-    info = step.info if every else info_rows(step.info, rows, len(step.reward))
-    return Step(
-        step.obs[at], step.action[at], step.next_obs[at], step.reward[at],
-        terminated, step.truncated[at], timed_out, elapsed, info,
-    )  # fmt: skip
+
+__all__ = ["Interruption", "SkillSet", "Why", "skill_step", "skills_below"]

@@ -136,8 +136,9 @@ class Collector:
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs, self.begun = np.array(obs), True
         self.open = {k: v.copy() for k, v in unprefixed("open", state).items()}
-        if "obs" in self.open:  # files hold it as bytes where it is structured
-            self.open["obs"] = self.open["obs"].view(self.obs.dtype).reshape(self.obs.shape)
+        for k, v in self.open.items():  # files hold observations as bytes if they are structured
+            if k.rpartition(".")[2] == "obs":
+                self.open[k] = v.view(self.obs.dtype).reshape(self.obs.shape)
         if any(len(v) != self.num_envs for v in self.open.values()):
             raise ValueError("what is kept of open calls is of another number of environments")
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])

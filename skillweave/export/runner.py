@@ -29,14 +29,21 @@ class Runner:
     def __init__(self, path: Any, code: Any = None, hierarchy: Any = None, seed: Any = None):
         self.path, self.code, self.rng = Path(path), dict(code or {}), np.random.default_rng(seed)
         self.told = json.loads((self.path / "policy.json").read_text(encoding="utf-8"))
-        for owner in (*getattr(hierarchy, "skills", ()), *getattr(hierarchy, "reflexes", ())):
-            for method in ("initiation", "termination", "success", "condition", "action"):
-                self.code.setdefault(f"{owner.name}.{method}", getattr(owner, method, None))
+        self._take(hierarchy)
         needs = {k: v for k, v in self.told["code"].items() if not callable(self.code.get(k))}
         if needs:
             raise ValueError(f"{path} needs code: give Runner(code={{name: function}}) for {needs}")
         self.dtype, self.root = np.dtype(self.told["dtype"]), self.made(self.told["policy"])
         self.reset()
+
+    def _take(self, owner: Any, path: str = "") -> None:
+        """Take the functions of a hierarchy's skills and reflexes, and of hierarchies below."""
+        skills = getattr(owner, "skills", ())
+        owner = skills if hasattr(skills, "skills") else owner
+        for part in (*getattr(owner, "skills", ()), *getattr(owner, "reflexes", ())):
+            for method in ("initiation", "termination", "success", "condition", "action"):
+                self.code.setdefault(f"{path}{part.name}.{method}", getattr(part, method, None))
+            self._take(getattr(part, "policy", None), f"{path}{part.name}/")
 
     def reset(self) -> None:
         """A new episode begins."""
@@ -127,21 +134,32 @@ class _Hierarchy(_Code):
     def __init__(self, runner: Runner, told: Any) -> None:
         super().__init__(runner, told)
         self.selector, self.skills = runner.made(told["selector"]), told["skills"]
+        self.guide = told.get("guide") and runner.made(told["guide"])
         self.policies = [runner.made(skill["policy"]) for skill in self.skills]
         self.critic = told["critic"] and runner.made(told["critic"])
 
     def reset(self) -> None:
         self.skill, self.why, self.succeeded = -1, EPISODE, False
         self.selector.reset()
+        if self.guide:
+            self.guide.reset()
 
     def may_start(self) -> Any:
-        runner, told = self.runner, (skill["initiation"] for skill in self.skills)
-        return np.array([code is None or runner.asks(code, runner.obs) for code in told])
+        may = []
+        for told, policy in zip(self.skills, self.policies, strict=True):
+            code = told["initiation"]
+            own = code is None or self.runner.asks(code, self.runner.obs)
+            may.append(own and (not isinstance(policy, _Hierarchy) or policy.may_start().any()))
+        return np.array(may)
+
+    def allowed(self) -> Any:
+        may = self.may_start()
+        return self.guide.allowed(may[None], self) if self.guide and may.any() else may
 
     def act(self, mask: Any, last: Any = None) -> Any:
         lengths, runner = self.told["lengths"] or [np.inf], self.runner
         if self.why != RUNNING:
-            if not (may := self.may_start().repeat(len(lengths))).any():
+            if not (may := self.allowed().repeat(len(lengths))).any():
                 raise ValueError(f"no skill may start in observation {runner.obs[0]}")
             skill, length = divmod(int(self.selector.act(may[None], self)), len(lengths))
             if skill != self.skill:
@@ -158,7 +176,9 @@ class _Hierarchy(_Code):
         runner, told, self.elapsed = self.runner, self.skills[self.skill], self.elapsed + 1
         own = self.elapsed, self.elapsed >= (told["max_steps"] or np.inf)
         self.why = LIMIT if self.elapsed >= self.limit else RUNNING
-        self.policies[self.skill].observe(*own)
+        (below := self.policies[self.skill]).observe(*own)
+        if isinstance(below, _Hierarchy) and below.why != RUNNING and not below.may_start().any():
+            self.why = LIMIT
         if told["termination"] and runner.asks(told["termination"], runner.step(*own)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
@@ -169,6 +189,8 @@ class _Hierarchy(_Code):
         if judge and self.why != RUNNING:
             self.succeeded = runner.asks(judge, runner.step(*own))
         self.selector.watch(self, elapsed, timed_out)
+        if self.guide:
+            self.guide.watch(self, elapsed, timed_out)
 
 
 class _Function(_Code):
@@ -180,6 +202,9 @@ class _Function(_Code):
         chosen = np.asarray(self.runner.code[self.told["code"]](self.runner.obs, *more))[0]
         return self.told["names"].index(chosen) if isinstance(chosen, str) else chosen
 
+    def allowed(self, mask: Any, last: Any) -> Any:
+        return np.arange(mask.shape[1]) == self.act(mask, last)
+
 
 class _Automaton(_Code):
     """A selector of states: the skills of each, best first, and transitions by events."""
@@ -189,6 +214,9 @@ class _Automaton(_Code):
 
     def act(self, mask: Any, last: Any = None) -> Any:
         return next(skill for skill in self.told["skills"][self.state] if mask[0, skill])
+
+    def allowed(self, mask: Any, last: Any) -> Any:
+        return mask[0] & np.isin(np.arange(mask.shape[1]), self.told["skills"][self.state])
 
     def watch(self, last: Any, *when: Any) -> None:
         asks, step = self.runner.asks, self.runner.step

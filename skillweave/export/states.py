@@ -71,10 +71,14 @@ class States:
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills, cuts, selector = policy.skills, policy.skills.interruption, policy.selector
-        told_ends = isinstance(selector, Automaton) or getattr(selector, "asks_last", False)
+        guide: Any = None if policy.guide is None else policy.guide.selector
+        told_ends = any(
+            isinstance(x, Automaton) or getattr(x, "asks_last", False) for x in (selector, guide)
+        )
         told: dict[str, Any] = {
             "kind": "Hierarchy",
-            "selector": self._selector(policy, prefix, sampled),
+            "selector": self._selector(selector, f"{prefix}selector", sampled),
+            "guide": None if guide is None else self._selector(guide, f"{prefix}guide", False),
             "skills": [
                 self._skill(skills, i, prefix, told_ends) for i in range(len(skills.skills))
             ],
@@ -130,8 +134,7 @@ class States:
             "noise": [list(n) for n in graph.noise],
         }
 
-    def _selector(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
-        selector, name = policy.selector, f"{prefix}selector"
+    def _selector(self, selector: Policy, name: str, sampled: bool) -> dict[str, Any]:
         match selector:
             case Automaton():
                 if sampled:
@@ -146,7 +149,7 @@ class States:
                 return {
                     "kind": "Function",
                     "code": self._asks(name, selector.function, what),
-                    "names": list(policy.labels),
+                    "names": list(selector.skills),
                     "asks_last": selector.asks_last,
                 }
             case AgentPolicy():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from skillweave.collecting.lengths import Lengths
+from skillweave.hierarchy.nesting import Nestable, inner_of
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.training.plain_agent import check_algorithm
@@ -22,6 +23,7 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
         raise SkillweaveError("skills must be a list of skills: skills=[Center(), ...]")
     if not skills:
         raise SkillweaveError("a hierarchy needs at least one skill: skills is empty")
+    skills = [s.as_skill() if isinstance(s, Nestable) else s for s in skills]
     for skill in skills:
         if not isinstance(skill, Skill):
             hint = " (write Center(), not Center)" if isinstance(skill, type) else ""
@@ -29,7 +31,8 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
         skill.validate()
         check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
         check_target(skill)
-        ready_policy(skill)  # says so where it cannot act
+        if inner_of(skill) is None:
+            ready_policy(skill)  # says so where it cannot act
     names = [s.name for s in skills]
     for name in names:
         if names.count(name) > 1:

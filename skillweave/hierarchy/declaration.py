@@ -9,17 +9,24 @@ from typing import Any, Literal
 
 import gymnasium as gym
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, check_spaces
+from skillweave.algorithms.config import PPO, AlgorithmConfig
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
-from skillweave.hierarchy.guidance import check_selection, fitted_guide
+from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted_selectors
+from skillweave.hierarchy.guidance import check_selection
+from skillweave.hierarchy.nesting import (
+    Nestable,
+    check_nested,
+    every_skill,
+    inner_hierarchies,
+    inner_of,
+)
 from skillweave.messages import short
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
-from skillweave.skills import Reflex, Skill, ready_policy
-from skillweave.skills.foreign_policy import fitted
+from skillweave.skills import Reflex, Skill
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.plain_agent import (
     AGENT,
@@ -27,7 +34,6 @@ from skillweave.training.plain_agent import (
     check_algorithm,
     check_env,
     check_fields,
-    check_rollout,
 )
 from skillweave.training.stage import CRITIC, SELECTOR, Together, target_of
 from skillweave.types import Policy, SkillweaveError
@@ -39,7 +45,7 @@ RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT, "flat")
 
 
 @dataclass
-class Declaration:
+class Declaration(Nestable):
     """Skills, reflexes and a selector on one environment, with budgets in environment steps.
 
     Raises:
@@ -49,7 +55,7 @@ class Declaration:
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     skills: Sequence[Skill]
-    """What the selector chooses from."""
+    """What the selector chooses from; a hierarchy among them is trained inside."""
     call_steps: int | Lengths | None = 40
     """How long a skill acts before the selector decides again; None: until it stops by itself."""
     learn: Literal["apart", "together", "apart, then together"] = "apart"
@@ -100,6 +106,8 @@ class Declaration:
     """Environment steps between evaluations of who trains, by its own reward; None: none."""
     eval_episodes: int = 20
     """Episodes of each of these evaluations."""
+    name: str = "hierarchy"
+    """What it is named where it is a skill of another hierarchy."""
 
     def __post_init__(self) -> None:
         check_env(self.env)
@@ -111,6 +119,7 @@ class Declaration:
         target_of(self.selector_target_return, None, "selector")
         check_fields(self)
         check_calls(self.call_steps, self.skills)
+        check_nested(self)
         cost: Any = self.call_cost
         if isinstance(cost, bool) or not isinstance(cost, int | float) or not 0 <= cost < math.inf:
             raise SkillweaveError(
@@ -130,27 +139,28 @@ class Declaration:
     def is_data(self) -> bool:
         """Whether acting needs none of the user's Python code, so a saved run says it all."""
         code = any(s.defines("termination") or s.defines("initiation") for s in self.skills)
-        ready = any(s.policy is not None for s in self.skills) or self.ready_selector is not None
+        plain = (inner.is_data if (inner := inner_of(s)) else s.policy is None for s in self.skills)
+        ready = self.ready_selector is not None or not all(plain)
         own = bool(self.reflexes) or self.guide is not None
         return not code and not ready and not own and self.spec.is_data
 
     @property
     def trains_from_data(self) -> bool:
         """Whether training, too, needs none of the user's Python code."""
-        own = any(s.defines(m) for s in self.skills for m in s.methods)
+        own = any(s.defines(m) for _, s in every_skill(self.skills) for m in s.methods)
         return self.is_data and self.spec.engine == "auto" and not own
 
     def skill(self, name: str) -> Skill:
-        """The skill of this name."""
-        for skill in self.skills:
-            if skill.name == name:
-                return skill
-        raise SkillweaveError(
-            f"no skill {short(name)}; there are: {', '.join(s.name for s in self.skills)}"
-        )
+        """The skill of this name, or path."""
+        found = dict(every_skill(self.skills))
+        if name not in found:
+            raise SkillweaveError(f"no skill {short(name)}; there are: {', '.join(found)}")
+        return found[name]
 
     def budget(self, skill: Skill) -> int:
-        """A skill's training steps; 0 where its policy is ready."""
+        """A skill's training steps, of a hierarchy all; 0 where its policy is ready."""
+        if (inner := inner_of(skill)) is not None:
+            return inner.total_steps
         return 0 if skill.policy is not None else skill.steps or self.skill_steps
 
     @property
@@ -158,6 +168,15 @@ class Declaration:
         """Of how many a selector's choice is one: skills, times lengths if these are chosen."""
         lengths = self.call_steps.steps if isinstance(self.call_steps, Lengths) else (0,)
         return len(self.skills) * len(lengths)
+
+    def chooses_from(self, path: str, actions: gym.Space[Any]) -> gym.Space[Any]:
+        """The actions of a selector or a skill, by its path; ``actions`` are the environment's."""
+        node, _, name = path.rpartition("/")
+        if name != SELECTOR:
+            return actions
+        inner = inner_of(self.skill(node)) if node else self
+        assert inner is not None
+        return gym.spaces.Discrete(inner.choices)
 
     @property
     def total_steps(self) -> int:
@@ -180,6 +199,8 @@ class Declaration:
         """Multiply every training budget, in place."""
         if not 0.0 < factor < float("inf"):
             raise SkillweaveError(f"scale is {factor}; it must be positive and finite")
+        for _, inner in inner_hierarchies(self.skills):
+            inner.scale(factor)
         for skill in self.skills:
             if skill.steps is not None:
                 skill.steps = max(1, round(skill.steps * factor))
@@ -228,57 +249,35 @@ class Declaration:
         try:
             obs_codec(env.observation_space)
             action_codec(env.action_space)
-            self._check_algorithms(env.action_space)
-            own = (s.algorithm for s in self.skills)
-            for config in (self.algorithm, self.selector, self.flat, *own):
-                if isinstance(config, AlgorithmConfig):
-                    check_rollout(config, env.observation_space)
-            for reflex in self.reflexes:
-                reflex.check(env.action_space)
-            self._fitted(env)
-            self.fitted_selector(env.observation_space)
-            fitted_guide(self, env.observation_space)
+            check_settings(self, env)
+            fitted_policies(self, env)
+            fitted_selectors(self, env.observation_space)
             return env.observation_space, env.action_space
         finally:
             env.close()
-
-    def _check_algorithms(self, space: gym.Space[Any]) -> None:
-        """Whether every algorithm can act where it is to act."""
-        for skill in self.skills:
-            if skill.policy is None:
-                config = skill.algorithm or self.algorithm
-                check_spaces(config, space, f"skill {skill.name!r}: ")
-        if isinstance(self.selector, AlgorithmConfig):
-            check_spaces(self.selector, gym.spaces.Discrete(self.choices), "selector: ")
-        if self.flat is not None:
-            check_spaces(self.flat, space, "flat: ")
 
     @property
     def ready_selector(self) -> ReadySelector | None:
         """The selector that is not trained; None: it is."""
         return ready_selector(self.selector, tuple(s.name for s in self.skills))
 
-    def fitted_selector(self, observation_space: gym.Space[Any]) -> Policy | None:
-        """The selector that is not trained, on these observations; None: it is trained."""
-        if (found := self.ready_selector) is None:
-            return None
-        choices = gym.spaces.Discrete(len(self.skills))
-        return fitted(found, observation_space, choices, "selector", self.spec.name)
+    def ready_selectors(self) -> dict[str, Policy]:
+        """By path, the selectors that are not trained, on the environment's observations."""
+        hierarchies = (self, *(inner_of(s) for _, s in every_skill(self.skills)))
+        if all(h is None or h.ready_selector is None for h in hierarchies):
+            return {}
+        env = self.spec.make()
+        try:
+            return fitted_selectors(self, env.observation_space)
+        finally:
+            env.close()
 
     def ready_policies(self) -> dict[str, Policy]:
-        """By skill, the policies that are not trained, on the environment's spaces."""
+        """By path, the policies of skills that are not trained, on the environment's spaces."""
         if all(s.policy is None for s in self.skills):
             return {}
         env = self.spec.make()
         try:
-            return self._fitted(env)
+            return fitted_policies(self, env)
         finally:
             env.close()
-
-    def _fitted(self, env: gym.Env[Any, Any]) -> dict[str, Policy]:
-        spaces = env.observation_space, env.action_space
-        return {
-            s.name: fitted(policy, *spaces, f"skill {s.name!r}", self.spec.name)
-            for s in self.skills
-            if (policy := ready_policy(s)) is not None
-        }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -9,10 +11,13 @@ import gymnasium as gym
 from skillweave.algorithms.config import PPO
 from skillweave.collecting.guide import Guide
 from skillweave.collecting.lengths import Lengths
+from skillweave.hierarchy.nesting import inner_of
 from skillweave.messages import short
 from skillweave.selectors import Automaton, ReadySelector, ready_selector
-from skillweave.skills.foreign_policy import fitted
+from skillweave.skills import Skill
+from skillweave.skills.foreign_policy import fitted, source_of
 from skillweave.training.plain_agent import check_algorithm
+from skillweave.training.stage import SELECTOR
 from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
@@ -41,11 +46,18 @@ def check_selection(declared: Declaration) -> None:
     for what, asked in refused.items():
         if asked:
             raise SkillweaveError(f"{what}, but the selector is ready: it does not learn")
-    if declared.weaves and all(s.policy is not None for s in declared.skills):
+    if declared.weaves and not any(_learns(s) for s in declared.skills):
         raise SkillweaveError(
             f"learn is {declared.learn!r}, but the selector and all skills are ready: nobody "
             "learns. Leave out learn, or give a selector that learns: selector=PPO()"
         )
+
+
+def _learns(skill: Skill) -> bool:
+    """Whether a skill learns, or where it is a hierarchy, anyone in it."""
+    if (inner := inner_of(skill)) is None:
+        return skill.policy is None
+    return inner.ready_selector is None or any(_learns(s) for s in inner.skills)
 
 
 def _check_guide(declared: Declaration) -> None:
@@ -94,8 +106,13 @@ def ready_guide(declared: Declaration) -> ReadySelector | None:
     return ready_selector(declared.guide, tuple(s.name for s in declared.skills))
 
 
-def fitted_guide(declared: Declaration, observation_space: gym.Space[Any]) -> Guide | None:
+def fitted_guide(
+    declared: Declaration, observation_space: gym.Space[Any], path: str = ""
+) -> Guide | None:
     """The guide of a selector that learns, on these observations; None: there is none.
+
+    Args:
+        path: of the hierarchy, ``inner/`` for example.
 
     Raises:
         SkillweaveError: it fails on them.
@@ -103,35 +120,58 @@ def fitted_guide(declared: Declaration, observation_space: gym.Space[Any]) -> Gu
     if (found := ready_guide(declared)) is None:
         return None
     choices = gym.spaces.Discrete(len(declared.skills))
-    own = fitted(found, observation_space, choices, "guide", declared.spec.name)
+    own = fitted(found, observation_space, choices, f"{path}guide", declared.spec.name)
     tells = declared.guide_nats is not None
     return Guide(cast(ReadySelector, own), declared.guide_restricts, tells)
 
 
-def who_guides(declared: Declaration) -> Guide | None:
-    """Who is asked while the selector learns, or instead of it; None: nobody."""
-    if declared.guide is None and declared.ready_selector is None:
+def restricting_guide(
+    declared: Declaration, observation_space: gym.Space[Any], path: str = ""
+) -> Guide | None:
+    """The guide that a selector keeps to after it has learnt; None: there is none."""
+    guide = fitted_guide(declared, observation_space, path)
+    return replace(guide, tells=False) if guide is not None and guide.restricts else None
+
+
+def own_guide(declared: Declaration) -> Guide | None:
+    """The guide of a selector that learns; None: there is none."""
+    if declared.guide is None:
         return None
     env = declared.spec.make()
     try:
-        ready = declared.fitted_selector(env.observation_space)
-        if ready is not None:
-            return Guide(cast(ReadySelector, ready), decides=True)
         return fitted_guide(declared, env.observation_space)
     finally:
         env.close()
 
 
-def adopt_guide(declared: Declaration, manifest: dict[str, Any], where: str) -> None:
-    """Take over from a run how its selector keeps to its guide.
+def who_guides(declared: Declaration) -> Guide | None:
+    """Who is asked while the selector learns, or instead of it; None: nobody."""
+    if declared.ready_selector is None:
+        return own_guide(declared)
+    ready = declared.ready_selectors()[SELECTOR]
+    return Guide(cast(ReadySelector, ready), decides=True)
+
+
+def guide_entry(declared: Declaration) -> dict[str, Any]:
+    """What a run says of the guide of a trained selector; nothing where there is none."""
+    if (guide := ready_guide(declared)) is None:
+        return {}
+    return {
+        "guide": source_of(guide),
+        "guide_restricts": declared.guide_restricts,
+        "guide_nats": declared.guide_nats,
+    }
+
+
+def adopt_guide(declared: Declaration, told: Mapping[str, Any], where: str) -> None:
+    """Take over from a run how a selector keeps to its guide; ``told`` is its ``guide_entry``.
 
     Raises:
         SkillweaveError: of the run and the hierarchy one has a guide, and the other has none.
     """
-    check_guided(declared.guide is not None, "guide" in manifest, where)
-    declared.guide_restricts = manifest.get("guide_restricts", True)
-    nats = [s["guide_nats"] for s in manifest["stages"] if "guide_nats" in s]
-    declared.guide_nats = nats[0] if nats else None
+    check_guided(declared.guide is not None, "guide" in told, where)
+    declared.guide_restricts = told.get("guide_restricts", True)
+    declared.guide_nats = told.get("guide_nats")
 
 
 def check_guided(mine: bool, theirs: bool, where: str) -> None:

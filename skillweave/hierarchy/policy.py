@@ -13,7 +13,7 @@ from skillweave.collecting.guide import Guide
 from skillweave.selectors import LastCall, ReadySelector
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
-from skillweave.types import Array, Memory, Policy, Step
+from skillweave.types import Array, Memory, Policy, Step, unprefixed
 
 _SELECTOR = "selector."
 
@@ -22,10 +22,11 @@ class HierarchyPolicy:
     """Decides where a call is over, lets the skill act elsewhere.
 
     Memory rows: those of ``SkillSet``, ``why`` (int8, why the last call ended; one that is
-    running has not), and the selector's own, and its guide's.
+    running has not), the selector's own and its guide's; where that tells, ``chances``: how likely
+    its latest choices were.
 
     Args:
-        guide: a ready selector that restricts what the selector may choose.
+        guide: a ready selector that is asked at every decision.
     """
 
     def __init__(self, selector: Policy, skills: SkillSet, guide: Guide | None = None) -> None:
@@ -56,7 +57,10 @@ class HierarchyPolicy:
     def start(self, n: int) -> Memory:
         """Memory of n environments that wait for their first decision."""
         memory = self.skills.start(n) | {"why": np.full(n, Why.EPISODE, np.int8)}
-        memory |= {} if self.guide is None else self.guide.start(n)
+        if self.guide is not None:
+            memory |= self.guide.start(n)
+            if self.guide.tells:
+                memory["chances"] = np.zeros((n, self.skills.choices), np.float32)
         return memory | {_SELECTOR + k: v for k, v in self.selector.start(n).items()}
 
     def act(
@@ -80,7 +84,10 @@ class HierarchyPolicy:
             may = self.skills.mask(here)
             if self.guide is not None:
                 may = np.ones((len(rows), self.skills.choices), bool) if may is None else may
-                may = self.guide.ask(memory, rows, here, may) > 0.0
+                chances = self.guide.ask(memory, rows, here, may)
+                may = chances > 0.0 if self.guide.restricts else may
+                if self.guide.tells:
+                    memory["chances"][rows] = chances
             skill, after = self.selector.act(own, here, may, deterministic=deterministic, rng=rng)
             for k, v in after.items():
                 memory[_SELECTOR + k][rows] = v
@@ -110,6 +117,14 @@ class HierarchyPolicy:
     def acting(self, memory: Memory) -> Array | None:
         """(n,) int64, the running skill."""
         return memory["skill"]
+
+    def acts(self, memory: Memory, row: int = 0) -> str:
+        """The path of the skill that acts in one environment: ``inner/skill`` for example."""
+        i = int(memory["skill"][row])
+        name, policy = self.labels[i], self.skills.policies[i]
+        if not isinstance(policy, HierarchyPolicy):
+            return name
+        return f"{name}/{policy.acts(unprefixed(str(i), memory), row)}"
 
     def _selectors(self, memory: Memory) -> Memory:
         """What the selector remembers."""

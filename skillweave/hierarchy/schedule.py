@@ -6,9 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
+from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
 from skillweave.hierarchy.guidance import who_guides
+from skillweave.hierarchy.nesting import inner_hierarchies, inner_of
 from skillweave.skills import Skill
 from skillweave.training.scene import (
     Scene,
@@ -17,42 +19,115 @@ from skillweave.training.scene import (
     skill_scene,
     woven_scene,
 )
-from skillweave.training.stage import CRITIC, SELECTOR, Policies, Stage, target_of
+from skillweave.training.stage import CRITIC, SELECTOR, Policies, Stage, Together, target_of
 
 
-def stages_of(declaration: Declaration) -> list[Stage]:
-    """Who learns when: skills apart, then the selector; then all together."""
-    apart = _apart(declaration) if declaration.learns_apart else []
-    return [*apart, *([_together(declaration)] if declaration.weaves else [])]
+def stages_of(declaration: Declaration, seen_as: Skill | None = None) -> list[Stage]:
+    """Who learns when: all in hierarchies below, skills apart, then the selector; then together.
+
+    Args:
+        seen_as: the skill that the hierarchy is, of another one; None: it is none.
+    """
+    found = []
+    if declaration.learns_apart:
+        for skill, inner in inner_hierarchies(declaration.skills):
+            found += [stage.inside(skill.name) for stage in stages_of(inner, skill)]
+    return found + own_stages(declaration, seen_as)
 
 
-def _together(declaration: Declaration) -> Stage:
-    """The stage in which skills and selector learn from the same steps."""
-    how, learns = declaration.together, [s for s in declaration.skills if s.policy is None]
+def own_stages(declaration: Declaration, seen_as: Skill | None = None) -> list[Stage]:
+    """The same without those of hierarchies below."""
+    apart = _apart(declaration, seen_as) if declaration.learns_apart else []
+    if not declaration.weaves:
+        return apart
+    compared = bool(apart) and (seen_as is None or _plays_alone(declaration))
+    return [*apart, _together(declaration, seen_as, compared)]
 
-    beside: dict[str, AlgorithmConfig] = {
-        s.name: s.algorithm or declaration.algorithm for s in learns
-    }
+
+def _together(declaration: Declaration, seen_as: Skill | None, compared: bool) -> Stage:
+    """The stage in which skills and selectors learn from the same steps.
+
+    Args:
+        compared: it is kept only if it is better than what was there before.
+    """
+    how = declaration.together
 
     def scene(policies: Policies) -> WovenScene:
-        acts: Any = [None if s in learns else policies[s.name] for s in declaration.skills]
-        numbers = tuple(i for i, s in enumerate(declaration.skills) if s in learns)
-        skills = declaration.skill_set(acts)
-        if not declaration.reflexes_in_training:
-            skills = replace(skills, reflexes=())
-        return woven_scene(declaration.spec, skills, numbers, who_guides(declaration))
+        skills, guide = learning_set(declaration, policies), who_guides(declaration)
+        margins, nats = _margins(declaration), _nats(declaration)
+        return woven_scene(declaration.spec, skills, guide, seen_as, margins, nats)
 
     ready = declaration.ready_selector is not None
-    config: Any = declaration.algorithm if ready else declaration.selector
-    if not ready and isinstance(config, PPO) and not config.floor:
-        config = replace(config, floor=how.floor, floor_final=how.floor_final)
+    beside = _learners(declaration, how)
     beside |= _critic(declaration) if how.task_weight or declaration.interrupt else {}
     target = target_of(declaration.selector_target_return, None, TOGETHER)
-    budget, cuts = declaration.together_steps, declaration.interrupt
+    config = declaration.algorithm if ready else _with_floor(declaration.selector, how)
     return Stage(
-        TOGETHER, "together", config, budget, scene, target, beside, how, cuts, ready,
+        TOGETHER,
+        "together",
+        config,
+        declaration.together_steps,
+        scene,
+        target,
+        beside,
+        how,
+        declaration.interrupt,
+        ready,
         declaration.guide_nats,
-    )  # fmt: skip
+        compared=compared,
+    )
+
+
+def _plays_alone(declaration: Declaration) -> bool:
+    """Whether a hierarchy can play whole episodes by itself: some skill may start everywhere."""
+    for skill in declaration.skills:
+        inner = inner_of(skill)
+        if not skill.defines("initiation") and (inner is None or _plays_alone(inner)):
+            return True
+    return False
+
+
+def _learners(declaration: Declaration, how: Together) -> dict[str, AlgorithmConfig]:
+    """By path, who learns below the selector, but for the critic of its skills."""
+    found: dict[str, AlgorithmConfig] = {}
+    for skill in declaration.skills:
+        if skill.policy is None:
+            found[skill.name] = skill.algorithm or declaration.algorithm
+        if (inner := inner_of(skill)) is None:
+            continue
+        own = _learners(inner, how)
+        if isinstance(inner.selector, AlgorithmConfig):
+            own[SELECTOR] = _with_floor(inner.selector, how)
+        own |= _critic(inner) if inner.interrupt else {}
+        found |= {f"{skill.name}/{name}": config for name, config in own.items()}
+    return found
+
+
+def _margins(declaration: Declaration) -> dict[str, float]:
+    """By the paths of critics in hierarchies below, where calls are cut there."""
+    found: dict[str, float] = {}
+    for skill, inner in inner_hierarchies(declaration.skills):
+        own = ({CRITIC: inner.together.margin} if inner.interrupt else {}) | _margins(inner)
+        found |= {f"{skill.name}/{name}": margin for name, margin in own.items()}
+    return found
+
+
+def _nats(declaration: Declaration) -> dict[str, float]:
+    """By the paths of selectors in hierarchies below, how far they may be from their guides."""
+    found: dict[str, float] = {}
+    for skill, inner in inner_hierarchies(declaration.skills):
+        own = _nats(inner)
+        if inner.guide_nats is not None:
+            own[SELECTOR] = inner.guide_nats
+        found |= {f"{skill.name}/{name}": nats for name, nats in own.items()}
+    return found
+
+
+def _with_floor(config: Any, how: Together) -> Any:
+    """A selector's settings, with the floor of learning together where it names none."""
+    if isinstance(config, PPO) and not config.floor:
+        return replace(config, floor=how.floor, floor_final=how.floor_final)
+    return config
 
 
 def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
@@ -67,7 +142,7 @@ def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
     return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}
 
 
-def _apart(declaration: Declaration) -> list[Stage]:
+def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
     """The skills that are to be trained, each apart, then the selector if it is not ready."""
     reflexes = declaration.reflexes if declaration.reflexes_in_training else ()
 
@@ -76,8 +151,8 @@ def _apart(declaration: Declaration) -> list[Stage]:
         target = check_target(skill)
 
         def scene(policies: Policies) -> Scene:
-            others = [s for s in declaration.skills if s.name in policies]
-            starters = declaration.skill_set([policies[s.name] for s in others], others)
+            others = [s for s in declaration.skills if can_act(s, policies)]
+            starters = declaration.skill_set([policy_of(s, policies) for s in others], others)
             led_by = starters if others else None
             return skill_scene(
                 declaration.spec, skill, reflexes, led_by, declaration.start_calls or 0
@@ -86,10 +161,11 @@ def _apart(declaration: Declaration) -> list[Stage]:
         return Stage(skill.name, "skill", config, budget, scene, target)
 
     def calls(policies: Policies) -> Scene:
-        skills = declaration.skill_set([policies[s.name] for s in declaration.skills])
+        skills = declaration.skill_set([policy_of(s, policies) for s in declaration.skills])
+        guide = who_guides(declaration)
         if declaration.interrupt:
-            return woven_scene(declaration.spec, skills, (), who_guides(declaration))
-        return selector_scene(declaration.spec, skills, who_guides(declaration))
+            return woven_scene(declaration.spec, skills, guide, seen_as)
+        return selector_scene(declaration.spec, skills, guide, seen_as)
 
     first = [skill_stage(s) for s in declaration.skills if s.policy is None]
     if not isinstance(config := declaration.selector, AlgorithmConfig):

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 from skillweave.collecting.lengths import calls_to_json
+from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
-from skillweave.hierarchy.guidance import fitted_guide, ready_guide
-from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
-from skillweave.hierarchy.schedule import stages_of
+from skillweave.hierarchy.guidance import guide_entry, ready_guide
+from skillweave.hierarchy.nesting import (
+    below,
+    check_nested,
+    every_hierarchy,
+    every_skill,
+    inner_hierarchies,
+    inner_of,
+)
+from skillweave.hierarchy.schedule import own_stages, stages_of
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.copies import keep_policy, recorded_policy
@@ -18,7 +25,7 @@ from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.training.evaluation import evaluate
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
-from skillweave.training.stage import CRITIC, SELECTOR, Policies
+from skillweave.training.stage import SELECTOR, Policies
 from skillweave.training.stage_log import Listener
 from skillweave.training.trainer import MakeLearner, train_stages
 from skillweave.training.woven import agents_of
@@ -29,6 +36,7 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
     """What a new run's ``run.json`` says."""
     if flat:
         return declaration.plain_agent().manifest(seed)
+    check_nested(declaration)
     return {
         "kind": "hierarchy",
         "env": declaration.spec.name,
@@ -37,17 +45,10 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "cut_every": declaration.cut_every,
         "eval_every": declaration.eval_every,
         "eval_episodes": declaration.eval_episodes,
-        "skills": [_skill_entry(s) for s in declaration.skills],
-        **calls_to_json(declaration.call_steps),
-        "learn": declaration.learn,
-        "interrupt": declaration.together.margin if declaration.interrupt else None,
-        "greedy_skills": declaration.greedy_skills,
-        "reflexes_in_training": declaration.reflexes_in_training,
-        "start_calls": declaration.start_calls,
+        "skills": [_skill_entry(path, s) for path, s in every_skill(declaration.skills)],
+        **_hierarchy_entry(declaration),
         "resume_needs_recipe": not declaration.trains_from_data,
-        "reflexes": [r.name for r in declaration.reflexes],
         "needs_recipe": not declaration.is_data,
-        **_selector_entry(declaration),
         "stages": [stage.entry() for stage in stages_of(declaration)],
     }
 
@@ -72,15 +73,40 @@ def train(
     ready = _ready(declaration, run)
     for name, policy in ready.items():
         keep_policy(run, name, policy)
-    stages = stages_of(declaration)
+    return assembled(declaration, _trained(declaration, run, listeners, ready, make_learner))
+
+
+def _trained(
+    declaration: Declaration,
+    run: RunDirectory,
+    listeners: tuple[Listener, ...],
+    known: Policies,
+    make_learner: MakeLearner,
+    nodes: tuple[str, ...] = (),
+    seen_as: Skill | None = None,
+) -> Policies:
+    """By path, everyone who can act after the stages of a hierarchy and of those below it.
+
+    Args:
+        known: who can act before.
+        nodes: the names on the way to the hierarchy, where it is a skill of another one.
+        seen_as: that skill.
+    """
+    if declaration.learns_apart:
+        for skill, inner in inner_hierarchies(declaration.skills):
+            where = (*nodes, skill.name)
+            known = _trained(inner, run, listeners, known, make_learner, where, skill)
+    stages = own_stages(declaration, seen_as)
+    for name in reversed(nodes):
+        stages = [stage.inside(name) for stage in stages]
     apart = [s for s in stages if s.kind != "together"]
-    before = train_stages(apart, run, listeners, ready, make_learner)
+    before = train_stages(apart, run, listeners, known, make_learner)
     if len(apart) == len(stages):
-        return _woven(declaration, run, before)
+        return before
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
-    if not apart:
-        return _woven(declaration, run, after)
-    return _better(declaration, run, listeners, before, after)
+    if not stages[-1].compared:
+        return after
+    return _better(declaration, run, listeners, before, after, nodes)
 
 
 def _better(
@@ -89,19 +115,20 @@ def _better(
     listeners: tuple[Listener, ...],
     before: Policies,
     after: Policies,
-) -> HierarchyPolicy:
+    nodes: tuple[str, ...] = (),
+) -> Policies:
     """The better of two hierarchies, by episodes of the environment; written into the run."""
-    entry = run.stage(TOGETHER)
-    policies = {
-        "before": _woven(declaration, run, before),
-        "after": _woven(declaration, run, after),
-    }
+    entry = run.stage("/".join((*nodes, TOGETHER)))
+    found = {"before": before, "after": after}
     if "kept" not in entry:
         seed = JUDGED + int(run.manifest["seed"])
         means = {
-            name: evaluate(policy, declaration.spec, episodes=100, seed=seed)
-            for name, policy in policies.items()
-        }
+            name: evaluate(
+                assembled(declaration, _inside(policies, nodes)),
+                declaration.spec, episodes=100, seed=seed,
+            )
+            for name, policies in found.items()
+        }  # fmt: skip
         entry["kept"] = {name: found.mean for name, found in means.items()}
         better = means["after"].mean >= means["before"].mean
         entry["kept"]["kept"] = "after" if better else "before"
@@ -110,10 +137,17 @@ def _better(
         kept = entry["kept"]
         for listener in listeners:
             listener.message(
-                f"{TOGETHER}: mean return before {kept['before']:.1f}, after {kept['after']:.1f} "
-                f"(100 episodes each): kept what was {kept['kept']}"
+                f"{entry['name']}: mean return before {kept['before']:.1f}, after "
+                f"{kept['after']:.1f} (100 episodes each): kept what was {kept['kept']}"
             )
-    return policies[entry["kept"]["kept"]]
+    return found[entry["kept"]["kept"]]
+
+
+def _inside(policies: Policies, nodes: tuple[str, ...]) -> Policies:
+    """Those of a hierarchy below."""
+    for name in nodes:
+        policies = below(policies, name)
+    return policies
 
 
 def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
@@ -128,8 +162,8 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
             f"{run.path}: all is learnt, but whether the hierarchy before or that after learning "
             f"together is better was not judged yet; skillweave resume {run.path}"
         )
-    policy = _woven(declaration, run, found)
-    check_parts(declaration, policy.skills.policies, policy.selector, str(run.path))
+    policy = assembled(declaration, found)
+    check_parts(declaration, policy, str(run.path))
     return policy
 
 
@@ -142,50 +176,56 @@ def _learnt(run: RunDirectory) -> dict[str, Policy]:
     return found
 
 
-def _woven(
-    declaration: Declaration, run: RunDirectory, found: Mapping[str, Policy]
-) -> HierarchyPolicy:
-    """The hierarchy of these policies."""
-    skills = declaration.skill_set([found[s.name] for s in declaration.skills])
-    if declaration.interrupt:
-        skills = with_interruption(skills, found[CRITIC], declaration.together.margin)
-    selector = _ready_selector(declaration, run, skills.policies[0]) or found[SELECTOR]
-    guide = fitted_guide(declaration, selector.observation_space)
-    if guide is None or not guide.restricts:
-        return HierarchyPolicy(selector, skills)
-    told = run.manifest.get("guide")
-    as_recorded(cast(Policy, guide.selector), told, lambda: None, f"{run.path}: the guide")
-    return HierarchyPolicy(selector, skills, guide)
-
-
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
-    """The ready policies as they were when the run began."""
+    """By path, the ready policies as they were when the run began, those of selectors too."""
     ready = declaration.ready_policies()
-    return {name: recorded_policy(run, name, policy) for name, policy in ready.items()}
+    found = {name: recorded_policy(run, name, policy) for name, policy in ready.items()}
+    for name, policy in declaration.ready_selectors().items():
+        told = _told_of(run, name.removesuffix(SELECTOR).removesuffix("/"))
+        where = f"{run.path}: the selector" + ("" if name == SELECTOR else f" {name}")
+        found[name] = as_recorded(policy, told.get(SELECTOR), lambda: None, where)
+    for path, own in every_hierarchy(declaration):
+        if own.guide_restricts and (guide := ready_guide(own)) is not None:
+            where = f"{run.path}: the guide" + (f" of {path}" if path else "")
+            as_recorded(guide, _told_of(run, path).get("guide"), lambda: None, where)
+    return found
 
 
-def _ready_selector(declaration: Declaration, run: RunDirectory, skill: Policy) -> Policy | None:
-    """The selector where it is ready, after a check that it is that of the run."""
-    selector = declaration.fitted_selector(skill.observation_space)
-    if selector is None:
-        return None
-    return as_recorded(
-        selector, run.manifest.get(SELECTOR), lambda: None, f"{run.path}: the selector"
-    )
+def _told_of(run: RunDirectory, path: str) -> dict[str, Any]:
+    """What the run says of a hierarchy: of itself, or of one below."""
+    if not path:
+        return run.manifest
+    entries: list[dict[str, Any]] = run.manifest["skills"]
+    return next((s["hierarchy"] for s in entries if s["name"] == path), {})
 
 
 def _selector_entry(declaration: Declaration) -> dict[str, Any]:
     """Where a ready selector comes from, or the guide of a trained one."""
     selector = declaration.ready_selector
-    found: dict[str, Any] = {} if selector is None else {SELECTOR: source_of(selector)}
-    if (guide := ready_guide(declaration)) is not None:
-        found |= {"guide": source_of(guide), "guide_restricts": declaration.guide_restricts}
-    return found
+    return guide_entry(declaration) if selector is None else {SELECTOR: source_of(selector)}
 
 
-def _skill_entry(skill: Skill) -> dict[str, Any]:
-    policy = ready_policy(skill)
-    entry = {"name": skill.name, "max_steps": skill.max_steps, "ready": policy is not None}
+def _skill_entry(path: str, skill: Skill) -> dict[str, Any]:
+    inner = inner_of(skill)
+    policy = ready_policy(skill) if inner is None else None
+    entry: dict[str, Any] = {"name": path, "max_steps": skill.max_steps}
+    entry["ready"] = policy is not None
     if skill.call_steps is not None:
         entry["call_steps"] = skill.call_steps
+    if inner is not None:
+        entry["hierarchy"] = _hierarchy_entry(inner)
     return entry if policy is None else entry | {"policy": source_of(policy)}
+
+
+def _hierarchy_entry(declaration: Declaration) -> dict[str, Any]:
+    """What a run says of a hierarchy, be it itself or one below."""
+    return {
+        **calls_to_json(declaration.call_steps),
+        "learn": declaration.learn,
+        "interrupt": declaration.together.margin if declaration.interrupt else None,
+        "greedy_skills": declaration.greedy_skills,
+        "reflexes_in_training": declaration.reflexes_in_training,
+        "reflexes": [r.name for r in declaration.reflexes],
+        "start_calls": declaration.start_calls,
+        **_selector_entry(declaration),
+    }

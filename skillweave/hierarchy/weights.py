@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict, cast
+from typing import Any, NotRequired, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -15,9 +16,11 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
+from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.guidance import check_guided, fitted_guide
-from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
+from skillweave.hierarchy.guidance import check_guided, ready_guide
+from skillweave.hierarchy.nesting import every_hierarchy, every_skill, inner_of
+from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
 from skillweave.reading import Positive, fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
@@ -25,7 +28,7 @@ from skillweave.selectors import ReadySelector
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT, PlainAgent
-from skillweave.training.stage import CRITIC
+from skillweave.training.stage import CRITIC, SELECTOR
 from skillweave.types import Policy, SkillweaveError
 
 
@@ -40,43 +43,71 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
     assert isinstance(declaration, Declaration)
     tensors: dict[str, Tensor] = {}
     parts: dict[str, Any] = {}
-    named: list[tuple[str, Policy]] = []
     ready: dict[str, Any] = {}
-    if isinstance(policy.selector, ReadySelector):
-        ready["selector"] = source_of(policy.selector)
-    else:
-        named.append(("selector", policy.selector))
-    cuts = policy.skills.interruption
-    if cuts is not None and cuts.critic is not None:
-        named.append((CRITIC, cuts.critic))
-    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
-        if skill.policy is None:
-            named.append((skill.name, own))
+    for name, trained, own in _parts_of(declaration, policy):
+        if trained:
+            assert isinstance(own, AgentPolicy)
+            weights, parts[name] = own.to_file()
+            tensors |= {f"{name}/{k}": v for k, v in weights.items()}
             continue
-        ready[skill.name] = source_of(own)
+        ready[name] = source_of(own)
         if isinstance(own, Foreign) and (content := own.content()) is not None:
-            tensors[f"{skill.name}/content"] = torch.tensor(np.frombuffer(content, np.uint8))
-    for name, own in named:
-        assert isinstance(own, AgentPolicy)
-        weights, parts[name] = own.to_file()
-        tensors |= {f"{name}/{k}": v for k, v in weights.items()}
+            tensors[f"{name}/content"] = torch.tensor(np.frombuffer(content, np.uint8))
+    hierarchies = every_hierarchy(declaration)
     header = {
         "kind": "hierarchy",
         "recipe": getattr(declaration, "recipe", None),
         **place,
-        "skills": [s.name for s in declaration.skills],
-        **calls_to_json(declaration.call_steps),
-        "interrupt": None if cuts is None else cuts.margin,
-        "greedy_skills": declaration.greedy_skills,
+        "skills": [name for name, _ in every_skill(declaration.skills)],
+        **_how(declaration),
+        "hierarchies": {name: _how(found) for name, found in hierarchies if name},
         "parts": parts,
         "ready": ready,
     }
-    if policy.guide is not None:
-        header["guide"] = source_of(cast(Policy, policy.guide.selector))
     write_tensors(path, tensors, header)
 
 
-class HierarchyHeader(TypedDict):
+def _parts_of(
+    declaration: Declaration, policy: HierarchyPolicy, path: str = ""
+) -> Iterator[tuple[str, bool, Policy]]:
+    """All who act in a hierarchy: path, whether they were trained in it, policy."""
+    trained = not isinstance(policy.selector, ReadySelector)
+    yield path + SELECTOR, trained, policy.selector
+    cuts = policy.skills.interruption
+    if cuts is not None and cuts.critic is not None:
+        yield path + CRITIC, True, cuts.critic
+    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
+        inner = inner_of(skill)
+        if inner is None:
+            yield path + skill.name, skill.policy is None, own
+        else:
+            assert isinstance(own, HierarchyPolicy)
+            yield from _parts_of(inner, own, f"{path}{skill.name}/")
+
+
+def _how(declaration: Declaration) -> dict[str, Any]:
+    """How a hierarchy calls its skills."""
+    guide = ready_guide(declaration) if declaration.guide_restricts else None
+    return {
+        **calls_to_json(declaration.call_steps),
+        "interrupt": declaration.together.margin if declaration.interrupt else None,
+        "greedy_skills": declaration.greedy_skills,
+        **({} if guide is None else {"guide": source_of(guide)}),
+    }
+
+
+class InnerHeader(TypedDict):
+    """What the file says of how a hierarchy calls its skills."""
+
+    call_steps: Positive | None
+    call_lengths: NotRequired[list[Positive]]
+    interrupt: NotRequired[float | None]
+    greedy_skills: bool
+    guide: NotRequired[Source]
+    """Of the ready selector that restricts the trained one."""
+
+
+class HierarchyHeader(InnerHeader):
     """What the file of a hierarchy's weights says of them."""
 
     kind: str
@@ -84,15 +115,11 @@ class HierarchyHeader(TypedDict):
     env_kwargs: NotRequired[dict[str, Any]]
     recipe: NotRequired[str | None]
     skills: list[str]
-    call_steps: Positive | None
-    call_lengths: NotRequired[list[Positive]]
-    interrupt: NotRequired[float | None]
-    greedy_skills: bool
     parts: dict[str, dict[str, Any]]
-    guide: NotRequired[Source]
-    """Of the ready selector that restricts the trained one."""
     ready: NotRequired[dict[str, Source]]
-    """Of skills by name, and of "selector"."""
+    """Of skills by path, and of selectors."""
+    hierarchies: NotRequired[dict[str, InnerHeader]]
+    """By path, skills that are hierarchies; their own skills are among all ``skills``."""
 
 
 def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -144,8 +171,10 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     tensors, header = open_weights(path)
     if header["kind"] == "agent":
         return read_agent(declaration.spec, tensors, header, path)
-    names = [s.name for s in declaration.skills]
-    if header["skills"] != names or header["env"] != declaration.spec.name:
+    skills = dict(every_skill(declaration.skills))
+    names, inner = list(skills), {name for name, _ in every_hierarchy(declaration) if name}
+    told = header.get("hierarchies", {})
+    if header["skills"] != names or header["env"] != declaration.spec.name or set(told) != inner:
         theirs = ", ".join(header["skills"])
         raise SkillweaveError(
             f"{path} is of skills {theirs[:300]} on {header['env'][:100]}, but the "
@@ -153,7 +182,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
         )
 
     def part(name: str) -> AgentPolicy:
-        own = {k.split("/", 1)[1]: v for k, v in tensors.items() if k.split("/", 1)[0] == name}
+        own = {k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(f"{name}/")}
         if name not in header["parts"]:
             raise SkillweaveError(f"{path} holds no weights of {name!r}")
         return AgentPolicy.from_file(own, header["parts"][name], f"{path} ({name})")
@@ -162,35 +191,46 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
         content = tensors.get(f"{name}/content")
         return None if content is None else content.contiguous().numpy().tobytes()
 
-    policies: list[Policy] = []
+    found: dict[str, Policy] = {}
     ready, recorded = declaration.ready_policies(), header.get("ready", {})
-    for name in names:
-        if name in ready:
-            read, where = partial(copied, name), f"{path}: skill {name!r}"
-            policies.append(as_recorded(ready[name], recorded.get(name), read, where))
-        else:
-            policies.append(part(name))
-    declaration.call_steps = calls_from_json(header)
-    selector = declaration.fitted_selector(policies[0].observation_space)
-    check_selector(selector is not None, "selector" in recorded, str(path))
-    if selector is None:
-        selector = part("selector")
-    else:
-        place = f"{path}: the selector"
-        selector = as_recorded(selector, recorded["selector"], lambda: None, place)
-    check_parts(declaration, policies, selector, str(path))
-    declaration.greedy_skills = header["greedy_skills"]
-    skills = declaration.skill_set(policies)
-    if (margin := header.get("interrupt")) is not None:
-        skills = with_interruption(skills, part(CRITIC), margin)
-    guide = fitted_guide(declaration, selector.observation_space)
-    restricts = guide is not None and guide.restricts
-    check_guided(restricts, "guide" in header, str(path))
-    if guide is None or not restricts:
-        return HierarchyPolicy(selector, skills)
-    own = cast(Policy, guide.selector)
-    as_recorded(own, header["guide"], lambda: None, f"{path}: the guide")
-    return HierarchyPolicy(selector, skills, guide)
+    for name, policy in ready.items():
+        read, where = partial(copied, name), f"{path}: skill {name!r}"
+        found[name] = as_recorded(policy, recorded.get(name), read, where)
+    for name, own in every_hierarchy(declaration):
+        node, where = f"{name}/" if name else "", f"{path}: {name}" if name else str(path)
+        how = told[name] if name else header
+        adopt_calls(own, how)
+        check_selector(own.ready_selector is not None, node + SELECTOR in recorded, where)
+        for other in [SELECTOR, *([CRITIC] if own.interrupt else [])]:
+            if node + other not in recorded:
+                found[node + other] = part(node + other)
+        _check_guide(own, how.get("guide"), where)
+    for name, policy in declaration.ready_selectors().items():
+        found[name] = as_recorded(policy, recorded[name], lambda: None, f"{path}: the {name}")
+    for name, skill in skills.items():
+        if skill.policy is None:
+            found[name] = part(name)
+    whole = assembled(declaration, found)
+    check_parts(declaration, whole, str(path))
+    return whole
+
+
+def _check_guide(declaration: Declaration, told: dict[str, Any] | None, where: str) -> None:
+    """Raise a SkillweaveError where the selector was trained under another guide."""
+    guide = ready_guide(declaration) if declaration.guide_restricts else None
+    check_guided(guide is not None, told is not None, where)
+    if guide is not None:
+        as_recorded(guide, told, lambda: None, f"{where}: the guide")
+
+
+def adopt_calls(declaration: Declaration, told: Mapping[str, Any]) -> None:
+    """Take over how a hierarchy calls its skills."""
+    declaration.call_steps = calls_from_json(told)
+    declaration.greedy_skills = told["greedy_skills"]
+    margin = told.get("interrupt")
+    declaration.interrupt = margin is not None
+    if margin is not None:
+        declaration.together = replace(declaration.together, margin=margin)
 
 
 def check_selector(mine: bool, theirs: bool, where: str) -> None:
@@ -203,23 +243,35 @@ def check_selector(mine: bool, theirs: bool, where: str) -> None:
         )
 
 
-def check_parts(
-    declaration: Declaration, policies: Sequence[Policy], selector: Policy, where: str
-) -> None:
+def check_parts(declaration: Declaration, policy: HierarchyPolicy, where: str) -> None:
     """Raise a SkillweaveError where a policy is not of the spaces that its place asks for.
 
-    The selector chooses among the skills; they all see and do what the first of them does.
+    Selectors choose among their skills; skills all see and do what the first of them does.
     """
-    first = policies[0]
+    first = policy.skills.policies[0]
     wanted = {"observation_space": first.observation_space, "action_space": first.action_space}
-    places = {s.name: (p, wanted) for s, p in zip(declaration.skills, policies, strict=True)}
+    _check_parts(declaration, policy, wanted, where, "")
+
+
+def _check_parts(
+    declaration: Declaration,
+    policy: HierarchyPolicy,
+    wanted: dict[str, gym.Space[Any]],
+    where: str,
+    path: str,
+) -> None:
     choices = gym.spaces.Discrete(declaration.choices)
-    places["selector"] = selector, wanted | {"action_space": choices}
-    for name, (policy, spaces) in places.items():
+    places = {SELECTOR: (policy.selector, wanted | {"action_space": choices})}
+    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
+        places[skill.name] = own, wanted
+        if (inner := inner_of(skill)) is not None:
+            assert isinstance(own, HierarchyPolicy)
+            _check_parts(inner, own, wanted, where, f"{path}{skill.name}/")
+    for name, (own, spaces) in places.items():
         for kind, space in spaces.items():
-            found = getattr(policy, kind)
+            found = getattr(own, kind)
             if not same_space(found, space):
                 raise SkillweaveError(
-                    f"{where}: the policy in the place of {name!r} has {kind} {shown(found)}, but "
-                    f"{shown(space)} belongs there"
+                    f"{where}: the policy in the place of {path + name!r} has {kind} "
+                    f"{shown(found)}, but {shown(space)} belongs there"
                 )

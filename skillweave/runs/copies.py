@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.reading import read_file
-from skillweave.runs.directory import RunDirectory
+from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import make_directory, write_bytes
 from skillweave.skills.foreign_policy import Foreign, as_recorded
 from skillweave.types import Policy
@@ -39,4 +39,4 @@ def recorded_policy(run: RunDirectory, skill: str, policy: Policy) -> Policy:
 
 
 def _copy_path(run: RunDirectory, skill: str, policy: Foreign) -> Path:
-    return run.path / "policies" / f"{skill}{policy.suffix}"
+    return run.path / "policies" / f"{file_name(skill)}{policy.suffix}"

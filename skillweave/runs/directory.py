@@ -50,6 +50,11 @@ from skillweave.types import SkillweaveError, unprefixed
 S = TypeVar("S")
 
 
+def file_name(path: str) -> str:
+    """The name of a file for who has this path: ``inner.skill`` for ``inner/skill``."""
+    return path.replace("/", ".")
+
+
 class RunDirectory:
     """One run on disk. ``manifest`` is the content of ``run.json``."""
 
@@ -151,9 +156,11 @@ class RunDirectory:
     @property
     def unjudged(self) -> bool:
         """Whether nobody has found out yet which is better: before, or after, learning together."""
-        stages = self.manifest["stages"]
-        both = self.manifest.get("learn") == "apart, then together"
-        return both and any(s["kind"] == "together" and "kept" not in s for s in stages)
+        both = self.manifest.get("learn") == "apart, then together"  # older runs say no more
+        return any(
+            s["kind"] == "together" and s.get("compared", both) and "kept" not in s
+            for s in self.manifest["stages"]
+        )
 
     def save_checkpoint(
         self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
@@ -263,7 +270,7 @@ class RunDirectory:
     def policy_path(self, stage: str, name: str | None = None) -> Path:
         """Where the policy of a stage lies, or of one who learns in it."""
         file = stage if name in (None, stage) else f"{stage}.{name}"
-        return self.path / "policies" / f"{file}.safetensors"
+        return self.path / "policies" / f"{file_name(file)}.safetensors"
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""

@@ -21,20 +21,50 @@ from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 from skillweave.types import SkillweaveError
 
-Name = Annotated[
-    str, Asked("letters, digits, '_' and '-', at most 64", lambda x: NAME.fullmatch(x) is not None)
+
+def _is_path(text: str) -> bool:
+    names = text.split("/")
+    return len(names) <= MOST_NAMES and all(NAME.fullmatch(name) for name in names)
+
+
+MOST_NAMES = 16
+"""In a path."""
+NodePath = Annotated[
+    str, Asked("names of letters, digits, '_' and '-', with '/' between", _is_path)
 ]
-"""It names a file, too."""
+"""A name after those of the hierarchies that it is in: ``inner/skill``."""
+
+
+class NestedEntry(TypedDict):
+    """A hierarchy: the run's, or a skill of it or of another one; its skills have entries, too."""
+
+    call_steps: Positive | None
+    call_lengths: NotRequired[list[Positive]]
+    interrupt: NotRequired[float | None]
+    """By how much another skill must be worth more for a call to be cut."""
+    learn: NotRequired[Literal["apart", "together", "apart, then together"]]
+    greedy_skills: bool
+    selector: NotRequired[Source]
+    """Of a ready selector; absent where it is trained."""
+    guide: NotRequired[Source]
+    """Of the ready selector that a trained one keeps to."""
+    guide_restricts: NotRequired[bool]
+    guide_nats: NotRequired[float | None]
+    reflexes: NotRequired[list[str]]
+    reflexes_in_training: NotRequired[bool]
+    start_calls: NotRequired[int | None]
 
 
 class SkillEntry(TypedDict):
-    """A skill of the run."""
+    """A skill of the run, or of a hierarchy that is one."""
 
-    name: Name
+    name: NodePath
     max_steps: Positive | None
     call_steps: NotRequired[Positive]
     ready: NotRequired[bool]
     policy: NotRequired[Source]
+    hierarchy: NotRequired[NestedEntry]
+    """What it is made of."""
 
 
 class Winner(TypedDict):
@@ -71,11 +101,11 @@ class Kept(TypedDict):
 class StageEntry(TypedDict):
     """A stage: who learns in it and who decides, for how many steps, and how far it is."""
 
-    name: Name
+    name: NodePath
     kind: Literal["agent", "skill", "selector", "together"]
-    learns: Annotated[list[Name], Asked("at least one name", bool)]
+    learns: Annotated[list[NodePath], Asked("at least one name", bool)]
     """Whose weights the stage changes: "agent", "selector" or a skill's name."""
-    decides: Name | None
+    decides: NodePath | None
     """Who chooses among the skills; None: one acts all the time."""
     budget: Positive
     algorithm: dict[str, Any]
@@ -94,16 +124,18 @@ class StageEntry(TypedDict):
     winner: NotRequired[Winner]
     sha256: NotRequired[str]
     """Of its policy's file."""
-    policies: NotRequired[dict[Name, str]]
+    policies: NotRequired[dict[NodePath, str]]
     """The same where several learn: by name, checksums of their policies' files."""
     together: NotRequired[dict[str, Any]]
     """How skills and selector learn together."""
-    algorithms: NotRequired[dict[Name, dict[str, Any]]]
+    algorithms: NotRequired[dict[NodePath, dict[str, Any]]]
     """Of the skills that learn together with the selector."""
     interrupt: NotRequired[bool]
     """The selector cuts calls."""
     guide_nats: NotRequired[float]
     """How far the selector may be from its guide."""
+    compared: NotRequired[bool]
+    """What is learnt together is kept only if it is better than what was there before."""
     kept: NotRequired[Kept]
     """Whether what was there before was better than what was learnt together."""
 
@@ -128,24 +160,10 @@ class Manifest(TypedDict):
     track: NotRequired[list[str]]
 
 
-class HierarchyManifest(Manifest):
+class HierarchyManifest(Manifest, NestedEntry):
     """``run.json`` of a hierarchy."""
 
     skills: list[SkillEntry]
-    call_steps: Positive | None
-    call_lengths: NotRequired[list[Positive]]
-    interrupt: NotRequired[float | None]
-    """By how much another skill must be worth more for a call to be cut."""
-    learn: NotRequired[Literal["apart", "together", "apart, then together"]]
-    greedy_skills: bool
-    selector: NotRequired[Source]
-    """Of a ready selector; absent where it is trained."""
-    guide: NotRequired[Source]
-    """Of the ready selector that a trained one keeps to."""
-    guide_restricts: NotRequired[bool]
-    reflexes: NotRequired[list[str]]
-    reflexes_in_training: NotRequired[bool]
-    start_calls: NotRequired[int | None]
 
 
 class MemberEntry(TypedDict):
@@ -177,7 +195,7 @@ class BestEntry(TypedDict):
 class LineageLine(TypedDict):
     """A line of ``lineage.jsonl``: a member in a generation."""
 
-    stage: Name
+    stage: NodePath
     generation: Count
     member: Count
     parent: Count | None
@@ -191,7 +209,7 @@ class LineageLine(TypedDict):
 MetricsLine = TypedDict(
     "MetricsLine",
     {
-        "stage": NotRequired[Name],
+        "stage": NotRequired[NodePath],
         "update": NotRequired[Count],
         "steps": NotRequired[Count],
         "seconds": NotRequired[Seconds],
@@ -204,7 +222,7 @@ MetricsLine = TypedDict(
 class Checkpoint(TypedDict):
     """A checkpoint's header."""
 
-    stage: Name
+    stage: NodePath
     update: Count
     steps: Count
     evaluation_steps: Count

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from skillweave.algorithms.policy import state_from
-from skillweave.runs.directory import RunDirectory
+from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import make_directory, read_tensors, remove, write_tensors
 from skillweave.types import SkillweaveError
 
@@ -33,7 +33,8 @@ def save_state(run: RunDirectory, stage: str, name: str, state: Any) -> None:
 def load_state(run: RunDirectory, name: str, like: S) -> S | None:
     """The state that ``name`` ended its latest stage with; None: none was written.
 
-    A population writes none, and older versions did not.
+    A population writes none, and older versions did not. Where what was learnt in that stage was
+    not kept, its state is none of who goes on.
 
     Raises:
         SkillweaveError: the file is damaged, or belongs elsewhere.
@@ -45,6 +46,8 @@ def load_state(run: RunDirectory, name: str, like: S) -> S | None:
     if header.get("learns") != name:
         raise SkillweaveError(f"{path} does not hold the state of {name!r}")
     run.must_be_ours(header, path)
+    if run.stage(header.get("stage", "")).get("kept", {}).get("kept") == "before":
+        return None
     return state_from(tensors, like, str(path))
 
 
@@ -58,4 +61,4 @@ def drop_states(run: RunDirectory, stage: str) -> None:
 
 
 def _path(run: RunDirectory, name: str) -> Path:
-    return run.path / "states" / f"{name}.safetensors"
+    return run.path / "states" / f"{file_name(name)}.safetensors"

@@ -16,7 +16,7 @@ from skillweave.collecting.calls import Why
 from skillweave.collecting.guide import LastCall
 from skillweave.messages import short
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
-from skillweave.skills.base import answer
+from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import checksum
 from skillweave.types import Array, Memory, SkillweaveError, Step
 

@@ -1,6 +1,7 @@
 """Skills and reflexes: what a user declares."""
 
-from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, checked
+from skillweave.skills.answers import checked
+from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, path_of
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
 from skillweave.skills.sb3 import from_sb3
@@ -17,5 +18,6 @@ __all__ = [
     "from_onnx",
     "from_sb3",
     "from_torch",
+    "path_of",
     "ready_policy",
 ]

@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.messages import short
-from skillweave.skills.outputs import as_array, at_step, called, checked_actions
-from skillweave.types import Array, SkillweaveError, Step, finite, read_only
+from skillweave.skills.answers import answer
+from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.types import Array, SkillweaveError, Step
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 """What a skill may be named: its name names files, too."""
@@ -56,6 +57,8 @@ class Skill:
     color: tuple[int, int, int] | None = None
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
+
+    _path: str = ""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -104,6 +107,11 @@ class Skill:
                 raise SkillweaveError(
                     f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
+
+
+def path_of(skill: Skill) -> str:
+    """What messages call a skill: its name, after those of the hierarchies that it is in."""
+    return skill._path or skill.name
 
 
 class RecordedSkill(Skill):
@@ -204,100 +212,5 @@ def asked(
         SkillweaveError: as of ``answer``.
     """
     dtype = np.float32 if method == "reward" else bool
-    who = f"skill {skill.name!r}"
+    who = f"skill {path_of(skill)!r}"
     return answer(getattr(skill, method), about, n, dtype, who, method, elapsed, ids)
-
-
-def answer(
-    function: Callable[[Any], Any],
-    about: Step | Array,
-    n: int,
-    dtype: type,
-    who: str,
-    method: str,
-    elapsed: Array | int | None = None,
-    ids: Array | None = None,
-) -> Array:
-    """What a function of the user's returns, ``checked``.
-
-    Raises:
-        SkillweaveError: the function failed, or returned something else than was asked for.
-    """
-    if isinstance(about, np.ndarray):
-        about = read_only(about)
-    value = called(function, about, f"{who}: {method}()", elapsed)
-    return checked(value, n, dtype, who, method, elapsed, ids)
-
-
-def checked(
-    value: Any,
-    n: int,
-    dtype: type,
-    who: str,
-    method: str,
-    elapsed: Array | int | None = None,
-    ids: Array | None = None,
-) -> Array:
-    """``value`` as an array (n,) of ``dtype``.
-
-    Args:
-        elapsed: at which steps, (n,) or (), for messages.
-        ids: in which environments, (n,), for messages; None: in all n.
-
-    Raises:
-        SkillweaveError: it has another shape or kind, or is a NaN or an infinity; the message
-            names the skill, the method and the step.
-    """
-    array = as_array(value, f"{who}: {method}()")
-    if array.shape != (n,):
-        raise SkillweaveError(
-            f"{who}: {method}() returned shape {array.shape}{at_step(elapsed)}, but ({n},) was "
-            f"expected: one number for each of the {n} environments"
-        )
-    if dtype is bool:
-        return (
-            array
-            if array.dtype == bool
-            else _flags(array, f"{who}: {method}()", at_step(elapsed), ids)
-        )
-    if array.dtype.kind not in "fiub":
-        raise SkillweaveError(
-            f"{who}: {method}() returned {_kind(array)}{at_step(elapsed)}, but rewards are real "
-            "numbers"
-        )
-    with np.errstate(over="ignore"):  # an overflow is an infinity, reported below
-        array = array.astype(dtype, copy=False)
-    if not finite(array):
-        row = int(np.flatnonzero(~np.isfinite(array))[0])
-        when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
-        raise SkillweaveError(
-            f"{who}: {method}() returned {array[row]}{when} for environment {_number(row, ids)}: "
-            "rewards must be finite"
-        )
-    return array
-
-
-def _number(row: int, ids: Array | None) -> int:
-    """The environment that a row is of."""
-    return row if ids is None else int(ids[row])
-
-
-def _flags(array: Array, what: str, when: str, ids: Array | None) -> Array:
-    """Numbers that are all 0 or 1, as bool."""
-    if array.dtype.kind not in "fiu":
-        raise SkillweaveError(
-            f"{what} returned {_kind(array)}{when}, but yes or no (bool) is asked"
-        )
-    wrong = np.flatnonzero((array != 0) & (array != 1))
-    if len(wrong):
-        row = int(wrong[0])
-        raise SkillweaveError(
-            f"{what} returned {array[row]}{when} for environment {_number(row, ids)}, but yes or "
-            "no (bool) is asked: compare with something"
-        )
-    return array.astype(bool)
-
-
-def _kind(array: Array) -> str:
-    first = array.reshape(-1)[:1].tolist()  # as Python's own values, which read better
-    return f"{array.dtype} ({short(first[0])})" if first else str(array.dtype)

@@ -17,7 +17,7 @@ from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
-from skillweave.training.skill_report import SkillReport, SkillTally, skill_table
+from skillweave.training.skill_report import SkillReport, SkillTally, all_steps, skill_table
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
@@ -69,7 +69,7 @@ class Evaluation:
         n = len(returns)
         std = float(returns.std(ddof=1)) if n > 1 else 0.0
         half = 1.96 * std / np.sqrt(n)
-        total = sum(self.skill_steps.values())
+        total = all_steps(self.skills)
         skills = {name: report.to_json(total) for name, report in self.skills.items()}
         return {
             "episodes": n,

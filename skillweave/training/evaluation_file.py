@@ -93,7 +93,8 @@ def load_evaluation(run: RunDirectory) -> SavedEvaluation | None:
     found: EvaluationFile = fit(EvaluationFile, data, str(path))
     names = {entry["name"] for entry in run.manifest.get("skills", [])}
     ours = found.get("run") == run.manifest.get("id")
-    if not ours or not set(found["evaluation"].skills) <= names:
+    told = {name.partition("/")[0] for name in found["evaluation"].skills}
+    if not ours or not told <= names:  # a ready hierarchy's own skills are not the run's
         raise SkillweaveError(f"{path} belongs to another run; delete it, and evaluate again")
     return SavedEvaluation(
         found["made"], found["seed"], found["deterministic"], found["evaluation"]

@@ -27,6 +27,8 @@ class Played:
     begun: Array | None = None  # (k,) bool: a call of that skill began
     elapsed: Array | None = None  # (k,) int64, steps of its call so far; None: not told
     why: Array | None = None  # (k,) int8, the policy's ``Why`` its call has ended; None: not told
+    chosen: Memory | None = None  # what the policy remembered when it had acted
+    after: Memory | None = None  # the same after the step
 
     @property
     def over(self) -> Array:
@@ -83,9 +85,10 @@ def play(
         acting = policy.acting(own)
         begun = own["elapsed"] == 0 if "elapsed" in own else np.zeros(len(rows), bool)
         played = episodes.step(action)
-        played.acting, played.begun = acting, begun
+        played.acting, played.begun, played.chosen = acting, begun, own
         after = policy.observe(own, played.step)
         played.elapsed, played.why = after.get("elapsed"), after.get("why")
+        played.after = after
         for k, v in after.items():
             memory[k][rows] = v
         yield played

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.guide import AskedElsewhere, Guide
+from skillweave.collecting.levels import CRITIC, SELECTOR
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.engine import Engine
@@ -76,14 +77,21 @@ def skill_scene(
     return Scene(spec.name, *_spaces(spec), collector)
 
 
-def selector_scene(spec: EnvSpec, skills: SkillSet, guide: Guide | None = None) -> Scene:
-    """The environments in which a selector calls skills, perhaps guided by a ready one."""
+def selector_scene(
+    spec: EnvSpec, skills: SkillSet, guide: Guide | None = None, seen_as: Skill | None = None
+) -> Scene:
+    """The environments in which a selector calls skills.
+
+    Args:
+        guide: a ready selector that is asked wherever it decides.
+        seen_as: the skill that all of it is, in another hierarchy; None: the task itself.
+    """
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return DecisionCollector(engine, acting, skills, keep_rewards=shared, guide=guide)
+        return DecisionCollector(engine, acting, skills, shared, guide, seen_as)
 
     observation_space, _ = _spaces(spec)
     choices = gym.spaces.Discrete(skills.choices)
@@ -95,44 +103,79 @@ class WovenScene(Scene):
     """Environments in which a selector calls skills, and some of these learn too."""
 
     skills: SkillSet = field(kw_only=True)
-    """Those that learn have any policy."""
-    learners: tuple[int, ...] = field(kw_only=True)
-    """The numbers of those that learn."""
+    """Those that learn have any policy, or are ``Inner``."""
     skill_space: gym.Space[Any] = field(kw_only=True)
     """What skills choose from."""
     spec: EnvSpec = field(kw_only=True)
-    guide: Guide | None = field(default=None, kw_only=True)
+    guide: Guide | None = field(kw_only=True)
     """A ready selector, which is asked wherever the selector decides, or decides itself."""
+    seen_as: Skill | None = field(kw_only=True)
+    """The skill that all of it is, in another hierarchy."""
+    margins: Mapping[str, float] = field(kw_only=True)
+    """By the paths of critics in hierarchies below: where calls are cut there."""
+    nats: Mapping[str, float] = field(kw_only=True)
+    """By the paths of selectors in hierarchies below: how far they may be from their guides."""
+
+    def chooses_from(self, path: str) -> gym.Space[Any]:
+        """The actions of a skill, a selector or a critic of skills, by its path."""
+        *nodes, name = path.split("/")
+        level = self.level(nodes)
+        if name == SELECTOR:
+            return gym.spaces.Discrete(level.choices)
+        return gym.spaces.Discrete(len(level.skills)) if name == CRITIC else self.skill_space
+
+    def steps_of_row(self, path: str) -> int:
+        """Environment steps of a row of a learner's experience, about, by its path."""
+        *nodes, name = path.split("/")
+        return self.level(nodes).usual_steps or CALL if name == SELECTOR else 1
+
+    def is_greedy(self, path: str) -> bool:
+        """Whether a learner does not explore where its hierarchy is evaluated, by its path."""
+        *nodes, name = path.split("/")
+        return name == SELECTOR or self.level(nodes).greedy
+
+    def level(self, nodes: Sequence[str]) -> SkillSet:
+        """The skills of a hierarchy below, by the names on the way to it."""
+        found = self.skills
+        for node in nodes:
+            number = [s.name for s in found.skills].index(node)
+            inner: Any = found.policies[number]
+            found = inner.skills
+        return found
 
     def woven(
         self,
         engine: Engine,
         acting: Acting | None,
-        learners: Sequence[Acting],
-        critic: Acting | None = None,
-        margin: float | None = None,
+        learners: Mapping[str, Acting],
+        margins: Mapping[str, float],
     ) -> WovenCollector:
         """A collector of these environments.
 
         Args:
             acting: the selector; None: the guide decides.
-            learners: the skills that learn, in their order.
-            critic, margin: as of ``WovenCollector``.
+            learners, margins: as of ``WovenCollector``.
         """
-        by_number = dict(zip(self.learners, learners, strict=True))
         decides: Any = acting or AskedElsewhere(engine.num_envs)
-        return WovenCollector(engine, decides, self.skills, by_number, critic, margin, self.guide)
+        return WovenCollector(
+            engine, decides, self.skills, learners, margins, self.guide, self.seen_as
+        )
 
 
 def woven_scene(
-    spec: EnvSpec, skills: SkillSet, learners: tuple[int, ...], guide: Guide | None = None
+    spec: EnvSpec,
+    skills: SkillSet,
+    guide: Guide | None = None,
+    seen_as: Skill | None = None,
+    margins: Mapping[str, float] | None = None,
+    nats: Mapping[str, float] | None = None,
 ) -> WovenScene:
-    """The environments in which a selector calls skills, and those of ``learners`` learn too."""
+    """The environments in which a selector calls skills, and some of these learn too."""
     plain = skill_scene(spec)
     return WovenScene(
         spec.name, plain.observation_space, gym.spaces.Discrete(skills.choices), plain.collector,
-        skills.usual_steps or CALL, skills=skills, learners=learners,
-        skill_space=plain.action_space, spec=spec, guide=guide,
+        skills.usual_steps or CALL, skills=skills, skill_space=plain.action_space, spec=spec,
+        guide=guide, seen_as=seen_as, margins=margins or {}, nats=nats or {},
     )  # fmt: skip
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet, Why, skill_step
+from skillweave.collecting.calls import SkillSet, Why, skill_step, skills_below
 from skillweave.reading import Count
 from skillweave.skills import asked
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.play import Played
-from skillweave.types import Array, Policy
+from skillweave.types import Array, Policy, unprefixed
 
 ENDS = {Why.OWN: "own", Why.LIMIT: "limit", Why.INTERRUPTED: "interrupted", Why.EPISODE: "episode"}
 """Why a call ended, as reports name it."""
@@ -23,9 +23,10 @@ ENDS = {Why.OWN: "own", Why.LIMIT: "limit", Why.INTERRUPTED: "interrupted", Why.
 class SkillReport:
     """What one skill did in all episodes of an evaluation.
 
-    Calls are those of the policy's own selector: a hierarchy that is a skill of another counts as
-    one skill. What needs the skills' declarations is not known of a policy that is no hierarchy,
-    and its reward and success not of a run that was loaded without its code.
+    A skill that is a hierarchy has a report, and each of its own skills has one, under its path. A
+    call in it goes on where the hierarchy is called again at once; where another skill follows, it
+    has ended by the limit. What needs the skills' declarations is not known of a policy that is no
+    hierarchy, and its reward and success not of a run that was loaded without its code.
     """
 
     steps: Count
@@ -102,10 +103,16 @@ def judge(skills: SkillSet, played: Played) -> Judged:
 
 
 class SkillTally:
-    """Counts what each skill of a policy does, as episodes are played."""
+    """Counts what each skill of a policy does, as episodes are played.
 
-    def __init__(self, policy: Policy, episodes: int) -> None:
-        self.labels = policy.labels
+    Args:
+        policy: whose skills; a hierarchy's are counted at every level.
+        episodes: that are played.
+        path: of its skills: empty, or ``inner/`` for example.
+    """
+
+    def __init__(self, policy: Policy, episodes: int, path: str = "") -> None:
+        self.labels, self._path = policy.labels, path
         found = getattr(policy, "skills", None)
         self.skills = found if isinstance(found, SkillSet) else None
         count = len(self.labels)
@@ -117,6 +124,13 @@ class SkillTally:
         self._before = np.zeros(episodes, np.int64)
         # One sum for each episode, so the result does not depend on which are played together.
         self._returns = np.zeros((episodes, count))
+        policies = () if self.skills is None else self.skills.policies
+        self._below = {
+            i: SkillTally(own, episodes, f"{path}{self.labels[i]}/")
+            for i, own in enumerate(policies)
+            if skills_below(own) is not None
+        }
+        self._open = np.full(episodes, -1)  # by episode, the skill whose call may go on
 
     def add(self, played: Played) -> None:
         """Count one step of each environment."""
@@ -131,23 +145,40 @@ class SkillTally:
         own = played.reward
         if self.skills is not None:
             judged = judge(self.skills, played)
+            self._open[played.episode] = np.where(judged.why == Why.RUNNING, acting, -1)
             own = judged.reward
             ended = np.flatnonzero(judged.why != Why.RUNNING)
             np.add.at(self._ended, (acting[ended], judged.why[ended]), 1)
             np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
         self._returns[played.episode, acting] += own
+        for i, tally in self._below.items():
+            tally.cut(played.episode[acting != i])
+            rows = np.flatnonzero(acting == i)
+            if len(rows):
+                tally.add(played_below(played, i, rows))
+
+    def cut(self, episodes: Array) -> None:
+        """Another skill acts in ``episodes`` (k,): calls that might have gone on are over."""
+        over = episodes[self._open[episodes] >= 0]
+        if len(over):
+            np.add.at(self._ended[:, Why.LIMIT], self._open[over], 1)
+            self._open[over] = -1
+        for tally in self._below.values():
+            tally.cut(episodes)
 
     def reports(self) -> dict[str, SkillReport]:
-        """The report of each skill, by its name."""
-        returns = self._returns.sum(axis=0)
-        return {
-            name: SkillReport(
+        """The report of each skill, by its path."""
+        returns, found = self._returns.sum(axis=0), dict[str, SkillReport]()
+        paths = [self._path + name for name in self.labels]
+        for i, name in enumerate(paths):
+            found[name] = SkillReport(
                 int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
                 float(returns[i]) if self._known(i) else None, int(self._next[0, i]),
-                dict(zip(self.labels, self._next[1 + i].tolist(), strict=True)),
-            )
-            for i, name in enumerate(self.labels)
-        }  # fmt: skip
+                dict(zip(paths, self._next[1 + i].tolist(), strict=True)),
+            )  # fmt: skip
+            if i in self._below:
+                found |= self._below[i].reports()
+        return found
 
     def _known(self, i: int) -> bool:
         """Whether the reward of skill ``i`` is."""
@@ -164,6 +195,34 @@ class SkillTally:
         return int(self._succeeded[i])
 
 
+def played_below(played: Played, i: int, rows: Array) -> Played:
+    """A step of ``rows`` (m,) as it was in the hierarchy that is skill ``i``."""
+    assert played.elapsed is not None
+    assert played.chosen is not None
+    assert played.after is not None
+    chosen = {k: v[rows] for k, v in unprefixed(str(i), played.chosen).items()}
+    after = {k: v[rows] for k, v in unprefixed(str(i), played.after).items()}
+    step = skill_step(played.step, rows, played.elapsed[rows], None)
+    return Played(
+        played.rows[rows], played.episode[rows], step, played.reward[rows], played.lasted[rows],
+        played.cut[rows], chosen["skill"], chosen["elapsed"] == 0, after["elapsed"], after["why"],
+        chosen, after,
+    )  # fmt: skip
+
+
+def levels_of(skills: Mapping[str, SkillReport]) -> dict[str, dict[str, SkillReport]]:
+    """The reports by the path of the hierarchy that skills are of; the first path is empty."""
+    found: dict[str, dict[str, SkillReport]] = {}
+    for name, report in skills.items():
+        found.setdefault(name.rpartition("/")[0], {})[name] = report
+    return found
+
+
+def all_steps(skills: Mapping[str, SkillReport]) -> int:
+    """Environment steps of all skills, each counted once."""
+    return sum(report.steps for name, report in skills.items() if "/" not in name)
+
+
 def _ask(
     skills: SkillSet, i: int, method: str, played: Played, elapsed: Array, rows: Array
 ) -> Array:
@@ -175,7 +234,7 @@ def _ask(
 
 def skill_table(skills: Mapping[str, SkillReport]) -> str:
     """The reports as an aligned table for people, a line for each skill."""
-    total = sum(report.steps for report in skills.values())
+    total = all_steps(skills)
     head = ["skill", "share", "calls", "length", *ENDS.values()]
     rows = [[*head, "success", "return"]]
     for name, report in skills.items():

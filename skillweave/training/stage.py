@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.config_off_policy import number, positive
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.collecting import levels
 from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
 from skillweave.ops.device import resolve_device
@@ -17,10 +18,7 @@ from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy, SkillweaveError
 
-SELECTOR = "selector"
-"""What the selector is named."""
-CRITIC = "skill_critic"
-"""What the critic of skills is named."""
+SELECTOR, CRITIC = levels.SELECTOR, levels.CRITIC
 Policies = Mapping[str, Policy]
 """By name, everyone who can act already: ready skills, and who learnt in earlier stages."""
 
@@ -132,10 +130,27 @@ class Stage:
     """The selector does not learn: ``config`` says how many environments there are."""
     guide_nats: float | None = None
     """How far the selector may be from a ready one, in nats of KL; None: as far as it likes."""
+    node: str = ""
+    """The path of the hierarchy that it is of: empty, or ``inner/`` for example."""
+    compared: bool = False
+    """What is learnt is kept only if it is better than what was there before."""
+
+    def inside(self, name: str) -> Stage:
+        """This stage in a hierarchy that is the skill ``name`` of another one."""
+
+        def scene(policies: Policies) -> Scene:
+            own = {k.removeprefix(path): v for k, v in policies.items() if k.startswith(path)}
+            return self.scene(own)
+
+        path = f"{name}/"
+        beside = {path + k: v for k, v in self.beside.items()}
+        return replace(
+            self, name=path + self.name, node=path + self.node, beside=beside, scene=scene
+        )
 
     def entry(self) -> dict[str, Any]:
         """The manifest's entry before training."""
-        first = SELECTOR if self.together else self.name
+        first = self.node + SELECTOR if self.together else self.name
         entry: dict[str, Any] = {
             "name": self.name,
             "kind": self.kind,
@@ -152,6 +167,8 @@ class Stage:
             entry["interrupt"] = self.interrupt
         if self.guide_nats is not None:
             entry["guide_nats"] = self.guide_nats
+        if self.kind == "together":
+            entry["compared"] = self.compared
         return entry
 
 

@@ -144,7 +144,7 @@ class OneAgent:
             stack, config.num_envs, stage.seeds, row_steps=stage.scene.row_steps,
             goes_on_at=log.at["steps"],
         )  # fmt: skip
-        keep_to_guide(found, stage.entry)
+        keep_to_guide(found, stage.entry.get("guide_nats"))
         return found
 
     def policies(self) -> dict[str, AgentPolicy]:
@@ -216,9 +216,8 @@ class OneAgent:
         self._open.close()
 
 
-def keep_to_guide(learner: Learner, entry: dict[str, Any]) -> None:
-    """Let a selector stay near its guide, if a stage's entry asks for it."""
-    nats = entry.get("guide_nats")
+def keep_to_guide(learner: Learner, nats: float | None) -> None:
+    """Let a selector stay near its guide, so many nats of KL; None: it need not."""
     if nats is not None and isinstance(learner, RolloutLearner):
         (stack,) = learner.stacks
         coef = torch.ones(stack.members, device=stack.state.params.device)

@@ -79,10 +79,9 @@ def collector_of(call_steps, margin=None, n=N):
     policies = (None, None, Stay.policy)
     found = SkillSet(skills, policies, call_steps=call_steps)
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
-    learners = {0: Learner(n), 1: Learner(n)}
-    collector = WovenCollector(
-        engine, Choices(n, found.choices), found, learners, Values(n), margin
-    )
+    learners = {"up": Learner(n), "down": Learner(n), "skill_critic": Values(n)}
+    margins = {} if margin is None else {"skill_critic": margin}
+    collector = WovenCollector(engine, Choices(n, found.choices), found, learners, margins)
     collector.start(Seeds(7))
     return collector
 
@@ -188,7 +187,7 @@ def test_a_learner_of_the_library_acts_and_its_head_is_kept():
     state = algorithm.init([Seeds(0)])
     skills = SkillSet((Down(), Stay()), (None, Stay.policy), call_steps=3)
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
-    collector = WovenCollector(engine, Choices(n, 2), skills, {0: Acting([(algorithm, 1)], n)})
+    collector = WovenCollector(engine, Choices(n, 2), skills, {"down": Acting([(algorithm, 1)], n)})
     collector.start(Seeds(1))
     request = next(requests(30))
     own = replace(request, params=(algorithm.acting_params(state),))

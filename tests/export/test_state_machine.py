@@ -18,6 +18,7 @@ from skillweave import PPO, RNN, Automaton, Lengths, Network, Reflex, Skillweave
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
 from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.guide import Guide
 from skillweave.export import states
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
@@ -126,6 +127,31 @@ def nested() -> HierarchyPolicy:
     return trained(skill_set(Inner, Zigzag, call_steps=8), seed=5)
 
 
+class Even(Skill):
+    """May start at even positions alone, and takes one step."""
+
+    max_steps = 1
+    policy = network(3, seed=7)
+
+    def initiation(self, obs: Array) -> Array:
+        return obs[:, POSITION] % 2 == 0
+
+
+def waiting() -> HierarchyPolicy:
+    """A hierarchy that may act only where its skill may start, and so stops elsewhere."""
+
+    class Inner(Skill):
+        policy = trained(skill_set(Even))
+
+    return trained(skill_set(Inner, Zigzag, call_steps=6), seed=5)
+
+
+def guided(guide: Any, **how: Any) -> HierarchyPolicy:
+    skills = skill_set(Careful, Left, Zigzag, Right, **how)
+    asked: Any = ready(guide, skills).selector
+    return HierarchyPolicy(network(skills.choices, seed=6), skills, Guide(asked))
+
+
 def interrupted() -> HierarchyPolicy:
     algorithm = SkillCritic(network=Network((8,)), normalize_obs=False)
     critic = agent(algorithm, OBS, gym.spaces.Discrete(3), seed=2)
@@ -147,8 +173,13 @@ POLICIES: dict[str, Any] = {
         reflexes=(shy(), Reflex(lambda o: o[:, T] % 4 == 1, lambda o: o[:, T].astype(int) % 3)),
     )),
     "nested": nested,
+    "nested, waiting": waiting,
     "interrupted": interrupted,
     "an automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
+    "a guide": lambda: guided(AUTOMATON),
+    "a guide of lengths": lambda: guided(
+        lambda o: 1 + o[:, T].astype(int) // 4 % 2, call_steps=Lengths(1, 2, 6)
+    ),
     "a function": lambda: ready(by_place, skill_set(Left, Careful, Zigzag, call_steps=5)),
 }  # fmt: skip
 
@@ -167,7 +198,9 @@ def code_of(policy: HierarchyPolicy, prefix: str = "") -> dict[str, Any]:
         found[f"{prefix}{reflex.name}.condition"] = reflex.condition
         found[f"{prefix}{reflex.name}.action"] = reflex.action
     found[f"{prefix}selector"] = getattr(policy.selector, "function", None)
-    found[f"{prefix}selector.far"] = far
+    found[f"{prefix}selector.far"] = found[f"{prefix}guide.far"] = far
+    guide = None if policy.guide is None else policy.guide.selector
+    found[f"{prefix}guide"] = getattr(guide, "function", None)
     return found
 
 

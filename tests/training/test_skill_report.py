@@ -207,8 +207,8 @@ def test_the_table_for_people():
     ]
 
 
-def test_a_hierarchy_as_a_skill_counts_as_one_and_alone_reports_its_own():
-    inner = woven(Paid, Zigzag)
+def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():
+    inner = woven(Paid, Lucky, Zigzag)
 
     class Nested(Skill):
         max_steps = 5
@@ -219,12 +219,17 @@ def test_a_hierarchy_as_a_skill_counts_as_one_and_alone_reports_its_own():
 
     outer = woven(Nested, Right, call_steps=None)
     found = evaluate(outer, EnvSpec(Walk), episodes=20).skills
-    assert set(found) == {"nested", "right"}
+    assert list(found) == ["nested", "nested/paid", "nested/lucky", "nested/zigzag", "right"]
+    below = [found[f"nested/{name}"] for name in inner.labels]
+    assert sum(x.steps for x in below) == found["nested"].steps
+    for report in below:
+        assert sum(report.ended.values()) == report.calls
+    assert sum(report.calls for report in below) > 20
     assert found["nested"].return_sum == 2.0 * found["nested"].steps > 0
     assert sum(found["nested"].ended.values()) == found["nested"].calls
     alone = evaluate(SkillAlone(outer.skills, "nested"), EnvSpec(Walk), episodes=20)
     assert alone == evaluate(inner, EnvSpec(Walk), episodes=20)
-    assert set(alone.skills) == {"paid", "zigzag"}
+    assert set(alone.skills) == {"paid", "lucky", "zigzag"}
 
 
 def test_where_no_reward_is_defined_it_is_the_environments():

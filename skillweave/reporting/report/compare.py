@@ -24,6 +24,7 @@ from skillweave.reporting.report.skills_table import (
 )
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
+from skillweave.training.skill_report import levels_of
 
 MOST_DIFFERENCES = 60
 
@@ -165,7 +166,8 @@ def _skill_rows(group: Group, saved: Saved) -> list[dict[str, str]]:
 
 def _followed(group: Group, saved: Saved) -> list[dict[str, Any]]:
     """Transitions between skills, summed over the group's seeds; none where one does not know."""
-    reports = [e.evaluation.skills for run in group.runs if (e := saved[run.path])]
+    found = [e.evaluation.skills for run in group.runs if (e := saved[run.path])]
+    reports = [levels_of(skills).get("", {}) for skills in found]  # hierarchies below: one report
     counts = [transitions(skills) for skills in reports]
     known = [c for c in counts if c is not None]
     if not known or len(known) < len(counts):

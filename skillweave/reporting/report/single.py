@@ -36,6 +36,7 @@ from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import AGENT
+from skillweave.training.skill_report import levels_of
 from skillweave.types import Policy, SkillweaveError
 
 EPISODES, FILMED = 20, 3
@@ -209,7 +210,6 @@ def _scores(
     if score is None:
         return {"score": None, "skill_table": [], "transitions": []}
     told = score.to_json()
-    counts = transitions(score.skills)
     return {
         "score": {
             "mean": number(told["mean"]),
@@ -224,7 +224,11 @@ def _scores(
             "of": f"{told['episodes']} episodes {words}",
         },
         "skill_table": skill_rows(score.skills),
-        "transitions": [] if counts is None else transition_rows(list(score.skills), counts),
+        "transitions": [
+            (path, transition_rows(list(own), counts))
+            for path, own in levels_of(score.skills).items()
+            if (counts := transitions(own)) is not None
+        ],
     }
 
 

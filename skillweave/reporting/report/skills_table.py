@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from skillweave.training.skill_report import SkillReport
+from skillweave.training.skill_report import SkillReport, all_steps
 
 WHY = {
     "own": "by itself",
@@ -19,7 +19,7 @@ NOTHING = "–"
 
 def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
     """A row for each skill."""
-    total = sum(report.steps for report in reports.values())
+    total = all_steps(reports)
     rows = []
     for name, report in reports.items():
         calls = report.calls

@@ -1,0 +1,134 @@
+"""A hierarchy of two hierarchies (``examples/nested.py``): how it learns; killed and resumed, too.
+
+    python -m benchmarks.nested [CASE …] [--seeds 0 1 2 3 4] [--steps 150000]
+
+All cases have the same number of environment steps in all. Where a case is no flat agent, each run
+is made a second time, killed (SIGKILL) in the middle of its last stage, and resumed; the weights of
+both are then compared, bit for bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common import median, report, table, workers
+from examples import nested
+from skillweave import Hierarchy, SkillweaveError
+from skillweave.runs.directory import RunDirectory
+
+CASES = ("together", "apart", "apart, then together", "flat")
+
+
+def declare(case: str, steps: int) -> Hierarchy:
+    """The hierarchy, with so many steps in all: seven stages apart, if there are any."""
+    if case in ("together", "flat"):
+        return nested.declare(steps, cut_every=10_000)
+    apart = steps if case == "apart" else steps // 2
+    each = {"skill_steps": apart // 7, "selector_steps": apart // 7, "cut_every": 10_000}
+    found = nested.declare(steps, learn=case, together_steps=steps - apart, **each)
+    for skill in found.skills:
+        skill.policy.skill_steps = skill.policy.selector_steps = apart // 7
+    return found
+
+
+def train(case: str, steps: int, seed: int, path: Path) -> None:
+    """Train in a process that is to be killed."""
+    declare(case, steps).train(path, seed=seed, quiet=True)
+
+
+def killed(case: str, steps: int, seed: int, path: Path) -> RunDirectory:
+    """A run whose process was killed in the middle of its last stage, and that was resumed."""
+    process = multiprocessing.get_context("spawn").Process(
+        target=train, args=(case, steps, seed, path), daemon=True
+    )
+    process.start()
+    while process.is_alive() and not _half_done(path):
+        time.sleep(0.05)
+    process.kill()
+    process.join()
+    if RunDirectory.open(path).finished:
+        raise SkillweaveError(f"{path}: the run was over before it was killed")
+    declare(case, steps).resume(path, quiet=True)
+    return RunDirectory.open(path)
+
+
+def _half_done(path: Path) -> bool:
+    if not (path / "run.json").exists():
+        return False
+    run = RunDirectory.open(path)
+    last = run.manifest["stages"][-1]
+    at = [x["steps"] for x in run.metrics() if x["stage"] == last["name"]]
+    return bool(at) and at[-1] > last["budget"] / 2
+
+
+def weights(run: RunDirectory) -> dict[str, dict[str, bytes]]:
+    """All that every stage has learnt."""
+    return {
+        f"{stage['name']}.{name}": {
+            k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()
+        }
+        for stage in run.manifest["stages"]
+        for name, policy in run.load_policies(stage["name"]).items()
+    }  # fmt: skip
+
+
+def one(case: str, steps: int, seed: int) -> dict[str, Any]:
+    """Train and score in this process; then once more, killed and resumed."""
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder)
+        flat = case == "flat"
+        run = declare(case, steps).train(path / "whole", seed=seed, quiet=True, flat=flat)
+        seconds = time.perf_counter() - started
+        found = run.evaluate(100)
+        spent = sum(s["steps"] for s in run.info()["stages"])
+        same = None
+        if not flat:
+            again = killed(case, steps, seed, path / "killed")
+            same = weights(again) == weights(RunDirectory.open(path / "whole"))
+    solved = float(np.mean(np.array(found.returns) > 1))
+    usage = found.to_json()["skill_usage"]
+    return {
+        "seed": seed, "solved": solved, "length": float(np.mean(found.lengths)), "steps": spent,
+        "seconds": seconds, "usage": usage, "same": same,
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="*", default=["together", "flat"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--steps", type=int, default=150_000)
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    unknown = [c for c in asked.cases if c not in CASES]
+    if unknown:
+        raise SkillweaveError(f"no case {unknown[0]!r}; there are: {', '.join(CASES)}")
+    rows, found = [], {}
+    head = ("case", "median", "worst", "length", "steps", "s", "killed, resumed", "each")
+    with workers(asked.processes) as pool:
+        for case in asked.cases:
+            pending = [pool.submit(one, case, asked.steps, seed) for seed in asked.seeds]
+            found[case] = runs = [future.result() for future in pending]
+            solved = [r["solved"] for r in runs]
+            same = [r["same"] for r in runs]
+            told = "–" if None in same else f"same {sum(same)}/{len(same)}"
+            length = f"{median(r['length'] for r in runs):.1f}"
+            steps = f"{median(r['steps'] for r in runs):,.0f}"
+            seconds = f"{median(r['seconds'] for r in runs):.0f}"
+            each = " ".join(f"{x:.0%}" for x in solved)
+            score = f"{median(solved):.0%}", f"{min(solved):.0%}"
+            rows.append((case, *score, length, steps, seconds, told, each))
+            print(table(head, rows), flush=True)
+    report("nested", {"seeds": asked.seeds, "steps": asked.steps, "cases": found})
+
+
+if __name__ == "__main__":
+    main()

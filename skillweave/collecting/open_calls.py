@@ -1,0 +1,210 @@
+"""A selector's decisions whose calls are under way, and rows of those whose calls are over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from skillweave.collecting.acting import Acted
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.columns import as_wide
+from skillweave.collecting.guide import Guide, as_logits
+from skillweave.experience import Experience
+from skillweave.types import Array, Memory
+
+
+class OpenCalls:
+    """The calls that one selector has begun in N environments, each since its decision.
+
+    All that it keeps stands in the collector's ``kept`` and ``open``, so checkpoints hold it.
+
+    Args:
+        collector: of these environments.
+        skills: what the selector chooses from.
+        memory_size: of the selector's network.
+        keep_rewards: of each call, keep the reward of every step.
+        guide: a ready selector that was asked at each decision.
+        memory: where the guide remembers, with ``chances``: how likely its choices were.
+        prefix: of all names, where a collector has several selectors.
+    """
+
+    def __init__(
+        self,
+        collector: Collector,
+        skills: SkillSet,
+        memory_size: int,
+        keep_rewards: bool = False,
+        guide: Guide | None = None,
+        memory: Memory | None = None,
+        prefix: str = "",
+    ) -> None:
+        n = collector.num_envs
+        self.skills, self.memory_size, self.keep_rewards = skills, memory_size, keep_rewards
+        self.guide, self._memory = guide, memory or {}
+        self._collector, self._prefix, self._all = collector, prefix, np.arange(n)
+        self.kept: dict[str, Array] = {
+            "first": np.zeros(n, bool),  # the selector's memory was empty before this call
+            "reward": np.zeros(n),  # Σ γᵏ rₖ
+            "discount": np.zeros(n),  # γ^τ
+            "tau": np.zeros(n, np.int64),
+            "choice": np.zeros(n, np.int64),
+            "before": np.zeros((n, memory_size), np.float32),  # the selector's memory
+        }
+        if skills.restricts or guide is not None:
+            self.kept["allowed"] = np.ones((n, skills.choices), bool)  # when it decided
+        collector.kept |= {prefix + k: v for k, v in self.kept.items()}
+
+    def begin(
+        self, ids: Array, obs: Array, choice: Array, acted: Acted, before: Array | None
+    ) -> None:
+        """Decisions in environments ``ids`` (k,); all else has a row for each of these.
+
+        Args:
+            before: the selector's memory before it decided.
+        """
+        kept = self.kept
+        kept["choice"][ids] = choice
+        kept["reward"][ids], kept["discount"][ids], kept["tau"][ids] = 0.0, 1.0, 0
+        if before is not None:
+            kept["before"][ids] = before
+        if (rewards := self.opened("rewards")) is not None:
+            rewards[ids] = 0.0
+        for name, value in (("obs", obs), ("head", acted.head)):
+            if value is not None:
+                held = self.opened(name)
+                if held is None or held.shape[1:] != value.shape[1:]:
+                    held = np.zeros((len(self._all), *value.shape[1:]), value.dtype)
+                    self._collector.open[self._prefix + name] = held
+                held[ids] = value
+
+    def count(self, ids: Array | slice, reward: Array, gamma: Array) -> None:
+        """Add a step to the calls of environments ``ids`` (k,); ``gamma`` is of all N."""
+        kept = self.kept
+        if self.keep_rewards:
+            self._keep(self._all[ids], reward)
+        kept["reward"][ids] += kept["discount"][ids] * reward
+        kept["discount"][ids] *= gamma[ids]
+        kept["tau"][ids] += 1
+
+    def opened(self, name: str) -> Array | None:
+        """What is kept of open calls and has a shape that is known only when they begin."""
+        return self._collector.open.get(self._prefix + name)
+
+    def row(
+        self, ids: Array, terminated: Array, truncated: Array, next_obs: Array
+    ) -> dict[str, Array]:
+        """The decisions of environments ``ids`` (k,), whose calls are over, as rows."""
+        kept, obs = self.kept, self.opened("obs")
+        assert obs is not None
+        values = {
+            "obs": obs[ids],
+            "action": kept["choice"][ids],
+            "reward": (kept["reward"][ids] - self.skills.call_cost).astype(np.float32),
+            "steps": kept["tau"][ids],
+            "terminated": terminated,
+            "truncated": truncated,
+            "next_obs": next_obs,
+            "starts": kept["first"][ids],
+        }
+        if self.memory_size:
+            values["memory"] = kept["before"][ids]
+        for name in ("head", "rewards"):
+            if (held := self.opened(name)) is not None:
+                values[name] = held[ids]
+        if "allowed" in kept:
+            values["obs_mask"] = kept["allowed"][ids]
+            values["next_obs_mask"] = self._next_mask(values, ids)
+        if (chances := self.chances) is not None:
+            values["guide"] = as_logits(chances[ids], values["obs_mask"])
+        return values
+
+    @property
+    def chances(self) -> Array | None:
+        """How likely the guide's choices were when it was asked, (N, choices); None: not told."""
+        return self._memory["chances"] if self.guide is not None and self.guide.tells else None
+
+    def _keep(self, ids: Array, reward: Array) -> None:
+        """Keep the reward of this step of the open calls."""
+        longest = int(self.kept["tau"].max()) + 1
+        rewards = self.opened("rewards")
+        if rewards is None:
+            rewards = np.zeros((len(self._all), 16), np.float32)
+        if longest > rewards.shape[1]:
+            rewards = np.pad(rewards, ((0, 0), (0, longest)))
+        self._collector.open[self._prefix + "rewards"] = rewards
+        rewards[ids, self.kept["tau"][ids]] = reward
+
+    def _next_mask(self, values: Mapping[str, Array], ids: Array) -> Array:
+        """Where skills may start in the true successors: all where that does not matter."""
+        mask = np.ones_like(values["obs_mask"])
+        on = np.flatnonzero(~values["terminated"])
+        if len(on):
+            found = self.skills.startable(values["next_obs"][on])
+            if self.guide is not None:
+                found = self.guide.ahead(self._memory, ids[on], found)
+            mask[on] = found | ~found.any(axis=1, keepdims=True)
+        return mask
+
+
+class Decisions:
+    """Decisions as their calls end: some columns have more of them than others."""
+
+    def __init__(self, num_envs: int) -> None:
+        self._count = np.zeros(num_envs, np.int64)
+        self._found: list[tuple[Array, Array, dict[str, Array]]] = []
+
+    def put(self, ids: Array, values: dict[str, Array]) -> None:
+        """The calls of environments ``ids`` (k,) are over; ``values`` are as of ``row``."""
+        self._found.append((self._count[ids], ids, values))
+        self._count[ids] += 1
+
+    def experience(self, calls: OpenCalls, obs: Array) -> Experience:
+        """All decisions, (D, N), as far as each column goes.
+
+        Args:
+            obs: what there is to act on next, (N, …), of the kind of all observations.
+        """
+        if not self._found:
+            return self._nothing(calls, obs)
+        height = int(self._count.max())
+        n = len(self._count)
+        found: dict[str, Array] = {}
+        for name in self._found[0][2]:
+            found[name] = self._column(name, height, n)
+        memory = found.pop("memory", None)
+        starts = found.pop("starts")
+        valid = np.arange(height)[:, None] < self._count
+        return Experience(
+            **found,  # type: ignore[arg-type]
+            valid=None if valid.all() else valid,
+            memory=None if memory is None else memory[0],
+            starts=None if memory is None else starts,
+        )
+
+    def _column(self, name: str, height: int, n: int) -> Array:
+        """One field of all decisions, (D, N, …); rewards of calls as long as the longest."""
+        values = [value[name] for _, _, value in self._found]
+        if name == "rewards":
+            values = as_wide(values)
+        whole = np.zeros((height, n, *values[0].shape[1:]), values[0].dtype)
+        for (rows, ids, _), value in zip(self._found, values, strict=True):
+            whole[rows, ids] = value
+        return whole
+
+    @staticmethod
+    def _nothing(calls: OpenCalls, obs: Array) -> Experience:
+        """One empty row: no call has ended."""
+        n = len(obs)
+        lead, no = (1, n), np.zeros((1, n), bool)
+        head, size, chances = calls.opened("head"), calls.memory_size, calls.chances
+        return Experience(
+            obs=obs[None], action=np.zeros(lead, np.int64), reward=np.zeros(lead, np.float32),
+            steps=np.ones(lead, np.int64), terminated=no, truncated=no, next_obs=obs[None],
+            valid=no, head=None if head is None else np.zeros_like(head)[None],
+            memory=np.zeros((n, size), np.float32) if size else None,
+            starts=no if size else None,
+            rewards=np.zeros((*lead, 1), np.float32) if calls.keep_rewards else None,
+            guide=None if chances is None else chances[None],
+        )  # fmt: skip

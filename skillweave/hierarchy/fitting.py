@@ -1,0 +1,69 @@
+"""What a hierarchy is declared with, fitted to its environment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+from skillweave.algorithms.config import AlgorithmConfig, check_spaces
+from skillweave.hierarchy.guidance import fitted_guide
+from skillweave.hierarchy.nesting import every_skill, inner_hierarchies, inner_of
+from skillweave.skills import path_of, ready_policy
+from skillweave.skills.foreign_policy import fitted
+from skillweave.training.plain_agent import check_rollout
+from skillweave.training.stage import SELECTOR
+from skillweave.types import Policy
+
+if TYPE_CHECKING:
+    from skillweave.hierarchy.declaration import Declaration
+
+
+def check_settings(declared: Declaration, env: gym.Env[Any, Any], path: str = "") -> None:
+    """Raise a SkillweaveError where algorithms or reflexes do not fit an environment.
+
+    Args:
+        path: of the hierarchy, ``inner/`` for example.
+    """
+    space = env.action_space
+    for skill in declared.skills:
+        if skill.policy is None:
+            config = skill.algorithm or declared.algorithm
+            check_spaces(config, space, f"skill {path_of(skill)!r}: ")
+    if isinstance(declared.selector, AlgorithmConfig):
+        choices = gym.spaces.Discrete(declared.choices)
+        check_spaces(declared.selector, choices, f"{path}{SELECTOR}: ")
+    if declared.flat is not None:
+        check_spaces(declared.flat, space, "flat: ")
+    own = (s.algorithm for s in declared.skills)
+    for config in (declared.algorithm, declared.selector, declared.flat, *own):
+        if isinstance(config, AlgorithmConfig):
+            check_rollout(config, env.observation_space)
+    for reflex in declared.reflexes:
+        reflex.check(space)
+    fitted_guide(declared, env.observation_space, path)
+    for skill, inner in inner_hierarchies(declared.skills):
+        check_settings(inner, env, f"{path}{skill.name}/")
+
+
+def fitted_policies(declared: Declaration, env: gym.Env[Any, Any]) -> dict[str, Policy]:
+    """By path, the policies of skills that are not trained, on the environment's spaces."""
+    spaces = env.observation_space, env.action_space
+    return {
+        path: fitted(policy, *spaces, f"skill {path!r}", declared.spec.name)
+        for path, skill in every_skill(declared.skills)
+        if inner_of(skill) is None and (policy := ready_policy(skill)) is not None
+    }
+
+
+def fitted_selectors(
+    declared: Declaration, observation_space: gym.Space[Any], path: str = ""
+) -> dict[str, Policy]:
+    """By path, the selectors that are not trained, on these observations."""
+    found: dict[str, Policy] = {}
+    if (ready := declared.ready_selector) is not None:
+        choices, name = gym.spaces.Discrete(len(declared.skills)), path + SELECTOR
+        found[name] = fitted(ready, observation_space, choices, name, declared.spec.name)
+    for skill, inner in inner_hierarchies(declared.skills):
+        found |= fitted_selectors(inner, observation_space, f"{path}{skill.name}/")
+    return found

@@ -1,0 +1,107 @@
+"""What the user's functions say of steps and observations, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from skillweave.messages import short
+from skillweave.skills.outputs import as_array, at_step, called
+from skillweave.types import Array, SkillweaveError, Step, finite, read_only
+
+
+def answer(
+    function: Callable[[Any], Any],
+    about: Step | Array,
+    n: int,
+    dtype: type,
+    who: str,
+    method: str,
+    elapsed: Array | int | None = None,
+    ids: Array | None = None,
+) -> Array:
+    """What a function of the user's returns, ``checked``.
+
+    Raises:
+        SkillweaveError: the function failed, or returned something else than was asked for.
+    """
+    if isinstance(about, np.ndarray):
+        about = read_only(about)
+    value = called(function, about, f"{who}: {method}()", elapsed)
+    return checked(value, n, dtype, who, method, elapsed, ids)
+
+
+def checked(
+    value: Any,
+    n: int,
+    dtype: type,
+    who: str,
+    method: str,
+    elapsed: Array | int | None = None,
+    ids: Array | None = None,
+) -> Array:
+    """``value`` as an array (n,) of ``dtype``.
+
+    Args:
+        elapsed: at which steps, (n,) or (), for messages.
+        ids: in which environments, (n,), for messages; None: in all n.
+
+    Raises:
+        SkillweaveError: it has another shape or kind, or is a NaN or an infinity; the message
+            names the skill, the method and the step.
+    """
+    array = as_array(value, f"{who}: {method}()")
+    if array.shape != (n,):
+        raise SkillweaveError(
+            f"{who}: {method}() returned shape {array.shape}{at_step(elapsed)}, but ({n},) was "
+            f"expected: one number for each of the {n} environments"
+        )
+    if dtype is bool:
+        return (
+            array
+            if array.dtype == bool
+            else _flags(array, f"{who}: {method}()", at_step(elapsed), ids)
+        )
+    if array.dtype.kind not in "fiub":
+        raise SkillweaveError(
+            f"{who}: {method}() returned {_kind(array)}{at_step(elapsed)}, but rewards are real "
+            "numbers"
+        )
+    with np.errstate(over="ignore"):  # an overflow is an infinity, reported below
+        array = array.astype(dtype, copy=False)
+    if not finite(array):
+        row = int(np.flatnonzero(~np.isfinite(array))[0])
+        when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
+        raise SkillweaveError(
+            f"{who}: {method}() returned {array[row]}{when} for environment {_number(row, ids)}: "
+            "rewards must be finite"
+        )
+    return array
+
+
+def _number(row: int, ids: Array | None) -> int:
+    """The environment that a row is of."""
+    return row if ids is None else int(ids[row])
+
+
+def _flags(array: Array, what: str, when: str, ids: Array | None) -> Array:
+    """Numbers that are all 0 or 1, as bool."""
+    if array.dtype.kind not in "fiu":
+        raise SkillweaveError(
+            f"{what} returned {_kind(array)}{when}, but yes or no (bool) is asked"
+        )
+    wrong = np.flatnonzero((array != 0) & (array != 1))
+    if len(wrong):
+        row = int(wrong[0])
+        raise SkillweaveError(
+            f"{what} returned {array[row]}{when} for environment {_number(row, ids)}, but yes or "
+            "no (bool) is asked: compare with something"
+        )
+    return array.astype(bool)
+
+
+def _kind(array: Array) -> str:
+    first = array.reshape(-1)[:1].tolist()  # as Python's own values, which read better
+    return f"{array.dtype} ({short(first[0])})" if first else str(array.dtype)

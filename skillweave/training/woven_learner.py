@@ -1,0 +1,107 @@
+"""Several learners from one stream of steps, each with its own rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from torch import Tensor
+
+from skillweave.buffers.rollout import RolloutStore
+from skillweave.collecting.acting import Request
+from skillweave.experience import Experience
+from skillweave.training.learner import Learner, Stack
+from skillweave.training.stage import CRITIC, SELECTOR, Together
+from skillweave.types import Array, prefixed, unprefixed
+
+
+class WovenLearner:
+    """A selector and skills, each with a learner of its own; nobody learns from others' rows.
+
+    Args:
+        parts: by path, the selector first unless it is ready, then all others who learn.
+        node: the path of the hierarchy: empty, or ``inner/`` for example.
+        how: how much the task counts, and how far skills may move from their anchors.
+    """
+
+    def __init__(self, parts: Mapping[str, Learner], node: str, how: Together) -> None:
+        self.parts, self._how, self._weight = dict(parts), how, 0.0
+        self._selector, self._critic = node + SELECTOR, node + CRITIC
+        self.counts = {name: [0, 0] for name in parts}
+        """By path, in how many rows each has acted, and how often it has learnt from them."""
+        self.stacks: Sequence[Stack] = [s for part in parts.values() for s in part.stacks]
+        self.overlap = all(part.overlap for part in parts.values())
+        self.report_every = max(part.report_every for part in parts.values())
+        self.threads = max(part.threads for part in parts.values())
+
+    def request(self, update: int, steps: int, progress: float) -> Request:
+        """As many rows as the selector's learner asks for, with the parameters of all.
+
+        Where the selector is ready, as many as the skill asks for that asks for most.
+        """
+        self._weight = self._how.task_weight * progress
+        asked = tuple(p.request(update, steps, progress) for p in self.parts.values())
+        if self._selector in self.parts:
+            return replace(asked[0], parts=asked[1:])
+        rows, seeds = max(r.rows for r in asked), asked[0].seeds / self._selector
+        return Request(rows, (), asked[0].gamma, seeds, parts=asked)
+
+    def take(self, experience: Experience) -> None:
+        """Give each its own rows, and skills the task's advantage in them, if it counts."""
+        found = experience.parts
+        if self._selector in self.parts:
+            found = (replace(experience, parts=()), *found)
+        own = dict(zip(self.parts, found, strict=True))
+        if self._how.task_weight > 0.0:
+            advantage = self._weight * self._task_advantage(own[self._critic])
+            for name, rows in own.items():
+                if not decides(name):
+                    rows.advantage = advantage
+        for name, rows in own.items():
+            self.counts[name][0] += int(
+                rows.reward.size if rows.valid is None else rows.valid.sum()
+            )
+            self.parts[name].take(rows)
+
+    def _task_advantage(self, rows: Experience) -> Array:
+        """What each step did for the task, (T, N) float32, with deviation 1."""
+        (stack,) = self.parts[self._critic].stacks
+        store = RolloutStore(1, device=stack.state.params.device)
+        store.add(rows)
+        rollout = store.rollout(stack.state.gamma)
+        assert rollout is not None
+        found: Array = stack.algorithm.advantage(stack.state, rollout)[0].cpu().numpy()
+        scaled: Array = (found - found.mean()) / (found.std() + np.float32(1e-3))
+        return scaled
+
+    def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
+        """Let those learn that have enough rows; metrics under ``<name>.``."""
+        found: dict[str, Tensor] = {}
+        for name, part in self.parts.items():
+            metrics = part.learn(update, steps, progress)
+            self.counts[name][1] += bool(metrics)
+            found |= prefixed(name, metrics)
+        return found
+
+    def cut(self, columns: Array) -> None:
+        """The environments of ``columns`` (k,) begin anew."""
+        for part in self.parts.values():
+            part.cut(columns)
+
+    def kept(self) -> dict[str, Tensor]:
+        """What going on exactly needs beside the states of the stacks, at a clean cut."""
+        found: dict[str, Tensor] = {}
+        for name, part in self.parts.items():
+            found |= prefixed(name, part.kept())
+        return found
+
+    def load(self, kept: dict[str, Tensor]) -> None:
+        """The inverse of ``kept``."""
+        for name, part in self.parts.items():
+            part.load(unprefixed(name, kept))
+
+
+def decides(path: str) -> bool:
+    """Whether it is the path of a selector or a critic of skills: they are no skills."""
+    return path.rpartition("/")[2] in (SELECTOR, CRITIC)

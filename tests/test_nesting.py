@@ -1,0 +1,466 @@
+"""Hierarchies as skills of hierarchies: whole runs, stopped and resumed, and bad declarations."""
+
+from __future__ import annotations
+
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_resume import assert_same, lines, policies, stopped_run
+
+from skillweave import (
+    DQN,
+    PPO,
+    RNN,
+    TD3,
+    Automaton,
+    EnvSpec,
+    Hierarchy,
+    Lengths,
+    Network,
+    Reflex,
+    Skill,
+    SkillweaveError,
+    Together,
+)
+from skillweave.cli import main
+from skillweave.envs.make import make_engine
+from skillweave.hierarchy.nesting import every_skill
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.states import load_state
+from skillweave.training.call_log import CallLog
+from skillweave.training.evaluation import episode_seeds, evaluate
+from skillweave.training.play import SeededEpisodes, play
+
+SMALL = Network(hidden=(8,))
+ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
+OFF = DQN(
+    num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
+)
+MEMORY = PPO(num_envs=4, n_steps=16, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6)))
+CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
+
+
+class Left(Skill):
+    """Moves to the left."""
+
+    max_steps = 15
+
+    def reward(self, step):
+        return -step.next_obs[:, 0] + 0.1 * step.timed_out
+
+
+class Right(Skill):
+    """Moves to the right."""
+
+    def reward(self, step):
+        return step.next_obs[:, 0]
+
+
+class Balance(Skill):
+    """Stays up, until it is far away."""
+
+    def initiation(self, obs):
+        return np.abs(obs[:, 2]) < 0.15
+
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 0]) > 0.5
+
+
+class Push(Skill):
+    """Is ready."""
+
+    call_steps = 2
+
+    def policy(self, obs):
+        return (obs[:, 2] > 0).astype(np.int64)
+
+
+def options(**how):
+    told = {"env": CARTPOLE, "algorithm": ON, "selector": ON, "skill_steps": 300}
+    return told | {"selector_steps": 300, "together_steps": 900, "cut_every": 150} | how
+
+
+def inside(*skills, **how):
+    skills = skills or (Balance(), Right())
+    return Hierarchy(skills=skills, **options(call_steps=3, name="inner") | how)
+
+
+def declare(inner=None, **how):
+    """Left, a hierarchy of balance and right, and a ready skill."""
+    inner = inside() if inner is None else inner
+    return Hierarchy(skills=[Left(), inner, Push()], **options(call_steps=7) | how)
+
+
+class Careful(Skill):
+    """A hierarchy that is paid in its own way, and stops by itself."""
+
+    max_steps = 9
+    policy = None
+
+    def reward(self, step):
+        return 1.0 - np.abs(step.next_obs[:, 2])
+
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 2]) > 0.1
+
+
+def careful(**how):
+    found = Careful()
+    found.policy = inside(**how)
+    return found
+
+
+def three():
+    """A hierarchy in a hierarchy in a hierarchy."""
+    deepest = inside(Right(), Push(), call_steps=2, name="deepest")
+    middle = inside(Balance(), deepest, call_steps=4, name="middle", interrupt=True)
+    return Hierarchy(skills=[Left(), middle], **options(call_steps=7, learn="together"))
+
+
+BUSY = {"call_steps": Lengths(1, ..., 8), "interrupt": True}
+SHORT = {"skill_steps": 100, "selector_steps": 100, "together_steps": 300}
+MODES = Automaton({"low": ["balance", "right"], "high": "right"}, {
+    ("low", "high"): lambda step: step.next_obs[:, 2] > 0.02,
+    ("high", "low"): lambda step: step.next_obs[:, 2] < 0,
+})  # fmt: skip
+KINDS = {
+    "together": lambda: declare(learn="together", together=Together(task_weight=0.5)),
+    "apart": lambda: declare(),
+    "then": lambda: declare(learn="apart, then together"),
+    "off-policy": lambda: declare(inside(algorithm=OFF, selector=OFF), learn="together"),
+    "an off-policy selector above": lambda: declare(learn="together", selector=OFF),
+    "memory": lambda: declare(inside(algorithm=MEMORY, selector=MEMORY), learn="together"),
+    "interrupted": lambda: declare(inside(**BUSY), learn="together", **BUSY),
+    "its own ends": lambda: declare(careful(), learn="together"),
+    "its own ends apart": lambda: declare(careful(interrupt=True)),
+    "a ready selector": lambda: declare(inside(selector=ready), learn="together"),
+    "inside, then": lambda: declare(
+        inside(learn="apart, then together", skill_steps=100, selector_steps=100)
+    ),
+    "inside, then, in some places": lambda: declare(
+        inside(Balance(), learn="apart, then together", together_steps=200)
+    ),
+    "three": three,
+    "guides": lambda: declare(
+        inside(guide=MODES, guide_nats=0.05, reflexes=[Reflex(leans, 0)]),
+        learn="together",
+        guide=lambda obs: np.where(obs[:, 1] > 0, "left", "inner"),
+        guide_restricts=False,
+        guide_nats=0.1,
+        reflexes=[Reflex(far, 1)],
+    ),
+    "guides, start calls": lambda: declare(
+        inside(guide=MODES, start_calls=2), skill_steps=100, selector_steps=100
+    ),
+    "then, inside and outside": lambda: declare(
+        inside(learn="apart, then together", **SHORT), learn="apart, then together", **SHORT
+    ),
+    "a ready selector above": lambda: declare(
+        selector=lambda obs: np.where(obs[:, 1] > 0, "left", "inner"), learn="together"
+    ),
+}
+
+
+def leans(obs):
+    return obs[:, 2] > 0.05
+
+
+def far(obs):
+    return obs[:, 0] < -0.2
+
+
+def ready(obs):
+    """A selector that is not trained."""
+    return np.where(np.abs(obs[:, 2]) < 0.05, 0, 1)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run of each kind, made once."""
+    made = {}
+
+    def make(kind):
+        if kind not in made:
+            path = tmp_path_factory.mktemp("whole") / "run"
+            made[kind] = KINDS[kind]().train(path, seed=3, quiet=True), path
+        return made[kind]
+
+    return make
+
+
+LATER = [("apart", 12), ("apart", 22), ("then", 32), ("inside, then", 7), ("three", 8)]
+
+
+@pytest.mark.parametrize(("kind", "tick"), [*((k, t) for k in KINDS for t in (3, 5)), *LATER])
+def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, tick):
+    run = stopped_run(KINDS[kind](), tmp_path / "run", tick)
+    assert not run.finished
+    KINDS[kind]().resume(run.path, quiet=True)
+    assert_same(run.path, whole(kind)[1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
+    run, path = whole(kind)
+    found = run.evaluate(3)
+    assert KINDS[kind]().load(path).evaluate(3) == found
+    run.save_weights(tmp_path / "weights")
+    assert KINDS[kind]().load_weights(tmp_path / "weights").evaluate(3) == found
+    paths = [name for name, _ in every_skill(run.hierarchy.skills)]
+    assert list(found.skills) == paths
+
+
+@pytest.mark.parametrize("kind", ["together", "then", "off-policy", "three"])
+def test_all_learn_at_every_level_in_one_stream(whole, kind):
+    _, path = whole(kind)
+    entry = RunDirectory.open(path).manifest["stages"][-1]
+    assert entry["kind"] == "together"
+    told = {name for line in lines(path) if line["stage"] == entry["name"] for name in line}
+    deep = {k for k in entry["learns"] if "/" in k}
+    assert {k.rpartition("/")[2] for k in deep} >= {"selector", "balance", "right"}
+    for name in deep:
+        assert any(k.startswith(f"{name}.") for k in told), f"{name} has learnt nothing"
+    assert 900 <= entry["steps"] <= 900 + 64
+
+
+def test_selectors_at_all_levels_stay_near_their_guides(whole):
+    run, path = whole("guides")
+    told = {name for line in lines(path) if line["stage"] == "together" for name in line}
+    assert {"selector.anchor_kl", "inner/selector.anchor_kl"} <= told
+    inner = run.policy.skills.policies[1]
+    assert run.policy.guide is None
+    assert inner.guide.restricts
+
+
+def test_a_guide_in_a_hierarchy_below_is_kept_to(whole):
+    run, _ = whole("guides, start calls")
+    called = set()
+
+    def look(memory):
+        high = memory["1.guide.state"] == 1
+        acts = (memory["skill"] == 1) & (memory["1.elapsed"] == 0)
+        called.update(memory["1.skill"][acts & high].tolist())
+
+    engine = make_engine(CARTPOLE, 1)
+    engine.reset(0)
+    rng = np.random.default_rng(0)
+    episodes = SeededEpisodes(engine, range(9), 100)
+    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=look))
+    assert called == {1}
+
+
+def test_another_guide_below_is_refused_by_its_path(tmp_path, whole):
+    run, path = whole("guides, start calls")
+    other = declare(inside(guide=lambda obs: 0, call_steps=Lengths(1, 2)))
+    for plain, said in ((declare(), "inner: the selector has a guide"), (other, "guide of inner")):
+        with pytest.raises(SkillweaveError, match=said):
+            plain.load(path)
+    run.save_weights(tmp_path / "weights")
+    with pytest.raises(SkillweaveError, match="inner: the selector has a guide"):
+        declare().load_weights(tmp_path / "weights")
+
+
+def test_all_go_on_with_their_whole_states_by_path(tmp_path):
+    """Stopped in the last stage, the states of all who learn there lie in the run."""
+    run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
+    found = {f.name.removesuffix(".safetensors") for f in (run.path / "states").iterdir()}
+    assert found == {"left", "selector", "inner.balance", "inner.right", "inner.selector"}
+    KINDS["then, inside and outside"]().resume(run.path, quiet=True)
+    assert not (run.path / "states").exists()
+
+
+def test_a_state_that_was_not_kept_is_not_gone_on_with(tmp_path):
+    run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
+    like = SimpleNamespace()
+    run.stage("inner/together")["kept"]["kept"] = "before"
+    assert load_state(run, "inner/right", like) is None
+
+
+def test_calls_are_logged_by_the_paths_of_who_acts(whole):
+    run, _ = whole("together")
+    log = CallLog(run.policy, episode_seeds(0, 4))
+    score = evaluate(run.policy, CARTPOLE, episodes=4, watch=log.add)
+    assert log.labels == ("left", "inner/balance", "inner/right", "push")
+    for i, name in enumerate(log.labels):
+        own = [c for e in log.episodes for c in e.calls if c.skill == i]
+        told = score.skills[name]
+        assert (len(own), sum(c.steps for c in own)) == (told.calls, told.steps)
+        ends = {end: sum(c.why == end for c in own) for end in told.ended}
+        assert ends == told.ended
+    assert [len(e.rewards) for e in log.episodes] == list(score.lengths)
+
+
+def test_a_run_has_everyones_file_with_a_checksum(whole):
+    _, path = whole("then")
+    names = {name.removesuffix(".safetensors") for name in policies(path)}
+    own = {"left", "selector", "inner.balance", "inner.right", "inner.selector"}
+    assert names == own | {f"together.{name}" for name in own}
+    stages = {s["name"]: s for s in RunDirectory.open(path).manifest["stages"]}
+    assert set(stages) == {*(n.replace(".", "/") for n in own), "together"}
+    assert all("sha256" in s or all(s["policies"].values()) for s in stages.values())
+
+
+def test_a_policy_in_anothers_place_is_refused(tmp_path, whole):
+    copy = RunDirectory.open(shutil.copytree(whole("apart")[1], tmp_path / "run"))
+    one, other = (copy.policy_path(f"inner/{k}") for k in ("balance", "right"))
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(SkillweaveError, match="holds the policy of stage 'inner/right'"):
+        declare().load(copy.path)
+
+
+def test_info_names_all_levels(whole, capsys):
+    run, path = whole("together")
+    run.evaluate(3, save=True)
+    assert main(["info", str(path)]) == 0
+    told = capsys.readouterr().out
+    for name in ("inner ", "inner/balance", "inner/right"):
+        assert name in told
+
+
+def test_a_skill_of_a_hierarchy_below_acts_alone(whole):
+    run, _ = whole("together")
+    assert run.evaluate(2, skill="inner/balance").mean > 0
+    with pytest.raises(SkillweaveError, match="inner/balance"):
+        run.evaluate(2, skill="inner/nobody")
+
+
+def test_captions_name_the_path(whole):
+    run, _ = whole("together")
+    seen = set()
+
+    def name(memory):
+        seen.add(run.policy.acts(memory))
+
+    engine = make_engine(CARTPOLE, 1)
+    engine.reset(0)
+    rng = np.random.default_rng(0)
+    episodes = SeededEpisodes(engine, range(9), 100)
+    list(play(run.policy, episodes, deterministic=False, rng=rng, before_step=name))
+    assert {"left", "inner/right"} <= seen <= {"left", "inner/right", "inner/balance", "push"}
+
+
+class Task(Skill):
+    """Has no code of its own."""
+
+
+class Short(Skill):
+    """Has no code of its own either."""
+
+    max_steps = 4
+
+
+def test_a_run_without_code_is_loaded_from_its_own_record(tmp_path, capsys):
+    plain = options(env="CartPole-v1", call_steps=3)
+    inner = Hierarchy(skills=[Short(), Task()], **plain | {"name": "inner", "call_steps": 2})
+    found = Hierarchy(skills=[Task(), inner], **plain | {"learn": "together"})
+    run = found.train(tmp_path / "run", quiet=True)
+    assert not run.info()["needs_recipe"]
+    again = Hierarchy.from_manifest(run.info()).load(run.path)
+    assert again.evaluate(3).returns == run.evaluate(3).returns
+    assert [name for name, _ in every_skill(again.hierarchy.skills)] == [
+        "task", "inner", "inner/short", "inner/task",
+    ]  # fmt: skip
+    assert main(["evaluate", str(run.path), "--episodes", "2"]) == 0
+    assert "inner/short" in capsys.readouterr().out
+
+
+def test_a_run_of_other_levels_is_refused(whole):
+    _, path = whole("apart")
+    for other in (declare(inside(Right(), Balance())), declare(inside(name="other"))):
+        with pytest.raises(SkillweaveError, match="inner/balance, inner/right"):
+            other.load(path)
+    with pytest.raises(SkillweaveError, match=r"inner has a trained selector, but .* a ready one"):
+        declare(inside(selector=ready)).load(path)
+
+
+def test_a_hierarchy_of_a_run_can_be_a_skill_beside_one_that_is_trained(tmp_path, whole):
+    run, _ = whole("apart")
+    both = [run.as_skill("done"), inside()]
+    found = Hierarchy(skills=both, **options(call_steps=5, learn="together"))
+    made = found.train(tmp_path / "run", quiet=True)
+    assert {k.partition("/")[0] for k in made.evaluate(2).skills} == {"done", "inner"}
+    assert found.load(tmp_path / "run").evaluate(2) == made.evaluate(2)
+
+
+def test_budgets_of_all_levels_count_and_are_scaled():
+    found = declare()
+    assert found.total_steps == (300 + 300 + 300) + 300 + 300
+    found.scale(2.0)
+    assert found.total_steps == 3000
+    assert declare(learn="together").total_steps == 900
+
+
+class Forever(Skill):
+    """A skill whose policy is filled in later."""
+
+    name = "loop"
+
+
+def itself():
+    skill = Forever()
+    found = inside(Right(), skill)
+    skill.policy = found
+    return declare(found)
+
+
+def gains_itself():
+    found = declare()
+    found.skills = (*found.skills, found.as_skill("again"))
+    return found.train("never", quiet=True)
+
+
+def trained_twice():
+    found = careful()
+    found.algorithm = ON
+    return found
+
+
+WRONG = {
+    "another environment": (
+        lambda: declare(inside(env="Acrobot-v1")),
+        "inner: .*Acrobot-v1.*CartPole-v1",
+    ),
+    "other settings of it": (
+        lambda: declare(inside(env=EnvSpec("CartPole-v1", engine="sync"))),
+        "inner: .*workers",
+    ),
+    "itself": (itself, "inner/loop is a hierarchy that contains itself"),
+    "itself later": (gains_itself, "again is a hierarchy that contains itself"),
+    "two of one name": (lambda: declare(inside(name="left")), "two skills are named 'left'"),
+    "a reserved name": (lambda: declare(inside(name="selector")), "'selector', which names"),
+    "no end": (
+        lambda: declare(call_steps=None),
+        "skill 'inner' never stops|skill 'left'",
+    ),
+    "lengths of zero": (
+        lambda: declare(inside().as_skill(call_steps=0)),
+        "'inner'.*call_steps is 0",
+    ),
+    "an algorithm": (
+        lambda: declare(trained_twice()),
+        "skill 'careful' is a hierarchy, so it has no algorithm",
+    ),
+    "no such attribute": (lambda: inside().as_skill(cal_steps=3), "cal_steps"),
+    "an algorithm that cannot": (
+        lambda: declare(inside(algorithm=TD3(num_envs=4))).check_spaces(),
+        "'inner/balance'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_bad_declarations_are_told_by_path(case):
+    make, told = WRONG[case]
+    with pytest.raises(SkillweaveError, match=told):
+        make()
+
+
+def test_errors_of_skills_below_name_their_path(tmp_path):
+    class Broken(Skill):
+        def reward(self, step):
+            return np.full(len(step.reward), np.nan)
+
+    with pytest.raises(SkillweaveError, match="'inner/broken'"):
+        declare(inside(Broken()), learn="together").train(tmp_path / "run", quiet=True)
