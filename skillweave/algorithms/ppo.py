@@ -183,9 +183,6 @@ class PPOAlgorithm(Algorithm):
         if batch.memory is not None:
             batch = batch.changed(lambda x: x.flatten(1, 2))
         log_std, valid, acted = views.get("actor.log_std"), batch.valid, batch.own
-        own = head  # the anchor is compared without the floor
-        if now.floor is not None:
-            head = with_floor(head, batch.mask, now.floor)
         log_prob, entropy = self.head.stats(head, log_std, batch.mask, batch.action)
         old, weight = batch.log_prob, batch.importance
         policy = ppo_policy_loss(log_prob, old, batch.advantage, state.clip_coef, weight, acted)
@@ -201,7 +198,7 @@ class PPOAlgorithm(Algorithm):
             near = now.anchor.params
             other = None if near is None else near.views.get("actor.log_std")
             assert batch.anchor is not None
-            away = self.head.kl(own, log_std, batch.anchor, other, batch.mask)
+            away = self.head.kl(head, log_std, batch.anchor, other, batch.mask)
             report["anchor_kl"] = masked_mean(away, acted)
             total = total + now.anchor.coef * report["anchor_kl"]
         return total, {k: v.detach() for k, v in report.items()}

@@ -13,7 +13,6 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.rollouts import Cells, Samples, values_after
 from skillweave.experience import Anchor, Rollout
 from skillweave.networks.stacked import take_rows
-from skillweave.ops.distributions import with_floor
 from skillweave.ops.moments import explained_variance, normalise
 from skillweave.ops.returns import gae
 
@@ -27,7 +26,6 @@ class Terms:
 
     rate: Tensor  # (P,), Adam's step size
     ent_coef: Tensor  # (P,)
-    floor: Tensor | None  # (P, 1, 1), share of actions that is drawn uniformly
     anchor: Anchor | None
 
     @classmethod
@@ -39,7 +37,7 @@ class Terms:
             rate = rate * (1.0 - progress)
         if final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
-        return cls(rate, ent_coef, floor_now(config, progress, rate), rollout.anchor)
+        return cls(rate, ent_coef, rollout.anchor)
 
 
 def floor_now(config: PPO, progress: float, like: Tensor) -> Tensor | None:
@@ -82,10 +80,10 @@ def samples_of(
         agent.update_return_stats(state, returns, valid)
     mean, scale = state.return_mean, state.return_scale
     action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.obs_mask)
-    # Clipping and KL count from the policy as it is now, whoever acted.
+    # Clipping and KL count from the policy as it is now, whoever acted: an older one, or one with a
+    # floor. A ratio of mixtures would let the policy collapse within the clip where the floor is
+    # high: all it can change in the mixture is 1 − floor.
     head, _ = agent.run(agent.actor_net, params.views, inputs, memory, starts)
-    if now.floor is not None:
-        head = with_floor(head, mask, now.floor)
     log_prob, _ = agent.head.stats(head, params.views.get("actor.log_std"), mask, action)
     own = _own(cells.flat_or_none(rollout.overridden), valid)
     samples = Samples(

@@ -8,7 +8,7 @@ from torch.distributions import Categorical, Independent, Normal, kl_divergence
 
 from skillweave import PPO, Network, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.algorithms.ppo_samples import floor_now
+from skillweave.algorithms.ppo_samples import Terms, floor_now, samples_of
 from skillweave.experience import Anchor, Rollout
 from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_floor
@@ -96,6 +96,21 @@ def rollout_of(algorithm, state, seed=0, **more):
         log_std=params.views["actor.log_std"][:, None] if "actor.log_std" in params.views else None,
         **more,
     )  # fmt: skip
+
+
+def test_with_a_floor_samples_are_weighted_and_the_clip_counts_from_the_policy_itself():
+    """A mixture that is nearly uniform hardly changes where the policy collapses."""
+    config = PPO(floor=0.9, network=SMALL, normalize_obs=False)
+    algorithm = make_algorithm(config, SEEN, gym.spaces.Discrete(4))
+    state = algorithm.init([Seeds(0)])
+    rollout = rollout_of(algorithm, state)
+    bare = algorithm.acting_params_of(algorithm.weights(state))
+    _, own, _ = algorithm.act(bare, rollout.obs.flatten(1, 2), None, None)
+    action = rollout.action.flatten(1, 2).long()[..., None]
+    chosen = own.softmax(-1).gather(-1, action)[..., 0]
+    found, _ = samples_of(algorithm, state, rollout, Terms.of(config, state, rollout))
+    torch.testing.assert_close(found.log_prob, chosen.log())
+    torch.testing.assert_close(found.importance, chosen / (0.1 * chosen + 0.9 / 4))
 
 
 @pytest.mark.parametrize("space", [gym.spaces.Discrete(4), gym.spaces.Box(-1, 1, (2,), np.float32)])
