@@ -196,7 +196,7 @@ _OF_LEARNERS = {"memory", "before"}
 """What is kept of the learners' memory: others begin without."""
 
 
-def together(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
+def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
     """Several collectors of one kind as one, over an engine of all their environments."""
     found: Collector = collectors[0].like(engine, acting)
     for name, rows in found.kept.items():
@@ -209,8 +209,8 @@ def together(collectors: Sequence[Collector], engine: Engine, acting: Acting) ->
     return found
 
 
-def apart(joined: Collector, collectors: Sequence[Collector]) -> None:
-    """The inverse of ``together``: each stands where its part of ``joined`` does."""
+def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
+    """The inverse of ``joined_from``: each stands where its part of ``joined`` does."""
     first = 0
     for collector in collectors:
         part = slice(first, first + collector.num_envs)

@@ -18,7 +18,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.buffers.replay import ReplayStore
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.collector import Collector, apart, together
+from skillweave.collecting.collector import Collector, joined_from, parted
 from skillweave.collecting.group import Collectors
 from skillweave.envs.joined import JoinedEngines
 from skillweave.evolution.config import Evolution
@@ -138,7 +138,7 @@ class Population:
                 schedule_steps=schedule_steps * count, skip_diverged=True,
                 on_tick=_telling(on_tick, spent - start),
             )  # fmt: skip
-            apart(joined, places)
+            parted(joined, places)
             self._unstack(stack, group)
             spent, first = spent + end.steps - start, first + count
             _count(group, end.steps - start)
@@ -166,7 +166,7 @@ class Population:
             resume_from=Progress(self.rounds, start), schedule_steps=schedule_steps * count,
             skip_diverged=True, cut_every=NEVER, on_tick=_telling(on_tick, -start),
         )  # fmt: skip
-        apart(joined, self.places)
+        parted(joined, self.places)
         for stack, group in zip(stacks, groups, strict=True):
             self._unstack(stack, group)
         self._kept = learner.counts()
@@ -186,7 +186,7 @@ class Population:
         """The places as one collector, in which the stacks act."""
         engine: Any = JoinedEngines([place.engine for place in places])
         acting = Acting([(s.algorithm, s.members) for s in stacks], engine.num_envs)
-        return together(places, engine, acting)
+        return joined_from(places, engine, acting)
 
     def _make_store(self) -> ReplayStore:
         algorithm = self.members[0].algorithm(self.spaces)

@@ -116,7 +116,7 @@ class Declaration(Nestable):
         for name in ("algorithm", "flat"):
             check_algorithm(getattr(self, name), name, optional=name == "flat")
         check_selection(self)
-        target_of(self.selector_target_return, None, "selector")
+        target_of(self.selector_target_return, None, "selector", "selector_target")
         check_fields(self)
         check_calls(self.call_steps, self.skills)
         check_nested(self)

@@ -52,8 +52,14 @@ class Target:
         return value if value >= self.at_least else None
 
 
-def target_of(target_return: Any, target_success: Any, where: str) -> Target | None:
+def target_of(
+    target_return: Any, target_success: Any, where: str, field: str = "target"
+) -> Target | None:
     """The target that two settings, of which one may be given, ask for.
+
+    Args:
+        where: whose they are, for messages.
+        field: what the settings' names begin with.
 
     Raises:
         SkillweaveError: both are given, or one is no number in its range.
@@ -65,7 +71,7 @@ def target_of(target_return: Any, target_success: Any, where: str) -> Target | N
     for of, value in given.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not math.isfinite(value):
-            raise SkillweaveError(f"{where}: target_{of} is {short(value)}; it must be a number")
+            raise SkillweaveError(f"{where}: {field}_{of} is {short(value)}; it must be a number")
         if of == "success" and not 0.0 < value <= 1.0:
             raise SkillweaveError(
                 f"{where}: target_success is {short(value)}; it is a share of episodes, more than "
@@ -203,8 +209,8 @@ def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> N
             )
         if target is not None and population is None and eval_every is None:
             raise SkillweaveError(
-                f"{where}: it has a target, but is not evaluated while it trains: set eval_every "
-                "to the environment steps between evaluations"
+                f"{where}: it has a target_{target['of']}, but is not evaluated while it trains: "
+                "set eval_every to the environment steps between evaluations"
             )
 
 

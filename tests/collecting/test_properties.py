@@ -16,7 +16,7 @@ from skillweave.algorithms.config import PPO, SAC
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.collector import Collected, apart, side_by_side, together
+from skillweave.collecting.collector import Collected, joined_from, parted, side_by_side
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.joined import JoinedEngines
@@ -240,11 +240,11 @@ def test_joined_collectors_find_what_they_find_alone(kind, rows):
             for request in itertools.islice(stream, 2):
                 for part, single in zip(parts, alone, strict=True):
                     compare(part.collect(request), single.collect(request))
-        joined = together(parts, JoinedEngines([p.engine for p in parts]), Choices(6, actions))
+        joined = joined_from(parts, JoinedEngines([p.engine for p in parts]), Choices(6, actions))
         for request in itertools.islice(stream, 3):
             whole = joined.collect(request)
             compare(whole, side_by_side([c.collect(request) for c in alone], 1))
-        apart(joined, parts)
+        parted(joined, parts)
 
 
 def test_joined_collectors_go_on_with_the_search_for_a_start():
@@ -253,9 +253,9 @@ def test_joined_collectors_go_on_with_the_search_for_a_start():
         part.start(Seeds(4) / i)
     stream, found = requests(5), []
     for _ in range(4):
-        joined = together(parts, JoinedEngines([p.engine for p in parts]), Choices(6, 3))
+        joined = joined_from(parts, JoinedEngines([p.engine for p in parts]), Choices(6, 3))
         found += [joined.collect(r).experience for r in itertools.islice(stream, 3)]
-        apart(joined, parts)
+        parted(joined, parts)
         for name, rows in joined.kept.items():
             np.testing.assert_array_equal(np.concatenate([p.kept[name] for p in parts]), rows)
         for i, part in enumerate(parts):

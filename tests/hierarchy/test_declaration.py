@@ -52,6 +52,12 @@ def named(name: str, **attributes) -> Skill:
 
 # What is wrong -------------------------------------------------------------------------------
 
+
+def test_a_target_is_told_by_the_name_of_its_setting() -> None:
+    with pytest.raises(SkillweaveError, match="selector_target_return is 'x'; it must be a number"):
+        declare(selector_target_return="x")
+
+
 WRONG = {
     "no skills": (lambda: Hierarchy("CartPole-v1", []), "at least one skill"),
     "no name": (lambda: declare(named("")), "Custom.*no name"),

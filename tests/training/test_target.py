@@ -207,7 +207,7 @@ def test_a_population_ends_at_its_stages_target(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"target_return": 1.0}, "stage 'agent'.*set eval_every"),
+        ({"target_return": 1.0}, "stage 'agent': it has a target_return, .*set eval_every"),
         ({"target_return": "x", "eval_every": 9}, "agent: target_return is 'x'; it must be a"),
         ({"target_return": float("nan"), "eval_every": 9}, "target_return is nan"),
         ({"target_success": 2, "eval_every": 9}, "target_success is 2; it is a share"),
