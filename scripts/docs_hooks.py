@@ -19,6 +19,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     def inline(found: re.Match[str]) -> str:
         drawing = (DOCS / found[2]).read_text().strip()
         drawing = "\n".join(line for line in drawing.splitlines() if line.strip())
-        return f'<figure class="picture">\n{drawing}\n<figcaption>{found[1]}</figcaption>\n</figure>'
+        return (
+            f'<figure class="picture">\n{drawing}\n<figcaption>{found[1]}</figcaption>\n</figure>'
+        )
 
     return PICTURE.sub(inline, markdown)

@@ -16,7 +16,7 @@ from skillweave import Agent, Hierarchy
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.S | re.M)
-INCLUDED = re.compile(r'^--8<-- "([\w/.]+)"$', flags=re.M)
+INCLUDED = re.compile(r"^--8<--\n([\w/.]+)\n--8<--$", flags=re.M)
 STEPS = 1_000
 """Of each stage; those of an algorithm with replay are a little more than it waits."""
 

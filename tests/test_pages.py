@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
 
 import skillweave as sw
-from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
 from skillweave.cli.commands import COMMANDS, name_of
 
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -55,15 +55,17 @@ def test_modules_that_a_page_tells_to_run_exist(page: Path) -> None:
 
 def test_every_public_name_stands_in_the_reference_once() -> None:
     pages = sorted((ROOT / "docs/reference").glob("*.md"))
-    found = [n for p in pages for n in re.findall(r"^::: skillweave\.(\w+)$", p.read_text(), flags=re.M)]
+    found = [
+        n for p in pages for n in re.findall(r"^::: skillweave\.(\w+)$", p.read_text(), flags=re.M)
+    ]
     assert sorted(found) == sorted(sw.__all__)
 
 
 def test_figures_that_are_older_than_the_latest_changes_are_marked_alike() -> None:
     """A row that README has, too, has its dagger in both, or in none."""
     readme, measured = (ROOT / "README.md").read_text(), (ROOT / "docs/measured.md").read_text()
-    rows = [line.split(" | ")[0] for line in readme.splitlines() if re.match(r"\| .*\d\.\d \(", line)]
+    rows = [
+        line.split(" | ")[0] for line in readme.splitlines() if re.match(r"\| .*\d\.\d \(", line)
+    ]
     assert len(rows) == 4
     assert [row for row in rows if f"\n{row} |" not in measured] == []
-
-

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import pytest
-
 from pages import ROOT, run_page, train_briefly
 
 README = ROOT / "README.md"

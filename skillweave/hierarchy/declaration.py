@@ -141,7 +141,11 @@ class Declaration:
         return self.is_data and self.spec.engine == "auto" and not own
 
     def skill(self, name: str) -> Skill:
-        """The skill of this name."""
+        """The skill of this ``name``.
+
+        Raises:
+            SkillweaveError: there is none; the message lists them.
+        """
         for skill in self.skills:
             if skill.name == name:
                 return skill
@@ -150,7 +154,7 @@ class Declaration:
         )
 
     def budget(self, skill: Skill) -> int:
-        """A skill's training steps; 0 where its policy is ready."""
+        """Training steps of a ``skill``; 0 where its policy is ready."""
         return 0 if skill.policy is not None else skill.steps or self.skill_steps
 
     @property
@@ -177,7 +181,11 @@ class Declaration:
         return self.learn != "apart"
 
     def scale(self, factor: float) -> None:
-        """Multiply every training budget, in place."""
+        """Multiply every training budget by ``factor``, in place.
+
+        Raises:
+            SkillweaveError: the factor is not positive and finite.
+        """
         if not 0.0 < factor < float("inf"):
             raise SkillweaveError(f"scale is {factor}; it must be positive and finite")
         for skill in self.skills:
@@ -208,7 +216,7 @@ class Declaration:
     def skill_set(
         self, policies: Sequence[Policy], skills: Sequence[Skill] | None = None
     ) -> SkillSet:
-        """The skills (None: all) with their policies, ready to be called."""
+        """The ``skills`` (None: all) with their ``policies``, ready to be called."""
         return SkillSet(
             tuple(self.skills if skills is None else skills),
             tuple(policies),
@@ -259,7 +267,7 @@ class Declaration:
         return ready_selector(self.selector, tuple(s.name for s in self.skills))
 
     def fitted_selector(self, observation_space: gym.Space[Any]) -> Policy | None:
-        """The selector that is not trained, on these observations; None: it is trained."""
+        """The selector that is not trained, on this ``observation_space``; None: it is trained."""
         if (found := self.ready_selector) is None:
             return None
         choices = gym.spaces.Discrete(len(self.skills))
