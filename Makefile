@@ -1,6 +1,7 @@
 # make demo   train, score and film the lunar-lander recipe
 # make test   the tests            make check   ruff, mypy, import order, tests
 # make bench  the benchmarks       make weights the shipped weights, made anew
+# make docs   the documentation, as a site in site/
 # make torture  mutated files, kills, bad disks, hostile code: an hour
 PYTHON ?= python3
 # One torch for everything, installed first: a plain `torch` may pull gigabytes of CUDA.
@@ -10,7 +11,7 @@ SEED ?= 0
 # One process for each core; a process that has no tests left takes some of another's.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: demo test check torture bench figures weights smoke clean
+.PHONY: demo test check docs torture bench figures weights smoke clean
 
 .venv/demo: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("Skillweave needs Python 3.11 or newer, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
@@ -38,6 +39,10 @@ check: .venv/dev
 	$(BIN)/mypy
 	$(PYTEST)
 
+docs: .venv/demo
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 torture: .venv/dev
 	$(BIN)/python -m scripts.torture --seed $(SEED)
 
@@ -54,4 +59,4 @@ weights: .venv/demo
 	$(BIN)/skillweave weights runs/weights-$(r) --out skillweave/recipes/$(subst -,_,$(r)).safetensors &&) true
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

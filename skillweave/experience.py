@@ -82,7 +82,7 @@ class Rollout:
     advantage: Tensor | None = None  # (P, T, B), what counts beside the learner's own advantage
     guide: Tensor | None = None  # (P, T, B, A), logits of a ready selector's choice
     overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted instead; None: nowhere
-    anchor: Anchor | None = None
+    anchor: Anchor | None = None  # the policy to stay near
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
 

@@ -18,10 +18,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Seeds:
-    """A node of the seed tree; ``Seeds(7) / "landing" / 17`` is a node two levels below."""
+    """A node of the seed tree; ``Seeds(7) / "landing" / 17`` is a node two levels below.
 
-    root: int
-    path: tuple[int, ...] = ()
+    ```python
+    import skillweave as sw
+
+    noise = (sw.Seeds(7) / "landing" / 17).numpy().normal(size=3)  # always the same three
+    ```
+    """
+
+    root: int  # the run's seed
+    path: tuple[int, ...] = ()  # of keys, from the root down
 
     def __truediv__(self, name: str | int) -> Seeds:
         key = name if isinstance(name, int) else zlib.crc32(name.encode()) | 1 << 32

@@ -74,7 +74,7 @@ class Step:
     truncated: Array  # (N,) bool, the environment's time limit
     timed_out: Array  # (N,) bool, the skill's time limit
     elapsed: Array  # (N,) int64, steps
-    info: Mapping[str, Any]
+    info: Mapping[str, Any]  # the environment's, arrays over N where it tells any
 
     def __post_init__(self) -> None:
         # Of every step of training: a loop over the names would take three times as long.
@@ -97,7 +97,14 @@ class Policy(Protocol):
     """Names of the skills below it, in order; empty for a plain policy."""
 
     def start(self, n: int) -> Memory:
-        """Fresh memory for n environments at the start of their episodes."""
+        """Fresh memory for n environments at the start of their episodes.
+
+        Args:
+            n: how many environments.
+
+        Returns:
+            Arrays by name; the first axis of each is the environment.
+        """
         ...
 
     def act(
@@ -109,15 +116,41 @@ class Policy(Protocol):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions (n, ...) for observations (n, ...), and the memory after them."""
+        """What to do, and what to remember.
+
+        Args:
+            memory: of the n environments.
+            obs: (n, *obs_shape).
+            mask: (n, A) bool, allowed actions; None: all.
+            deterministic: act greedily, else sample.
+            rng: the source of chance, where it samples.
+
+        Returns:
+            Actions (n, ...), and the memory after them.
+        """
         ...
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """The memory after the environments answered."""
+        """The memory after the environments answered.
+
+        Args:
+            memory: of the n environments, after ``act``.
+            step: what happened, batched over them.
+
+        Returns:
+            The memory.
+        """
         ...
 
     def acting(self, memory: Memory) -> Array | None:
-        """(n,) int64, the skill that acts in each environment (a row of ``labels``), or None."""
+        """Which of its skills acts in each environment.
+
+        Args:
+            memory: of the n environments.
+
+        Returns:
+            (n,) int64, rows of ``labels``; None: it has no skills.
+        """
         ...
 
 

@@ -74,7 +74,8 @@ class Algorithm:
 
     A subclass sets ``layout``, the columns of its state's ``params`` (P, D), and ``acting``, the
     first of them, which acting needs. It defines ``fresh_state``, ``parameter_groups``, ``act``,
-    ``value`` and ``update``. It holds nothing that is learnt: that is in the state.
+    ``value`` and ``update``. It holds nothing that is learnt: that is in the state. It is made
+    of its settings (``config``), ``observation_space`` and ``action_space``.
     """
 
     store: ClassVar[Literal["rollout", "replay"]]
@@ -104,7 +105,7 @@ class Algorithm:
     # What an algorithm defines
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> Any:
-        """A state of fresh members, one for each seed, on the CPU; see ``fresh_fields``."""
+        """A state of fresh members, one for each of ``seeds``, on the CPU; see ``fresh_fields``."""
         self._missing("fresh_state")
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -122,6 +123,7 @@ class Algorithm:
         """Actions in policy units, what they were chosen from, and the memory after them.
 
         Args:
+            params: of ``acting_params`` or ``learning_params``.
             obs: (P, B, *item), raw.
             mask: (P, B, A) bool, allowed actions, or None: all.
             noise: one step of ``noise``, or None to act greedily.
@@ -130,9 +132,11 @@ class Algorithm:
         self._missing("act")
 
     def value(self, state: Any, obs: Tensor, mask: Tensor | None = None) -> Tensor:
-        """What it expects of raw observations (P, B, *item), in units of reward, (P, B).
+        """What it expects, (P, B), in units of reward.
 
         Args:
+            state: of P members.
+            obs: (P, B, *item), raw.
             mask: (P, B, A) bool, allowed actions, or None: all.
         """
         self._missing("value")
@@ -141,6 +145,7 @@ class Algorithm:
         """Learn from a batch, in place; returns the state and what to tell.
 
         Args:
+            state: of P members.
             batch: of the kind that ``store`` says, on the device of the state.
             rng: one generator per member, on the CPU.
         """
@@ -149,16 +154,16 @@ class Algorithm:
     # What all share
 
     def init(self, seeds: Sequence[Seeds]) -> Any:
-        """Fresh members on the CPU, one for each seed; none depends on its neighbours."""
+        """Fresh members on the CPU, one for each of ``seeds``; none depends on its neighbours."""
         with torch_threads(1):  # of a QR decomposition, the last bits depend on their number
             return self.fresh_state(seeds)
 
     def member_generators(self, seeds: Sequence[Seeds]) -> list[torch.Generator]:
-        """The generators of fresh members' weights."""
+        """The generators of fresh members' weights, one for each of ``seeds``."""
         return [(s / "init").torch() for s in seeds]
 
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
-        """The fields that every state has, of fresh parameters (P, D)."""
+        """The fields that every state has, of fresh ``params`` (P, D)."""
         members = len(params)
         return {
             "params": params,
@@ -180,17 +185,20 @@ class Algorithm:
     def acting_params(
         self, state: Any, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs; ``progress`` is the share of the budget that is spent."""
+        """A copy of what acting needs of a ``state``, on a ``device``.
+
+        ``progress`` is the share of the budget that is spent.
+        """
         flat = state.params[:, : self.acting.size].detach().to(device, copy=True)
         shift, scale = (None if x is None else x.to(device) for x in self.scaling(state))
         return ActingParams(self.acting.views(flat), shift, scale)
 
     def learning_params(self, state: Any) -> ActingParams:
-        """What learning needs to act with the parameters as they are; not a copy."""
+        """What learning needs to act with a ``state`` as it is; not a copy."""
         return ActingParams(self.layout.views(state.params), *self.scaling(state))
 
     def scaling(self, state: Any) -> tuple[Tensor | None, Tensor | None]:
-        """Shift and scale of observations, each (P, 1, O), or None where they are not scaled."""
+        """Shift and scale of observations by a ``state``, each (P, 1, O); None: there is none."""
         if not self.normalize_obs:
             return None, None
         return _scaling(state.obs_mean, state.obs_var)
@@ -206,14 +214,16 @@ class Algorithm:
         return self.layout.shapes | (scaling if self.normalize_obs else {})
 
     def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
-        """One member's policy by name: parameters and observation scaling, copied to the CPU."""
+        """One ``member``'s policy of a ``state`` by name: parameters (*shape) and the scaling of
+        observations (O,), copied to the CPU.
+        """
         named = {k: v[member] for k, v in self.layout.views(state.params).items()}
         if self.normalize_obs:
             named |= {k: getattr(state, k)[member] for k in ("obs_mean", "obs_var")}
         return {k: v.detach().to("cpu", copy=True) for k, v in named.items()}
 
     def set_weights(self, state: Any, weights: Mapping[str, Tensor]) -> None:
-        """The inverse of ``weights`` for a state of one member, in place; its slow copy follows."""
+        """The inverse of ``weights`` for a ``state`` of one member, in place; its slow copy too."""
         for name in self.parameter_groups()[0].weights:
             for k, view in self.layout.views(getattr(state, name)).items():
                 view[0].copy_(weights[k])
@@ -229,7 +239,10 @@ class Algorithm:
         return ActingParams(views, *_scaling(weights["obs_mean"][None], weights["obs_var"][None]))
 
     def inputs(self, params: ActingParams, obs: Tensor) -> Inputs:
-        """Raw observations (P, B, *item) as the network's inputs; images stay as they came."""
+        """Raw ``obs`` (P, B, *item) as the network's inputs, by the scaling in ``params``.
+
+        Images stay as they came.
+        """
         vector, images = self.obs.split(obs)
         found = {f"image.{i}": image for i, image in enumerate(images)}
         if self.obs.size:
@@ -239,13 +252,18 @@ class Algorithm:
         return found
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:
-        """Exploration noise for ``steps`` calls of ``act``, by step; one generator per member."""
+        """Exploration noise for ``steps`` calls of ``act`` on (P, ``batch``) rows, by step.
+
+        There is one of ``generators`` per member.
+        """
         return self.head.noise(generators, steps, batch)
 
     def update_obs_stats(self, state: Any, obs: Tensor, valid: Tensor | None = None) -> None:
-        """Take observations (P, B, *item) into account in the running moments, in place.
+        """Take observations into account in the running moments, in place.
 
         Args:
+            state: of P members.
+            obs: (P, B, *item), raw.
             valid: (P, B) bool, rows that count; None: all.
         """
         if self.normalize_obs:
@@ -254,14 +272,14 @@ class Algorithm:
             state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector, valid)
 
     def update_return_stats(self, state: Any, returns: Tensor, valid: Tensor | None = None) -> None:
-        """Take returns (P, B) into account in their running moments, in place."""
+        """Take ``returns`` (P, B), where ``valid`` (P, B), into the moments of ``state``."""
         moments = state.return_mean, state.return_var, state.return_count
         state.return_mean, state.return_var, state.return_count = merge_moments(
             *moments, returns[..., None], valid
         )
 
     def to_env(self, action: Array) -> Array:
-        """Policy units (n, …) to the environment's."""
+        """An ``action`` (n, …) in policy units as the environment's."""
         return self.codec.to_env(action)
 
     def _missing(self, method: str) -> NoReturn:

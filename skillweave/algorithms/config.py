@@ -32,7 +32,11 @@ from skillweave.types import SkillweaveError
 
 @dataclass(frozen=True)
 class OnPolicy:
-    """What the algorithms that learn from their own latest rollout have in common."""
+    """What the algorithms that learn from their own latest rollout have in common.
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     num_envs: int = 64
     """Environments stepped side by side."""
@@ -64,7 +68,11 @@ class OnPolicy:
 
 @dataclass(frozen=True)
 class PPO(OnPolicy):
-    """Proximal policy optimisation (Schulman et al. 2017)."""
+    """Proximal policy optimisation (Schulman et al. 2017).
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     batch_size: int = 256
     """Samples of one gradient step (a minibatch), about; a smaller rollout is one minibatch."""

@@ -160,7 +160,11 @@ class OffPolicy:
 
 @dataclass(frozen=True)
 class DQN(OffPolicy):
-    """Deep Q-learning (Mnih et al. 2015) and its extensions; all of them are ``DQN.rainbow()``."""
+    """Deep Q-learning (Mnih et al. 2015) and its extensions; all of them are ``DQN.rainbow()``.
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     double: bool = True
     """The online network chooses the target's action (van Hasselt et al. 2016)."""
@@ -213,7 +217,7 @@ class DQN(OffPolicy):
 
     @classmethod
     def rainbow(cls, **settings: Any) -> DQN:
-        """Every extension at once, as in Rainbow (Hessel et al. 2018); settings override."""
+        """Every extension at once, as in Rainbow (Hessel et al. 2018); ``settings`` override."""
         everything = {
             "double": True, "dueling": True, "noisy": True, "distributional": True,
             "prioritized": True, "n_step": 3, "priority_alpha": 0.5, "adam_eps": 1.5e-4,
@@ -266,7 +270,7 @@ class TD3(ActorCritic):
 
     @classmethod
     def ddpg(cls, **settings: Any) -> TD3:
-        """DDPG (Lillicrap et al. 2016): one critic, no delay, no noise on targets."""
+        """DDPG (Lillicrap et al. 2016): one critic, no delay, no target noise; or ``settings``."""
         return cls(**{"twin": False, "policy_delay": 1, "target_noise": 0.0, **settings})
 
 

@@ -14,7 +14,7 @@ from skillweave.networks.stacked import Layout
 class ParameterGroup:
     """Fields of a state (..., D) that hold the same networks, so they change together."""
 
-    layout: Layout
+    layout: Layout  # of their columns
     nets: tuple[tuple[str, Any], ...]
     """The networks in the layout, each with the field of the config that shapes it."""
     weights: tuple[str, ...] = ("params",)

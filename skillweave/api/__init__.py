@@ -12,7 +12,7 @@ import gymnasium as gym
 from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.api.adoption import adopt, check_run
+from skillweave.api.adoption import adopt, check_run, spec_of
 from skillweave.api.run import Run, as_path
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
@@ -45,47 +45,67 @@ class Agent(PlainAgent):
         track: Sequence[str] = (),
         evolve: Evolve = None,
     ) -> Run:
-        """Train it; everything goes to ``run_dir``. The arguments are ``Hierarchy.train``'s."""
+        """Train it; all goes to ``run_dir``.
+
+        ``seed``, ``quiet``, ``track`` and ``evolve`` are as in ``Hierarchy.train``.
+        """
         content = self.manifest(whole_number(seed, "seed", 0))
         return _train(self, content, run_dir, quiet, track, evolve)
 
     def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
-        """Finish a run that was stopped; as ``Hierarchy.resume``."""
+        """Finish the run in ``run_dir``; with ``quiet`` and ``evolve`` as ``Hierarchy.resume``."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
         return _go_on(self, run, quiet, evolve)
 
     def load(self, run_dir: str | Path) -> Run:
-        """A finished run of this agent."""
+        """The finished run of this agent in ``run_dir``."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
         return Run(self, run.path, training.load(self, run))
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
-        """The agent of a run that needs none of the user's code."""
+        """The agent of a run's ``manifest`` (``run.json``) that needs none of the user's code."""
         (stage,) = manifest["stages"]
         config = config_from_json(stage["algorithm"])
-        return cls(_spec_of(manifest), config, int(stage["budget"]))
+        return cls(spec_of(manifest), config, int(stage["budget"]))
 
     def load_weights(self, path: str | Path) -> Run:
-        """This agent with the weights of one file (see ``Run.save_weights``)."""
+        """This agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
         path = as_path(path, "path")
         return Run(self, path, read_agent(self.spec, *open_weights(path), path))
 
     @classmethod
     def from_weights(cls, path: str | Path) -> Run:
-        """A plain agent with its environment, from the file that ``Run.save_weights`` wrote."""
+        """A plain agent with its environment, from the file that ``Run.save_weights`` wrote.
+
+        Raises:
+            SkillweaveError: ``path`` is no such file, or the environment needs code.
+        """
         path = as_path(path, "path")
         tensors, header = open_weights(path)
         if header["kind"] != "agent" or "env" not in header:
             raise SkillweaveError(f"{path} does not say which environment its agent is for")
-        agent = cls(_spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
+        agent = cls(spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
 
 
 class Hierarchy(Declaration):
-    """Skills, reflexes and a selector on one environment: declared, then trained and watched."""
+    """Skills, reflexes and a selector on one environment: declared, then trained and watched.
+
+    ```python
+    import skillweave as sw
+
+
+    class Middle(sw.Skill):
+        def reward(self, step):
+            return 1.0 - abs(step.next_obs[:, 0])
+
+
+    run = sw.Hierarchy("CartPole-v1", [Middle()]).train("runs/middle")
+    ```
+    """
 
     recipe: str | None = None
     """Where it was declared: a shipped recipe's name or a file; written into runs."""
@@ -111,6 +131,9 @@ class Hierarchy(Declaration):
             evolve: a population for every stage, or for some by name (a skill's, "selector",
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
 
+        Returns:
+            The finished run.
+
         Raises:
             SkillweaveError: the declaration does not fit the environment, or training diverged.
         """
@@ -118,18 +141,19 @@ class Hierarchy(Declaration):
         return _train(self, content, run_dir, quiet, track, evolve)
 
     def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
-        """Finish a run that was stopped; the end is the same as if it had not been.
+        """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
-        ``evolve`` is needed only where the population evolves by a selection of your own.
+        ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
+        selection of your own.
         """
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        self._adopt_run_config(run)
+        adopt(self, run)
         return _go_on(self, run, quiet, evolve)
 
     def load(self, run_dir: str | Path) -> Run:
-        """A finished run of this hierarchy, or of its flat baseline."""
+        """The finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        self._adopt_run_config(run)
+        adopt(self, run)
         return Run(_declared(self, run), run.path, training.load(self, run))
 
     def plain_agent(self) -> Agent:
@@ -137,7 +161,7 @@ class Hierarchy(Declaration):
         return Agent(**vars(super().plain_agent()))
 
     def load_weights(self, path: str | Path) -> Run:
-        """This hierarchy with the weights of one file (see ``Run.save_weights``)."""
+        """This hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
         path = as_path(path, "path")
         policy = read_weights(self, path)
         plain = isinstance(policy, AgentPolicy)
@@ -145,14 +169,14 @@ class Hierarchy(Declaration):
 
     @staticmethod
     def pretrained(name: str) -> Run:
-        """A shipped recipe with its shipped weights."""
+        """The shipped recipe ``name`` with its shipped weights."""
         return recipes.load(name).load_weights(recipes.weights_path(name))
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
         """The hierarchy of a run that needs none of the user's code (plain data says it all)."""
         entries = {s["name"]: s for s in manifest["skills"]}
-        return cls._recorded(_spec_of(manifest), manifest, entries)
+        return cls._recorded(spec_of(manifest), manifest, entries)
 
     @classmethod
     def _recorded(
@@ -168,12 +192,6 @@ class Hierarchy(Declaration):
                 own["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
             skills.append(type(name, (RecordedSkill,), own)())
         return cls(spec, skills, call_steps=calls_from_json(told))
-
-    def _adopt_run_config(self, run: RunDirectory) -> None:
-        """Take over from a run how its skills are called, after a check that it fits."""
-        check_run(self, run)
-        if run.manifest["kind"] == "hierarchy":
-            adopt(self, run)
 
 
 def train_agent(
@@ -201,7 +219,14 @@ def train_agent(
         target_success: stop early at this share of episodes whose ``info["success"]`` is true.
         eval_every: environment steps between these evaluations; None: none.
         eval_episodes: episodes of each.
-        run_dir, seed, quiet, track, evolve: as in ``Hierarchy.train``.
+        run_dir: a new directory; an existing run is never overwritten.
+        seed: the root of every random stream.
+        quiet: no progress.
+        track: "tensorboard", "wandb".
+        evolve: an ``Evolution``: a population in place of one agent.
+
+    Returns:
+        The finished run.
 
     Raises:
         SkillweaveError: the algorithm cannot act in the environment; the message says which can.
@@ -269,14 +294,6 @@ def _declared(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Age
     if run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy):
         return declared.plain_agent()
     return declared
-
-
-def _spec_of(told: dict[str, Any]) -> EnvSpec:
-    """The environment that a manifest or a header names, if that says it all."""
-    spec = EnvSpec(told["env"], kwargs=told.get("env_kwargs", {}))
-    if not spec.is_data:
-        raise SkillweaveError(f"the environment {spec.name!r} names code; give the recipe")
-    return spec
 
 
 __all__ = ["Agent", "Hierarchy", "Run", "train_agent"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import adopt_guide
 from skillweave.hierarchy.nesting import every_hierarchy, every_skill, inner_of
@@ -14,7 +15,14 @@ from skillweave.types import SkillweaveError
 
 
 def adopt(declared: Declaration, run: RunDirectory) -> None:
-    """Take over from a run how skills are called, here and in hierarchies below."""
+    """Take over from a run how skills are called, here and in hierarchies below, if it fits.
+
+    Raises:
+        SkillweaveError: the run is not one of this declaration.
+    """
+    check_run(declared, run)
+    if run.manifest["kind"] != "hierarchy":
+        return
     entries = {s["name"]: s for s in run.manifest["skills"]}
     for path, own in every_hierarchy(declared):
         if path:
@@ -62,3 +70,15 @@ def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
             f"{run.path} was trained on {run.manifest['env']}, but this {what} is on "
             f"{declared.spec.name}"
         )
+
+
+def spec_of(told: dict[str, Any]) -> EnvSpec:
+    """The environment that a manifest or a header names.
+
+    Raises:
+        SkillweaveError: it is one that needs code.
+    """
+    spec = EnvSpec(told["env"], kwargs=told.get("env_kwargs", {}))
+    if not spec.is_data:
+        raise SkillweaveError(f"the environment {spec.name!r} names code; give the recipe")
+    return spec

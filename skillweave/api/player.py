@@ -16,13 +16,24 @@ from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 class Player:
     """A policy that acts in one environment and keeps its memory.
 
-    ::
+    ```python
+    import gymnasium as gym
+    import skillweave as sw
 
-        player = run.player()
-        obs, info = env.reset()
-        player.reset()
-        while True:
-            obs, reward, terminated, truncated, info = env.step(player.act(obs))
+    env = gym.make("CartPole-v1")
+    policy = sw.from_function(
+        lambda obs: (obs[:, 2] > 0).astype(int),
+        observation_space=env.observation_space,
+        action_space=env.action_space,
+    )
+    player = sw.Player(policy)  # of a run: run.player()
+    obs, info = env.reset(seed=0)
+    player.reset()
+    ended = False
+    while not ended:
+        obs, reward, terminated, truncated, info = env.step(player.act(obs))
+        ended = terminated or truncated
+    ```
 
     Args:
         policy: who acts.

@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 
 
 class Run:
-    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill."""
+    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill.
+
+    Args:
+        declaration: what was trained.
+        path: its directory, or its weights file.
+        policy: who acts.
+    """
 
     def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
         self.declaration, self.path, self.policy = declaration, path, policy
@@ -68,6 +74,13 @@ class Run:
                 None: the environment's own time limit, or 100,000 steps.
             save: keep the result in the run's directory, where ``info`` finds it; it takes the
                 place of the one before. Of the whole policy only.
+
+        Returns:
+            Returns, lengths, and what each skill did.
+
+        Raises:
+            SkillweaveError: there is no such skill, or it was asked to save the evaluation of one
+                skill alone.
         """
         if save and skill is not None:
             raise SkillweaveError("save keeps an evaluation of the whole policy: leave out skill")
@@ -93,7 +106,19 @@ class Run:
         skill: str | None = None,
         max_steps: int | None = None,
     ) -> dict[str, Any]:
-        """Write a captioned GIF or MP4; ``skill`` shows one skill alone, as in ``evaluate``."""
+        """Write a captioned film.
+
+        Args:
+            path: the file; its ending says which, ``.gif`` or ``.mp4``.
+            episodes: how many, one after another.
+            seed: picks them.
+            deterministic: act greedily, else sample.
+            skill: show this skill alone, as in ``evaluate``.
+            max_steps: an episode that nothing has ended by then is cut.
+
+        Returns:
+            ``path``, and what was filmed, as plain JSON.
+        """
         plain = isinstance(self.declaration, PlainAgent)
         skills = {} if plain else dict(every_skill(self.hierarchy.skills))
         colors = {name: color_of(i, s.color) for i, (name, s) in enumerate(skills.items())}
@@ -124,9 +149,16 @@ class Run:
         )
 
     def act(self, obs: Any, **told: Any) -> Any:
-        """The greedy action for one observation; the arguments are ``Player.act``'s.
+        """The greedy action for one observation.
 
         It remembers what a policy remembers, so call ``reset`` where an episode begins.
+
+        Args:
+            obs: what the environment's ``reset`` or ``step`` returned.
+            **told: ``reward``, ``info``, ``mask``: see ``Player.act``.
+
+        Returns:
+            The action, as the environment takes it.
         """
         if self._player is None:
             self._player = self.player()
@@ -143,6 +175,9 @@ class Run:
         Args:
             deterministic: act greedily, else sample; as in ``evaluate``.
             seed: of what is sampled.
+
+        Returns:
+            The player; call its ``reset`` where an episode begins.
         """
         return Player(self.policy, deterministic=deterministic, seed=seed)
 
@@ -154,6 +189,9 @@ class Run:
 
         Args:
             path: a folder; files of the same names are replaced.
+
+        Returns:
+            The folder, its files, and what is code.
 
         Raises:
             SkillweaveError: a part cannot be exported; the message says which, and what to do.
@@ -197,13 +235,28 @@ class Run:
         )
 
     def save_weights(self, path: str | Path) -> Path:
-        """Write every policy into one file for ``Hierarchy.load_weights``."""
+        """Write every policy into one file for ``Hierarchy.load_weights``.
+
+        Args:
+            path: the file to write.
+
+        Returns:
+            The path.
+        """
         path = as_path(path, "path")
         write_weights(path, self.declaration, self.policy)
         return path
 
     def as_skill(self, name: str, **attributes: Any) -> Skill:
-        """All of it, as it was trained, as one skill of another hierarchy."""
+        """All of it as one skill of another hierarchy.
+
+        Args:
+            name: of the skill.
+            **attributes: of the skill, ``max_steps=50`` for example.
+
+        Returns:
+            The skill, which needs no training.
+        """
         kind = type(name, (Skill,), {"name": name, "policy": self.policy, **attributes})
         skill: Skill = kind()
         return skill

@@ -36,6 +36,12 @@ EngineName = Literal["auto", "envpool", "sync"]
 class EnvSpec:
     """An environment to make as often as needed.
 
+    ```python
+    import skillweave as sw
+
+    short = sw.EnvSpec("CartPole-v1", kwargs={"max_episode_steps": 100})
+    ```
+
     Args:
         env: a Gymnasium id, or a function that makes one environment.
         kwargs: passed to ``gymnasium.make``.
@@ -47,6 +53,10 @@ class EnvSpec:
         workers: processes in which sync environments are stepped, and acted in, while they are
             trained in. None: measured when a run begins, one for each core if a step takes long
             enough to be worth it; the run keeps the choice, as results depend on it.
+
+    Raises:
+        SkillweaveError: a field is of another kind, or fields do not fit each other; the message
+            says which.
     """
 
     env: str | Callable[[], gym.Env[Any, Any]]
@@ -88,6 +98,13 @@ class EnvSpec:
 
     def make(self, render_mode: str | None = None, number: int | None = None) -> CheckedEnv:
         """One environment of Gymnasium's, whose errors say its name and its ``number``.
+
+        Args:
+            render_mode: Gymnasium's, "rgb_array" for films.
+            number: told in messages.
+
+        Returns:
+            The environment, whose steps are checked.
 
         Raises:
             SkillweaveError: no such environment (with close matches), or a missing dependency.

@@ -66,16 +66,40 @@ class PoolWrapper:
         self.action_space = pool.action_space
 
     def see(self, obs: Any, ids: Array) -> Any:
-        """What is seen of the observations (k, …) of environments ``ids`` (k,); here all."""
+        """What is seen of observations; here all.
+
+        Args:
+            obs: (k, …), of the pool.
+            ids: (k,) int32, which environments.
+
+        Returns:
+            Observations (k, …) of ``observation_space``.
+        """
         return obs
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
-        """As ``Pool.reset``."""
+        """Begin episodes in some environments.
+
+        Args:
+            ids: (k,) int32, which environments.
+
+        Returns:
+            Observations (k, …), and infos.
+        """
         obs, info = self.pool.reset(ids)
         return self.see(obs, ids), info
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """As ``Pool.step``."""
+        """Act in some environments.
+
+        Args:
+            action: (k, …).
+            ids: (k,) int32, which environments.
+
+        Returns:
+            Observations (k, …), rewards (k,), whether each episode has terminated (k,) bool or was
+            truncated (k,) bool, and infos, whose arrays have k rows.
+        """
         obs, reward, terminated, truncated, info = self.pool.step(action, ids)
         return self.see(obs, ids), reward, terminated, truncated, info
 
@@ -84,7 +108,14 @@ def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) 
     """A pool of EnvPool's environments.
 
     Args:
-        kwargs: EnvPool's settings of the environment.
+        env_id: EnvPool's name of it.
+        num_envs: environments side by side.
+        threads: that step them.
+        seed: of all.
+        **kwargs: EnvPool's settings of the environment.
+
+    Returns:
+        The pool, for ``PoolWrapper`` or ``EnvSpec(pool=)``.
 
     Raises:
         MissingExtra: EnvPool is not installed.

@@ -20,7 +20,11 @@ KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")
 
 @dataclass(frozen=True)
 class Range:
-    """Where a setting may lie, and how it moves there."""
+    """Where a setting may lie, and how it moves there.
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     low: float
     """The smallest value."""
@@ -41,12 +45,12 @@ class Range:
             raise SkillweaveError(f"Range.high is {self.high}; as a complement it must be below 1")
 
     def to_unit(self, value: float) -> float:
-        """Where a value lies between low (0) and high (1)."""
+        """Where a ``value`` lies between low (0) and high (1)."""
         low, high, x = (self._scaled(v) for v in (self.low, self.high, value))
         return (x - low) / (high - low)
 
     def from_unit(self, unit: float) -> float:
-        """The inverse of ``to_unit``; kept within the range."""
+        """The inverse of ``to_unit``: the value at ``unit``, kept within the range."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         x = low + min(1.0, max(0.0, unit)) * (high - low)
         value = {"linear": x, "log": math.exp(x), "complement": 1.0 - math.exp(-x)}[self.scale]
@@ -86,7 +90,11 @@ _MUTATED = ("learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "ta
 
 @dataclass(frozen=True)
 class Mutations:
-    """What happens to an heir: one kind of change, by these probabilities."""
+    """What happens to an heir: one kind of change, by these probabilities.
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     none: float = 0.2
     """Nothing."""
@@ -139,7 +147,11 @@ class Mutations:
         """The ranges of an algorithm's settings.
 
         Args:
+            config: the algorithm's settings.
             start: its own values are those that members begin with, so they must lie within.
+
+        Returns:
+            By setting, its range.
 
         Raises:
             SkillweaveError: a setting that it does not have, or a range without the start value.
@@ -173,7 +185,11 @@ class Mutations:
 
 @dataclass(frozen=True)
 class Tournament:
-    """Each heir's parent is the best of a few members drawn at random."""
+    """Each heir's parent is the best of a few members drawn at random.
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     size: int = 2
     """Members in a tournament."""
@@ -186,7 +202,11 @@ class Tournament:
 
 @dataclass(frozen=True)
 class Truncation:
-    """The worst members become heirs of the best; all others go on (Jaderberg et al. 2017)."""
+    """The worst members become heirs of the best; all others go on (Jaderberg et al. 2017).
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     share: float = 0.25
     """Of the members, how many are replaced, and by how many."""
@@ -197,7 +217,18 @@ class Truncation:
 
 @dataclass(frozen=True)
 class Evolution:
-    """A population in place of one agent: it trains, is compared, selected and mutated."""
+    """A population in place of one agent: it trains, is compared, selected and mutated.
+
+    ```python
+    import skillweave as sw
+
+    ranges = {"learning_rate": sw.Range(1e-4, 1e-2)}
+    search = sw.Evolution(population=4, generations=5, mutations=sw.Mutations(ranges=ranges))
+    ```
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     population: int = 8
     """Members."""

@@ -15,8 +15,8 @@ from skillweave.types import Array, SkillweaveError
 class Heir:
     """A place in the next generation: which member it comes from, and whether it may change."""
 
-    parent: int
-    mutates: bool
+    parent: int  # a row of the generation before
+    mutates: bool  # whether it may change; else it is the parent as it was
 
 
 class Selection(Protocol):
@@ -28,6 +28,9 @@ class Selection(Protocol):
         Args:
             fitness: (P,); the higher the better, −inf for members that have diverged.
             rng: the only source of chance, so that a run can be resumed.
+
+        Returns:
+            P heirs, each a parent's row and whether it mutates.
         """
         ...
 

@@ -25,8 +25,8 @@ FORMAT = 1
 class Export:
     """What was written."""
 
-    path: Path
-    files: tuple[str, ...]
+    path: Path  # the folder
+    files: tuple[str, ...]  # their names in it
     code: dict[str, str]
     """Python code that the runner must be given, by name, and what it is."""
 

@@ -151,14 +151,18 @@ class Declaration(Nestable):
         return self.is_data and self.spec.engine == "auto" and not own
 
     def skill(self, name: str) -> Skill:
-        """The skill of this name, or path."""
+        """The skill of this ``name``, or path.
+
+        Raises:
+            SkillweaveError: there is none; the message lists them.
+        """
         found = dict(every_skill(self.skills))
         if name not in found:
             raise SkillweaveError(f"no skill {short(name)}; there are: {', '.join(found)}")
         return found[name]
 
     def budget(self, skill: Skill) -> int:
-        """A skill's training steps, of a hierarchy all; 0 where its policy is ready."""
+        """Training steps of a ``skill``, of a hierarchy all; 0 where its policy is ready."""
         if (inner := inner_of(skill)) is not None:
             return inner.total_steps
         return 0 if skill.policy is not None else skill.steps or self.skill_steps
@@ -196,7 +200,11 @@ class Declaration(Nestable):
         return self.learn != "apart"
 
     def scale(self, factor: float) -> None:
-        """Multiply every training budget, in place."""
+        """Multiply every training budget by ``factor``, in place.
+
+        Raises:
+            SkillweaveError: the factor is not positive and finite.
+        """
         if not 0.0 < factor < float("inf"):
             raise SkillweaveError(f"scale is {factor}; it must be positive and finite")
         for _, inner in inner_hierarchies(self.skills):
@@ -229,7 +237,7 @@ class Declaration(Nestable):
     def skill_set(
         self, policies: Sequence[Policy], skills: Sequence[Skill] | None = None
     ) -> SkillSet:
-        """The skills (None: all) with their policies, ready to be called."""
+        """The ``skills`` (None: all) with their ``policies``, ready to be called."""
         return SkillSet(
             tuple(self.skills if skills is None else skills),
             tuple(policies),

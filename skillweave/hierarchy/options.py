@@ -58,7 +58,18 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start every episode anew; one seed for all."""
+        """Start every episode anew; one seed for all.
+
+        Args:
+            seed: one for all; None: chosen at random, or going on.
+            options: not used.
+
+        Returns:
+            Observations (N, *obs_shape), and infos.
+
+        Raises:
+            SkillweaveError: more than one seed was given.
+        """
         if isinstance(seed, list):
             raise SkillweaveError("OptionsEnv.reset takes one seed for all environments")
         self._seed = self._seed + 1 if seed is None else seed
@@ -70,7 +81,17 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         return unpack(self.single_observation_space, self._obs), info
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Run one call in each environment, whichever skills and however long."""
+        """Run one call in each environment, whichever skills and however long.
+
+        Args:
+            actions: (N,) int64, a skill for each environment.
+
+        Returns:
+            Observations (N, *obs_shape); rewards, terminated, truncated (N,); ``info``, see above.
+
+        Raises:
+            SkillweaveError: an action is no skill, or the skill may not start there.
+        """
         n = self.num_envs
         skill = np.asarray(actions).reshape(n)
         self._check(skill)
@@ -82,8 +103,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         reward, plain, discount = np.zeros(n), np.zeros(n), np.ones(n)
         steps = np.zeros(n, np.int64)
         terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
-        rows = np.arange(n)
-        turns = 0
+        rows, turns = np.arange(n), 0
         while len(rows):
             turns = self._turn(turns, rows, skill)
             here = obs if len(rows) == n else obs[rows]
@@ -136,7 +156,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         return over
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Release the engine."""
+        """Release the engine; ``kwargs`` are not used."""
         self.engine.close()
 
     def _masks(self, next_obs: Array, terminated: Array, truncated: Array) -> dict[str, Any]:

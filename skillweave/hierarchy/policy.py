@@ -26,7 +26,9 @@ class HierarchyPolicy:
     its latest choices were.
 
     Args:
-        guide: a ready selector that is asked at every decision.
+        selector: chooses a row of the skills.
+        skills: with their policies: ``OptionsEnv.skills``.
+        guide: a ready selector that restricts what the selector may choose.
     """
 
     def __init__(self, selector: Policy, skills: SkillSet, guide: Guide | None = None) -> None:
@@ -55,7 +57,7 @@ class HierarchyPolicy:
         return {"sha256": checksum(whole.encode())}
 
     def start(self, n: int) -> Memory:
-        """Memory of n environments that wait for their first decision."""
+        """Memory of ``n`` environments that wait for their first decision."""
         memory = self.skills.start(n) | {"why": np.full(n, Why.EPISODE, np.int8)}
         if self.guide is not None:
             memory |= self.guide.start(n)
@@ -72,7 +74,9 @@ class HierarchyPolicy:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions (n, ...), among those that ``mask`` (n, A) allows the skills.
+        """Actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
+
+        ``memory`` is of n environments; ``rng`` is the source of chance, where it samples.
 
         ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills.
         """
@@ -96,7 +100,7 @@ class HierarchyPolicy:
         return self.skills.act(memory, np.arange(len(obs)), obs, rng, mask), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """Notice where calls are over."""
+        """The ``memory`` after a ``step``: notice where calls are over."""
         memory = {k: v.copy() for k, v in memory.items()}
         watches = self.guide is not None or isinstance(self.selector, ReadySelector)
         seen = step if self.skills.watches else None
@@ -115,7 +119,7 @@ class HierarchyPolicy:
         return memory
 
     def acting(self, memory: Memory) -> Array | None:
-        """(n,) int64, the running skill."""
+        """(n,) int64, by the ``memory`` the running skill."""
         return memory["skill"]
 
     def acts(self, memory: Memory, row: int = 0) -> str:

@@ -15,7 +15,11 @@ Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
 
 @dataclass(frozen=True)
 class CNN:
-    """How images become features; ``CNN()`` is Nature's (Mnih et al. 2015)."""
+    """How images become features; ``CNN()`` is Nature's (Mnih et al. 2015).
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     kind: Literal["plain", "impala"] = "plain"
     """plain: convolutions in a row; impala: residual stages, each halving the image."""
@@ -41,18 +45,33 @@ class CNN:
 
     @classmethod
     def impala(cls, channels: tuple[int, ...] = (16, 32, 32)) -> CNN:
-        """The residual network of IMPALA (Espeholt et al. 2018, fig. 3)."""
+        """The residual network of IMPALA (Espeholt et al. 2018, fig. 3).
+
+        Args:
+            channels: of each of its blocks.
+
+        Returns:
+            The settings.
+        """
         return cls("impala", channels, (), ())
 
     @classmethod
     def small(cls) -> CNN:
-        """One 3×3 layer of 16 channels, for images of about ten pixels (Young & Tian 2019)."""
+        """One 3×3 layer of 16 channels, for images of about ten pixels (Young & Tian 2019).
+
+        Returns:
+            The settings.
+        """
         return cls("plain", (16,), (3,), (1,))
 
 
 @dataclass(frozen=True)
 class RNN:
-    """A memory after the hidden layers."""
+    """A memory after the hidden layers.
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
+    """
 
     kind: Literal["lstm", "gru"] = "lstm"
     """lstm (Hochreiter & Schmidhuber 1997) or gru (Cho et al. 2014)."""
@@ -73,6 +92,17 @@ class Network:
 
     Dict and Tuple observations need nothing more: their parts are joined before the hidden
     layers.
+
+    ```python
+    import skillweave as sw
+
+    wide = sw.Network((256, 256), "relu", layer_norm=True)
+    with_memory = sw.Network((64,), rnn=sw.RNN("lstm", 32))
+    pixels = sw.Network((512,), "relu", cnn=sw.CNN())
+    ```
+
+    Raises:
+        SkillweaveError: a setting is wrong or out of its range; the message names it.
     """
 
     hidden: tuple[int, ...] = (64, 64)

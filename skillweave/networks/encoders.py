@@ -33,7 +33,12 @@ class Encoder(Protocol):
     """Names and shapes of one member's parameters."""
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
-        """Fill fresh parameters in place, one generator per member."""
+        """Fill fresh parameters in place.
+
+        Args:
+            views: of its parameters, each (P, *shape).
+            generators: one for each of P members.
+        """
         ...
 
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
@@ -45,7 +50,12 @@ _REGISTERED: dict[str, Callable[[ObsCodec], Encoder]] = {}
 
 
 def register_encoder(name: str, make: Callable[[ObsCodec], Encoder]) -> None:
-    """Make a custom encoder known, for ``Network(encoder=name)``."""
+    """Make a custom encoder known, for ``Network(encoder=name)``.
+
+    Args:
+        name: what settings call it; the latest of a name counts.
+        make: given what is known of an observation space, makes the encoder for it.
+    """
     _REGISTERED[name] = make
 
 

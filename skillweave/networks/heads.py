@@ -35,6 +35,11 @@ class ActionHead:
     Actions are (...) int64 for Discrete, (..., K) int64 for MultiDiscrete and MultiBinary,
     (..., A) float in policy units for a Box. A squashed Box action is kept as it was before tanh,
     where its log-probability is exact; ``to_env`` applies tanh.
+
+    Args:
+        codec: of the action space.
+        std: whether a Box's deviation is a parameter or part of the head.
+        squash: whether a Box's actions go through tanh.
     """
 
     def __init__(
@@ -62,7 +67,16 @@ class ActionHead:
         return self.codec.discrete
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Tensor:
-        """Noise for ``steps`` calls of ``act``: (steps, P, batch, A), one generator per member."""
+        """Noise for calls of ``act``.
+
+        Args:
+            generators: one for each of P members.
+            steps: how many calls.
+            batch: environments of each member.
+
+        Returns:
+            Normal or Gumbel noise, (S, P, B, A): steps, members, batch.
+        """
         shape = (steps, batch, self.codec.size)
         if self.discrete:
             drawn = [gumbel(torch.rand(shape, generator=g)) for g in generators]
@@ -71,7 +85,17 @@ class ActionHead:
         return torch.stack(drawn, dim=1)
 
     def act(self, head: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
-        """Actions; greedy where ``noise`` is None. Logits come masked."""
+        """The actions that a head means.
+
+        Args:
+            head: (..., width), logits masked already.
+            log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
+                None.
+            noise: one step of ``noise``; None: act greedily.
+
+        Returns:
+            Actions, (...) for Discrete, else (..., K) or (..., A).
+        """
         if not self.discrete:
             mean, log_std = self.moments(head, log_std)
             return mean if noise is None else torch.addcmul(mean, log_std.exp(), noise)
@@ -82,7 +106,18 @@ class ActionHead:
     def stats(
         self, head: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Log-probability of the actions, and entropy; each (...)."""
+        """How likely actions are, and how spread out the distribution is.
+
+        Args:
+            head: (..., width), what a network's last layer says.
+            log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
+                None.
+            mask: (..., A) bool, allowed actions; None: all.
+            action: (...) or (..., A), what was done.
+
+        Returns:
+            Log-probability and entropy in nats, each (...).
+        """
         if self.discrete:
             head = mask_logits(head, mask)
             if not self.codec.multi:
@@ -106,7 +141,19 @@ class ActionHead:
         other_log_std: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """KL(p ‖ q), p by the first head and q by the other, before any squashing; (...)."""
+        """KL(p ‖ q), p by the first head and q by the other, before any squashing.
+
+        Args:
+            head: (..., width), what a network's last layer says.
+            log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
+                None.
+            other: (..., width), the head of q.
+            other_log_std: as ``log_std``, of q.
+            mask: (..., A) bool, allowed actions; None: all.
+
+        Returns:
+            The divergence in nats, (...).
+        """
         if not self.discrete:
             return normal_kl(*self.moments(head, log_std), *self.moments(other, other_log_std))
         head, other = mask_logits(head, mask), mask_logits(other, mask)
@@ -118,6 +165,11 @@ class ActionHead:
         """A head under which Discrete or Box actions have exactly these log-probabilities (...).
 
         For a caller who knows what was done and how likely it was, but not the distribution.
+
+        Args:
+            action: (...) int64 or (..., A).
+            log_prob: (...), in nats.
+            log_std: (..., A) or broadcast to it, of a Box; else None.
         """
         if self.discrete:
             rest = torch.log1p(-log_prob.exp().clamp(max=1.0 - 1e-6))
@@ -130,7 +182,13 @@ class ActionHead:
         return action - away.sqrt()[..., None] * log_std.exp()
 
     def moments(self, head: Tensor, log_std: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Mean and log deviation of a Box's normal, each (..., A) or broadcast to it."""
+        """Mean and log deviation of a Box's normal, each (..., A) or broadcast to it.
+
+        Args:
+            head: (..., width), what a network's last layer says.
+            log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
+                None.
+        """
         if not self.std_in_head:
             assert log_std is not None
             return head, log_std
@@ -138,7 +196,7 @@ class ActionHead:
         return mean, clamp_inward(raw, *LOG_STD)
 
     def to_env(self, action: Array) -> Array:
-        """Policy units to the environment's."""
+        """An ``action`` (n, …) in policy units as the environment's."""
         return self.codec.to_env(torch.from_numpy(action).tanh().numpy() if self.squash else action)
 
     def _parts(self, logits: Tensor) -> Tensor:

@@ -24,6 +24,8 @@ class Net:
 
     Args:
         name: the prefix of its parameters' names.
+        obs: of the observation space.
+        network: its architecture.
         outputs: width of the head; None: no head, the last hidden layer is the output.
         extra: width of what is given beside the observation (a critic's action).
     """
@@ -64,7 +66,13 @@ class Net:
             self.width = outputs or 1
 
     def init_(self, views: Views, head_gain: float, generators: list[torch.Generator]) -> None:
-        """Fresh parameters in place, one generator per member."""
+        """Fresh parameters, in place.
+
+        Args:
+            views: of its parameters, each (P, *shape).
+            head_gain: gain of the head's weights; near 0: all outputs begin alike.
+            generators: one for each of P members.
+        """
         for prefix, encoder in self.encoders.items():
             encoder.init_(part(views, prefix), generators)
         mlp_init_(views, self.name, self.network, head_gain, generators)
@@ -78,7 +86,16 @@ class Net:
         return mlp(views, self.name, self.network, self._joined(views, inputs, extra))
 
     def step(self, views: Views, inputs: Inputs, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """One step with memory (P, B, M): the output (P, B, out) and the memory after it."""
+        """One step with memory.
+
+        Args:
+            views: of its parameters, each (P, *shape).
+            inputs: (P, B, …) each.
+            memory: (P, B, M).
+
+        Returns:
+            The output (P, B, out) and the memory after it (P, B, M).
+        """
         rnn, name = self.network.rnn, f"{self.name}.rnn"
         assert rnn is not None
         gates = project(views, name, self(views, inputs))
@@ -88,7 +105,13 @@ class Net:
     def sequence(
         self, views: Views, inputs: Inputs, memory: Tensor, starts: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """T steps: inputs (P, T, B, …), memory (P, B, M), starts (P, T, B) bool.
+        """T steps with memory.
+
+        Args:
+            views: of its parameters, each (P, *shape).
+            inputs: (P, T, B, …) each.
+            memory: (P, B, M), before the first step.
+            starts: (P, T, B) bool, where an episode begins.
 
         Returns:
             Outputs (P, T, B, out) and the memory after each step (P, T, B, M).

@@ -33,7 +33,7 @@ ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
 class Layout:
     """Names and shapes of the parameters in the columns of a flat (P, D) tensor, in order."""
 
-    shapes: dict[str, tuple[int, ...]]
+    shapes: dict[str, tuple[int, ...]]  # of one member
 
     @property
     def size(self) -> int:
@@ -47,11 +47,11 @@ class Layout:
         return {name: part.view(-1, *shape) for (name, shape), part in named}
 
     def leaves(self, flat: Tensor) -> dict[str, Tensor]:
-        """Like ``views``, each a leaf that can be differentiated by."""
+        """Windows into ``flat`` (P, D) as ``views``, each (P, *shape) a leaf of a gradient."""
         return {k: v.detach().requires_grad_() for k, v in self.views(flat).items()}
 
     def gradient(self, loss: Tensor, leaves: Views) -> Tensor:
-        """The gradient (P, D) of losses (P,) by ``leaves``; 0 for what they do not depend on."""
+        """The gradient (P, D) of ``loss`` (P,) by ``leaves``; 0 for what it does not depend on."""
         # Members do not mix: the gradient of the sum is each member's own.
         found = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
         flat = [
@@ -61,7 +61,7 @@ class Layout:
         return torch.cat(flat, dim=1)
 
     def flatten(self, named: Mapping[str, Tensor]) -> Tensor:
-        """The inverse of ``views``: (P, D) from tensors (P, *shape), copied."""
+        """The inverse of ``views``: (P, D) from ``named`` tensors (P, *shape), copied."""
         return torch.cat([named[name].flatten(1) for name in self.shapes], dim=1)
 
 

@@ -16,9 +16,16 @@ _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 def mask_logits(
     logits: Float[Tensor, "*batch A"], mask: Bool[Tensor, "*#batch A"] | None
 ) -> Float[Tensor, "*batch A"]:
-    """Logits with forbidden actions at the smallest finite number; both (..., A).
+    """Logits with forbidden actions at the smallest finite number.
 
     A finite number keeps entropy and gradients finite (Huang & Ontañón 2022).
+
+    Args:
+        logits: (..., A).
+        mask: (..., A) bool, allowed actions; None: all.
+
+    Returns:
+        (..., A).
     """
     if mask is None:
         return logits

@@ -10,7 +10,15 @@ from torch import Tensor
 
 
 def masked_mean(x: Tensor, valid: Tensor | None = None) -> Tensor:
-    """The mean of the valid samples; both (P, ...), to (P,)."""
+    """The mean of the valid samples of each member.
+
+    Args:
+        x: (P, ...).
+        valid: (P, ...) bool; None: all count.
+
+    Returns:
+        (P,); 0 where nothing counts.
+    """
     if valid is None:
         return x.flatten(1).mean(1)
     total = torch.where(valid, x, 0.0).flatten(1).sum(1)
@@ -28,7 +36,16 @@ def masked_var_mean(x: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Ten
 
 
 def normalise(x: Tensor, valid: Tensor | None = None, eps: float = 1e-8) -> Tensor:
-    """Zero mean and unit deviation over all axes but the first; (P, ...) to (P, ...)."""
+    """Zero mean and unit deviation over all axes but the first.
+
+    Args:
+        x: (P, ...).
+        valid: (P, ...) bool, what mean and deviation are taken over; None: all.
+        eps: added to the deviation.
+
+    Returns:
+        (P, ...).
+    """
     variance, mean = (m.view(-1, *[1] * (x.ndim - 1)) for m in masked_var_mean(x, valid))
     return (x - mean) / (variance.sqrt() + eps)
 

@@ -13,7 +13,11 @@ from skillweave.shapes import Bool, Float, Int
 def clip_grad_norm_(
     grad: Float[Tensor, "P D"], max_norm: Float[Tensor, " P"]
 ) -> Float[Tensor, " P"]:
-    """Scale each member's gradient (P, D) in place to at most ``max_norm`` (P,).
+    """Scale each member's gradient to at most a norm.
+
+    Args:
+        grad: (P, D), changed in place.
+        max_norm: (P,).
 
     Returns:
         The norms before clipping, (P,).
@@ -39,10 +43,16 @@ def adam_(
     """One Adam step in place (Kingma & Ba 2015, algorithm 1, in its efficient form).
 
     Args:
-        params, grad, mu, nu: (P, D); the moments start at zero.
+        params: (P, D), changed in place.
+        grad: (P, D).
+        mu: (P, D), mean of gradients; zero at the start.
+        nu: (P, D), mean of their squares; zero at the start.
         count: (P,) or (P, …) int64, steps taken so far: a member's, or each parameter's own, where
             some are younger than others.
         learning_rate: (P,).
+        beta1: decay of ``mu``.
+        beta2: decay of ``nu``.
+        eps: keeps the division from 0.
         active: (P,) bool; members at False are left exactly as they are.
     """
     if active is not None and not (active.device.type == "cpu" and bool(active.all())):

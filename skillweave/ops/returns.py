@@ -21,9 +21,21 @@ def gae(
     ``δ = r + discount·V(next) − V``; ``A = δ + discount·λ·(1 − last)·A⁺``
     (Schulman et al. 2016, eq. 16, with the discount as data: γ^τ after a call of τ steps).
 
+    ```python
+    import torch
+    import skillweave as sw
+
+    row = torch.ones(1, 3, 1)  # one member, three steps, one environment
+    last = torch.tensor([False, False, True]).view(1, 3, 1)
+    advantage = sw.gae(row, 0.9 * row, 0 * row, 0 * row, last, torch.tensor([1.0]))
+    assert torch.allclose(advantage.flatten(), torch.tensor([2.71, 1.9, 1.0]))
+    ```
+
     Args:
-        reward, discount, value, next_value: (P, T, B) float; ``next_value`` is V of the true
-            successor and is ignored where ``discount`` is 0.
+        reward: (P, T, B), r of each row; of a call Σγᵏrₖ.
+        discount: (P, T, B), 0 where terminated, else γ^τ.
+        value: (P, T, B), V.
+        next_value: (P, T, B), V of the true successor; ignored where ``discount`` is 0.
         last: (P, T, B) bool, the trajectory is cut here.
         gae_lambda: (P,) float.
 

@@ -30,15 +30,19 @@ ENDS = ("success", "failure")
 class Automaton(ReadySelector):
     """States, each with the skills that are called in it, and transitions between them.
 
-    ::
+    ```python
+    import skillweave as sw
 
-        def has_key(step):
-            return step.next_obs[:, KEY] == 1
 
-        selector = sw.Automaton(
-            states={"no key": "get_key", "key": {"open_door", "push_door"}, "open": "leave"},
-            transitions={("no key", "key"): has_key, ("key", "open"): "success"},
-        )
+    def has_key(step):
+        return step.next_obs[:, 1] == 1
+
+
+    selector = sw.Automaton(
+        states={"no key": "get_key", "key": {"open_door", "push_door"}, "open": "leave"},
+        transitions={("no key", "key"): has_key, ("key", "open"): "success"},
+    )
+    ```
 
     After every step, also within a call, the transitions of each environment's state are looked
     at in the order in which they are written; the first whose event has happened is taken, and no
@@ -87,7 +91,7 @@ class Automaton(ReadySelector):
         self.ranks = np.zeros((len(states), 0))
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """A copy that chooses among the skills of these names."""
+        """A copy that chooses among the ``skills`` of these names."""
         found = super().among(skills)
         # The larger, the earlier: 0 where the skill is none of the state's.
         found.ranks = np.zeros((len(self.states), len(skills)), np.int64)
@@ -99,11 +103,11 @@ class Automaton(ReadySelector):
         return found
 
     def start(self, n: int) -> Memory:
-        """Every environment in the first state."""
+        """Memory of ``n`` environments in the first state."""
         return {"state": np.full(n, self.state_names.index(self.start_state))}
 
     def allowed(self, memory: Memory) -> Array:
-        """(n, S) bool: the skills of the state that each environment is in."""
+        """(n, S) bool: by the ``memory`` the skills of the state that each environment is in."""
         allowed: Array = self.ranks[memory["state"]] > 0
         return allowed
 
@@ -124,13 +128,19 @@ class Automaton(ReadySelector):
         return np.where(allowed, score, -1).argmax(axis=1), memory
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """All skills of the state that may start are equally likely, (n, S)."""
+        """All skills of the state that may start, by ``mask`` (n, S), are equally likely, (n, S).
+
+        ``memory`` is of n environments; ``obs`` is not looked at.
+        """
         allowed = self._startable(memory, obs, mask)
         found: Array = allowed / allowed.sum(axis=1, keepdims=True, dtype=np.float32)
         return found, memory
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Take the transitions whose events have happened."""
+        """The ``memory`` after a ``step``: take the transitions whose events have happened.
+
+        ``last`` says how the last calls ended.
+        """
         before, after = memory["state"], memory["state"].copy()
         waiting = np.ones(len(before), bool)  # no transition was taken yet
         for origin, target, event in self.arrows:

@@ -1,14 +1,19 @@
 """Behaviour trees as selectors: ``Sequence``, ``Fallback`` and ``Condition``; leaves are skills.
 
-::
+```python
+from skillweave import tree
 
-    from skillweave import tree
 
-    selector = tree.Sequence(
-        tree.Fallback(has_key, "get_key"),
-        "open_door",
-        "leave",
-    )
+def has_key(obs):
+    return obs[:, 1] == 1
+
+
+selector = tree.Sequence(
+    tree.Fallback(has_key, "get_key"),
+    "open_door",
+    "leave",
+)
+```
 
 Text is a skill's name; a function of observations (n, *obs_shape) to (n,) bool is a condition.
 
@@ -45,6 +50,9 @@ class Condition:
     Args:
         function: asked where a call is over.
         name: used in messages; default: the function's name.
+
+    Raises:
+        SkillweaveError: it is no function of observations.
     """
 
     def __init__(self, function: Callable[[Array], Any], name: str = "") -> None:
@@ -85,7 +93,12 @@ class Composite:
 class Sequence(Composite):
     """Its children one after another, as long as they succeed.
 
-    FAILURE as soon as one fails, SUCCESS when all have succeeded.
+    FAILURE as soon as one fails, SUCCESS when all have succeeded. ``children`` and ``memory`` are
+    as in ``Composite``.
+
+    Raises:
+        SkillweaveError: there are no children, or one is none of a name, a condition, a sequence or
+            a fallback.
     """
 
     goes_on_after = Status.SUCCESS
@@ -94,7 +107,12 @@ class Sequence(Composite):
 class Fallback(Composite):
     """Its children one after another, until one succeeds; also called a selector.
 
-    SUCCESS as soon as one succeeds, FAILURE when all have failed.
+    SUCCESS as soon as one succeeds, FAILURE when all have failed. ``children`` and ``memory`` are
+    as in ``Composite``.
+
+    Raises:
+        SkillweaveError: there are no children, or one is none of a name, a condition, a sequence or
+            a fallback.
     """
 
     goes_on_after = Status.FAILURE

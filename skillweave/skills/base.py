@@ -66,19 +66,19 @@ class Skill:
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower().strip("_")
 
     def reward(self, step: Step) -> Array:
-        """What the skill maximises, (N,). The default is the environment's own reward."""
+        """What it maximises in a ``step``, (N,). The default is the environment's own reward."""
         return step.reward
 
     def initiation(self, obs: Array) -> Array:
-        """Where it may start: (N, *obs_shape) to (N,) bool. The default is everywhere."""
+        """Where it may start: ``obs`` (N, *obs_shape) to (N,) bool. The default is everywhere."""
         return np.ones(len(obs), bool)
 
     def termination(self, step: Step) -> Array:
-        """Where it stops: (N,) bool; its value ends there. The default is nowhere."""
+        """Where it stops, after a ``step``: (N,) bool; its value ends there. Default: nowhere."""
         return np.zeros(len(step.reward), bool)
 
     def success(self, step: Step) -> Array:
-        """What counts as having succeeded, (N,) bool, read where the skill stops."""
+        """What counts as having succeeded, (N,) bool, by the last ``step`` before it stops."""
         return np.zeros(len(step.reward), bool)
 
     def defines(self, method: str) -> bool:
@@ -132,10 +132,7 @@ class Reflex:
     """
 
     def __init__(
-        self,
-        condition: Callable[[Array], Array],
-        action: Any,
-        name: str | None = None,
+        self, condition: Callable[[Array], Array], action: Any, name: str | None = None
     ) -> None:
         if not callable(condition):
             raise SkillweaveError(
@@ -152,7 +149,7 @@ class Reflex:
             self._actions(np.empty((1, 0)), space)
 
     def apply(self, obs: Array, action: Array, space: Space[Any]) -> tuple[Array, Array]:
-        """The actions with this reflex in force, and (N,) bool: where it acted.
+        """Each ``action`` (N, ...) in ``space`` with this reflex; (N,) bool: where ``obs`` asks it.
 
         Raises:
             SkillweaveError: what it answers is not what was asked for; the message names it.
@@ -164,7 +161,7 @@ class Reflex:
         return action, holds
 
     def fixed(self, space: Space[Any]) -> Array:
-        """Its action, where that is no function, as one of ``space``."""
+        """Its action, where that is no function, as one of ``space``; (...)."""
         who, shape = f"{self._who}: action", space.shape or ()
         one = as_array(self.action, who)
         # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.

@@ -33,7 +33,10 @@ class Foreign(Memoryless):
         self._open = observation_space is None, action_space is None
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy that takes these spaces where it has none; messages begin with ``who``."""
+        """A copy on ``observation_space`` and ``action_space``, where it has none of its own.
+
+        Messages begin with ``who``.
+        """
         bound = copy.copy(self)
         bound._who = f"{who}: {self.name}"
         if self._open[0]:

@@ -135,6 +135,9 @@ def from_onnx(
         observation_space: None: that of the environment it meets.
         action_space: None: that of the environment it meets.
 
+    Returns:
+        The policy, for a skill's ``policy`` or ``evaluate``.
+
     Raises:
         SkillweaveError: there is no such file, or it is no model of one batch of observations.
     """

@@ -104,6 +104,9 @@ def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = F
         algorithm: of a zip: "ppo", "a2c", "dqn", "sac", "td3", "ddpg", or the class that saved it.
         trust: opening the zip may run any code that its author put in; say True if you trust them.
 
+    Returns:
+        The policy, for a skill's ``policy`` or ``evaluate``.
+
     Raises:
         SkillweaveError: the zip is not trusted, is not there, or holds no such model.
     """

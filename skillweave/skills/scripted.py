@@ -53,11 +53,24 @@ def from_function(
 ) -> ScriptedPolicy:
     """A Python function as a skill's policy; a skill takes the bare function too.
 
+    ```python
+    import skillweave as sw
+
+    lean = sw.from_function(lambda obs: (obs[:, 2] > 0).astype(int))
+    print(sw.evaluate(lean, "CartPole-v1", episodes=2))
+    ```
+
     Args:
         function: observations (n, *obs_shape) to actions (n, *action_shape), of whole numbers where
             the actions are; keep no state in it, it is called for any environments in any order.
         observation_space: None: that of the environment it meets.
         action_space: None: that of the environment it meets.
+
+    Returns:
+        The policy, for a skill's ``policy`` or ``evaluate``.
+
+    Raises:
+        SkillweaveError: it is no function of observations.
     """
     if not callable(function):
         raise SkillweaveError(

@@ -97,6 +97,12 @@ def from_torch(
         module: acts in evaluation mode, as a copy of what it is when training starts.
         observation_space: None: that of the environment it meets.
         action_space: None: that of the environment it meets.
+
+    Returns:
+        The policy, for a skill's ``policy`` or ``evaluate``.
+
+    Raises:
+        SkillweaveError: it is no module made of its class.
     """
     if isinstance(module, type) or not hasattr(module, "state_dict"):
         raise SkillweaveError(f"from_torch takes a module made of its class, not {short(module)}")

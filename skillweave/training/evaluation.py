@@ -26,10 +26,14 @@ FIRST_SEED = 1_000_000
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of whole episodes; ``str()`` is a line for people."""
+    """Scores of whole episodes; ``str()`` is a line for people.
 
-    returns: tuple[float, ...]
-    lengths: tuple[Positive, ...]
+    Raises:
+        SkillweaveError: there is not one length for each return, or no episode at all.
+    """
+
+    returns: tuple[float, ...]  # of each episode, in the environment's own reward
+    lengths: tuple[Positive, ...]  # of each episode, in steps
     threshold: float | None  # the environment's reward_threshold
     skills: dict[str, SkillReport] = field(default_factory=dict)  # none: a plain agent
     cut: Count = 0  # episodes that nothing had ended when they were cut
@@ -147,6 +151,9 @@ def evaluate(
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
             as many as the environment's own time limit, or ``LONGEST_EPISODE``.
         watch: is shown every step that is played.
+
+    Returns:
+        Returns, lengths, and what each skill did.
 
     Raises:
         SkillweaveError: the policy was made for other spaces.

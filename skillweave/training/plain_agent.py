@@ -77,14 +77,14 @@ class PlainAgent:
             env.close()
 
     def stages(self, name: str = AGENT) -> list[Stage]:
-        """Its only stage; in runs of older versions it has another name."""
+        """Its only stage; in runs of older versions it has another ``name``."""
         target = target_of(self.target_return, self.target_success, AGENT)
         spec = self.spec
         how = self.algorithm, self.steps, lambda _: skill_scene(spec), target
         return [Stage(name, "agent", *how)]
 
     def manifest(self, seed: int) -> dict[str, Any]:
-        """What a new run's ``run.json`` says."""
+        """What a new run's ``run.json`` says, for this ``seed``."""
         return {
             "kind": "agent",
             "env": self.spec.name,

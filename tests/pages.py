@@ -1,0 +1,77 @@
+"""The Python blocks of README and pages, and training that takes a moment in place of minutes."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from skillweave import Agent, Hierarchy
+
+ROOT = Path(__file__).parents[1]
+BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.S | re.M)
+INCLUDED = re.compile(r"^--8<--\n([\w/.]+)\n--8<--$", flags=re.M)
+STEPS = 1_000
+"""Of each stage; those of an algorithm with replay are a little more than it waits."""
+
+
+def blocks(page: Path) -> Iterator[str]:
+    """The Python of a page: first the files that it shows, then its own blocks."""
+    found = BLOCK.findall(page.read_text())
+    shown = [name for block in found for name in INCLUDED.findall(block)]
+    yield from ((ROOT / name).read_text() for name in shown)
+    yield from (block for block in found if not INCLUDED.search(block))
+
+
+def run_page(page: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Run its blocks one after another as one module; the names in it."""
+    module = ModuleType("page_under_test")
+    monkeypatch.setitem(sys.modules, module.__name__, module)  # where dataclasses look for it
+    for number, code in enumerate(blocks(page), 1):
+        where = f"{page.name}, block {number}"
+        exec(compile(code, where, "exec", dont_inherit=True), vars(module))
+    return vars(module)
+
+
+def _sooner(config: Any) -> Any:
+    if not hasattr(config, "learning_starts"):
+        return config
+    return replace(config, learning_starts=STEPS - 100)
+
+
+def _smaller(search: Any) -> Any:
+    return replace(search, generations=2, population=3, episodes=1)
+
+
+def train_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut the budgets of everything that is trained, and keep it quiet."""
+    train, train_alone = Hierarchy.train, Agent.train
+
+    def hierarchy(self: Hierarchy, *args: Any, **kwargs: Any) -> Any:
+        for name in ("skill_steps", "selector_steps", "together_steps", "flat_steps"):
+            value = getattr(self, name)
+            setattr(self, name, None if value is None else min(value, STEPS))
+        if kwargs.get("flat"):
+            self.flat_steps = STEPS
+        for owner, name in [(self, "selector"), (self, "algorithm")]:
+            setattr(owner, name, _sooner(getattr(owner, name)))
+        for skill in self.skills:
+            skill.algorithm = _sooner(skill.algorithm)
+        if isinstance(evolve := kwargs.get("evolve"), dict):
+            kwargs["evolve"] = {name: _smaller(search) for name, search in evolve.items()}
+        return train(self, *args, **kwargs | {"quiet": True})
+
+    def agent(self: Agent, *args: Any, **kwargs: Any) -> Any:
+        self.steps, self.algorithm = min(self.steps, STEPS), _sooner(self.algorithm)
+        if kwargs.get("evolve") is not None:
+            kwargs["evolve"] = _smaller(kwargs["evolve"])
+        return train_alone(self, *args, **kwargs | {"quiet": True})
+
+    monkeypatch.setattr(Hierarchy, "train", hierarchy)
+    monkeypatch.setattr(Agent, "train", agent)

@@ -1,0 +1,71 @@
+"""What the pages of the documentation say works: their code, their commands, their links."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
+
+import skillweave as sw
+from skillweave.cli.commands import COMMANDS, name_of
+
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+NEEDS = {
+    "docs/tutorials/first-hierarchy.md": ("Box2D",),
+    "docs/tutorials/foreign-skills.md": ("stable_baselines3", "onnx", "onnxruntime"),
+    "docs/tutorials/other-libraries.md": ("stable_baselines3",),
+}
+"""What a page's code needs beside the core."""
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name)
+def test_the_code_of_a_page_runs(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in NEEDS.get(name(page), ()):
+        pytest.importorskip(module)
+    train_briefly(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    run_page(page, monkeypatch)
+
+
+def test_pages_show_whole_files_that_exist() -> None:
+    shown = [found for page in PAGES for found in INCLUDED.findall(page.read_text())]
+    assert "examples/doorkey.py" in shown
+    assert [path for path in shown if not (ROOT / path).is_file()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_command_of_a_page_exists(page: Path) -> None:
+    used = set(re.findall(r"^\s*skillweave ([\w-]+)", page.read_text(), flags=re.M))
+    assert used <= {name_of(c) for c in COMMANDS}
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=name)
+def test_modules_that_a_page_tells_to_run_exist(page: Path) -> None:
+    modules = re.findall(r"python -m (benchmarks\.\w+)", page.read_text())
+    assert [m for m in modules if not (ROOT / f"{m.replace('.', '/')}.py").is_file()] == []
+
+
+def test_every_public_name_stands_in_the_reference_once() -> None:
+    pages = sorted((ROOT / "docs/reference").glob("*.md"))
+    found = [
+        n for p in pages for n in re.findall(r"^::: skillweave\.(\w+)$", p.read_text(), flags=re.M)
+    ]
+    assert sorted(found) == sorted(sw.__all__)
+
+
+def test_figures_that_are_older_than_the_latest_changes_are_marked_alike() -> None:
+    """A row that README has, too, has its dagger in both, or in none."""
+    readme, measured = (ROOT / "README.md").read_text(), (ROOT / "docs/measured.md").read_text()
+    rows = [
+        line.split(" | ")[0] for line in readme.splitlines() if re.match(r"\| .*\d\.\d \(", line)
+    ]
+    assert len(rows) == 4
+    assert [row for row in rows if f"\n{row} |" not in measured] == []
