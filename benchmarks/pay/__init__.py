@@ -1,0 +1,1 @@
+"""Skills that pay: suites of tasks on which a hierarchy is held against honest baselines."""

@@ -1,0 +1,239 @@
+"""How each agent of the protocol is trained and scored: the hierarchy, and F0 to F4."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from benchmarks.pay.flat import Flat, with_bonus
+from benchmarks.pay.results import Result, Results, curve_of
+from benchmarks.pay.suite import Policies, Shaped, Suite, Task
+from skillweave import Array, Hierarchy, Lengths, Skill
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.api.run import Run
+
+HIERARCHY, RANDOM, SINGLE = "hierarchy", "F4-random-skills", "F4-best-skill"
+FLAT, SHAPED, BONUS, TUNED = "F0-flat", "F1-skill-rewards", "F2-bonus", "F3-fine-tuned"
+CHAINS = ("hierarchy", "flat", "shaped", "bonus")
+"""What can be run on its own: agents of one chain need what others of it have learnt."""
+TUNING_SEED = 100
+"""Weights of F1 are chosen on this one, which is never reported."""
+
+
+class Bench:
+    """One suite from one seed: trains what has no result yet.
+
+    Args:
+        suite: its tasks and budgets.
+        results: where results are kept.
+        seed: the root of all random numbers.
+    """
+
+    def __init__(self, suite: Suite, results: Results, seed: int) -> None:
+        self.suite, self.results, self.seed = suite, results, seed
+
+    def run(self, chain: str, tasks: Sequence[str] | None = None) -> None:
+        """Train and score a chain of agents on tasks, by name (None: all)."""
+        asked = [t for t in self.suite.tasks if tasks is None or t.name in tasks]
+        {
+            "hierarchy": self._hierarchy,
+            "flat": self._flat,
+            "shaped": self._shaped,
+            "bonus": self._bonus,
+        }[chain](asked)
+
+    # The hierarchy, and what needs its skills
+
+    def _hierarchy(self, tasks: Sequence[Task]) -> None:
+        source = self.suite.tasks[0]
+        budgets = dict(zip(self._names(), self.suite.steps(), strict=True))
+        for task in self._with_source(tasks):
+            skills = None if task is source else self._skills()
+            self._weave(task, HIERARCHY, skills, budgets[task.name], keep=task is source)
+        for task in tasks:
+            self._without_learning(task)
+
+    def _weave(
+        self, task: Task, agent: str, skills: Policies | None, budget: int, keep: bool
+    ) -> None:
+        if self._found(task, agent, budget):
+            return
+        path, started = self._path(task, agent), time.perf_counter()
+        hierarchy = self.suite.hierarchy(task, skills)
+        hierarchy.eval_every = max(1, budget // self.suite.evaluations)
+        hierarchy.eval_episodes = self.suite.evaluated
+        if path.exists():
+            run = hierarchy.resume(path, quiet=True)
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            run = hierarchy.train(path, seed=self.seed, quiet=True)
+        self._score(run, task, agent, budget, started, keep, ("selector", "together"))
+
+    def _skills(self) -> dict[str, Any]:
+        """The skills that were learnt on the first task from this seed."""
+        source = self.suite.tasks[0]
+        hierarchy = self.suite.hierarchy(source, None)
+        run = hierarchy.load(self._path(source, HIERARCHY))
+        policy: Any = run.policy
+        return dict(zip(policy.labels, policy.skills.policies, strict=True))
+
+    def _without_learning(self, task: Task) -> None:
+        """F4, and the suite's fixed hierarchies."""
+        fixed = {RANDOM: self._random, **self.suite.fixed}
+        for agent, declare in fixed.items():
+            if not self._found(task, agent, 0):
+                started = time.perf_counter()
+                run = self._ready(task, agent, declare(task, self._skills()))
+                self._score(run, task, agent, 0, started, greedy=agent != RANDOM)
+        if not self._found(task, SINGLE, 0):
+            started = time.perf_counter()
+            run = self._ready(task, SINGLE, self._random(task, self._skills()))
+            names = [s.name for s in run.hierarchy.skills]
+            each = {n: run.evaluate(self.suite.episodes, skill=n) for n in names}
+            best = max(each, key=lambda name: each[name].mean)
+            self._save(run, task, SINGLE, 0, started, each[best].returns, {best: 1.0})
+
+    def _random(self, task: Task, skills: Policies) -> Hierarchy:
+        """F4: of the skills that may start, any, all equally likely."""
+        hierarchy = self.suite.hierarchy(task, skills)
+        rng, all_skills = np.random.default_rng(self.seed), list(hierarchy.skills)
+        if isinstance(hierarchy.call_steps, Lengths):
+            lengths = hierarchy.call_steps.steps
+            hierarchy.call_steps = lengths[len(lengths) // 2]
+
+        def anyone(obs: Array) -> Array:
+            allowed = np.stack([s.initiation(obs) for s in all_skills], axis=1)
+            found: Array = np.where(allowed, rng.random(allowed.shape), -1.0).argmax(axis=1)
+            return found
+
+        return replace_selector(hierarchy, anyone)
+
+    def _ready(self, task: Task, agent: str, hierarchy: Hierarchy) -> Run:
+        """The run of a hierarchy in which nobody learns."""
+        path = self._path(task, agent)
+        shutil.rmtree(path, ignore_errors=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return hierarchy.train(path, seed=self.seed, quiet=True)
+
+    # Flat agents
+
+    def _flat(self, tasks: Sequence[Task]) -> None:
+        source, budgets = self.suite.tasks[0], self._flat_budgets()
+        for task in self._with_source(tasks):
+            self._learn(self._agent(task), task, FLAT, keep=task is source)
+        for task in tasks:
+            if task is not source:
+                agent = self._agent(task)
+                agent.starts_as = self._source_agent()
+                self._learn(agent, task, TUNED)
+            elif not self._found(task, TUNED, budgets[task.name]):
+                found = self.results.find(
+                    self.suite.name, task.name, FLAT, self.seed, budgets[task.name]
+                )
+                assert found is not None
+                self.results.save(replace(found, agent=TUNED))
+
+    def _shaped(self, tasks: Sequence[Task]) -> None:
+        weights = self.tuned_weights()
+        for task in tasks:
+            self._learn(self._with_rewards(self._agent(task), weights), task, SHAPED)
+
+    def _bonus(self, tasks: Sequence[Task]) -> None:
+        for task in tasks:
+            agent = self._agent(task)
+            agent.learns_in = with_bonus(task.env, self.suite.cells, self.suite.bonus)
+            self._learn(agent, task, BONUS)
+
+    def tuned_weights(self) -> dict[str, float]:
+        """The weights with which F1 does best on the first task, from a seed of its own."""
+        task, scores = self.suite.tasks[0], []
+        other = Bench(self.suite, self.results, TUNING_SEED)
+        for i, weights in enumerate(self.suite.weights):
+            agent = other._with_rewards(other._agent(task), weights)
+            scores.append(other._learn(agent, task, f"tuning-{i}").score)
+        return dict(self.suite.weights[int(np.argmax(scores))])
+
+    def _with_rewards(self, agent: Flat, weights: Any) -> Flat:
+        agent.learns = Shaped(self.suite.skills(), weights, self.suite.task_weight)
+        return agent
+
+    def _agent(self, task: Task) -> Flat:
+        budget = self._flat_budgets()[task.name]
+        return Flat(
+            task.env, self.suite.flat, budget,
+            eval_every=max(1, budget // self.suite.evaluations), eval_episodes=self.suite.evaluated,
+        )  # fmt: skip
+
+    def _learn(self, agent: Flat, task: Task, name: str, keep: bool = False) -> Result:
+        budget = agent.steps
+        if found := self._found(task, name, budget):
+            return found
+        path, started = self._path(task, name), time.perf_counter()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return self._score(
+            agent.run(path, self.seed), task, name, budget, started, keep, ("agent",)
+        )
+
+    def _source_agent(self) -> AgentPolicy:
+        policy: Any = self._agent(self.suite.tasks[0]).load(self._path(self.suite.tasks[0], FLAT))
+        return policy.policy  # type: ignore[no-any-return]
+
+    # What all share
+
+    def _score(
+        self, run: Run, task: Task, agent: str, budget: int, started: float,
+        keep: bool = False, stages: tuple[str, ...] = (), greedy: bool | None = None,
+    ) -> Result:  # fmt: skip
+        greedy = self.suite.greedy if greedy is None else greedy
+        found = run.evaluate(self.suite.episodes, deterministic=greedy)
+        usage = found.to_json()["skill_usage"]
+        return self._save(run, task, agent, budget, started, found.returns, usage, keep, stages)
+
+    def _save(
+        self, run: Run, task: Task, agent: str, budget: int, started: float,
+        returns: Sequence[float], usage: dict[str, float], keep: bool = False,
+        stages: tuple[str, ...] = (),
+    ) -> Result:  # fmt: skip
+        scores = [float(r) / self.suite.unit for r in returns]
+        curve = curve_of(run.path, self.suite.unit, stages) if stages else []
+        spent = sum(int(s["steps"]) for s in run.info()["stages"])
+        score, seconds = float(np.mean(scores)), time.perf_counter() - started
+        result = Result(
+            self.suite.name, task.name, agent, self.seed, score, spent, budget, seconds,
+            [*curve, (spent, score)], scores, usage,
+        )  # fmt: skip
+        self.results.save(result)
+        if not keep:
+            shutil.rmtree(run.path, ignore_errors=True)
+        return result
+
+    def _found(self, task: Task, agent: str, budget: int) -> Result | None:
+        return self.results.find(self.suite.name, task.name, agent, self.seed, budget)
+
+    def _path(self, task: Task, agent: str) -> Any:
+        return self.results.run_path(self.suite.name, task.name, agent, self.seed)
+
+    def _names(self) -> list[str]:
+        return [t.name for t in self.suite.tasks]
+
+    def _flat_budgets(self) -> dict[str, int]:
+        return dict(zip(self._names(), self.suite.steps_flat(), strict=True))
+
+    def _with_source(self, tasks: Sequence[Task]) -> list[Task]:
+        """These tasks, and before them the one on which skills are learnt."""
+        source = self.suite.tasks[0]
+        return [source, *(t for t in tasks if t is not source)]
+
+
+def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:
+    """The same skills under a ready selector: nothing is learnt any more."""
+    skills: list[Skill] = list(hierarchy.skills)
+    return Hierarchy(
+        hierarchy.env, skills, call_steps=hierarchy.call_steps, selector=selector,
+        reflexes=hierarchy.reflexes, greedy_skills=hierarchy.greedy_skills,
+    )  # fmt: skip

@@ -1,0 +1,65 @@
+"""Pick and place: scripted skills, and one that is learnt (``skillweave train pick-and-place``)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from benchmarks.pay.suite import Policies, Suite, Task
+from skillweave import Array, Hierarchy
+from skillweave.recipes import _arm as world
+from skillweave.recipes import pick_and_place as arm
+
+DISTURBANCES = {"calm": world.CALM, "disturbed": world.Disturbances()}
+SOLVED = {"calm": 0.95, "disturbed": 0.85}
+FURTHER_STEPS = 140_000
+
+
+def source(task: Task) -> Hierarchy:
+    """One skill and the selector are learnt."""
+    return arm.declare(DISTURBANCES[task.name])
+
+
+def further(task: Task, skills: Policies) -> Hierarchy:
+    """A selector over the same skills, learnt anew."""
+    found = arm.declare(DISTURBANCES[task.name], selector_steps=FURTHER_STEPS)
+    found.skill("recover").policy = skills["recover"]
+    return found
+
+
+def by_hand(selector: Any, call_steps: int = 1) -> Any:
+    """A hierarchy in which nothing is learnt."""
+
+    def declare(task: Task, skills: Policies) -> Hierarchy:
+        return arm.by_hand(selector, DISTURBANCES[task.name], call_steps)
+
+    return declare
+
+
+def cells(obs: Array) -> Array:
+    """Where the block is seen from the gripper, its height, whether it is grasped, (n, 5)."""
+    places = np.column_stack([obs[:, arm.OFFSET], obs[:, arm.BLOCK][:, 2]])
+    return np.column_stack([np.floor(places / 0.04), arm.is_grasped(obs)])
+
+
+def suite() -> Suite:
+    """Two tasks: nothing goes wrong, and something does."""
+    return Suite(
+        name="pick-and-place",
+        tasks=[Task(name, world.spec(d), SOLVED[name]) for name, d in DISTURBANCES.items()],
+        unit=1.0,
+        source=source,
+        further=further,
+        skills=lambda: [arm.Recover()],
+        flat=arm.LEARNER,
+        weights=({"recover": 0.1}, {"recover": 0.01}),
+        cells=cells,
+        bonus=0.1,
+        fixed={
+            "rule": by_hand(arm.rule),
+            "script": by_hand(arm.script),
+            "tree": by_hand(arm.behaviour_tree),
+        },
+        episodes=100,
+    )

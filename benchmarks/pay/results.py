@@ -1,0 +1,115 @@
+"""Results, one JSON file for each (suite, task, agent, seed): what is there is not run again."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from skillweave.runs.directory import RunDirectory
+from skillweave.types import SkillweaveError
+
+
+@dataclass(frozen=True)
+class Result:
+    """How one agent did one task from one seed."""
+
+    suite: str
+    task: str
+    agent: str
+    seed: int
+    score: float
+    steps: int
+    """Environment steps of training on this task, as they were made."""
+    budget: int
+    """Environment steps that were asked for."""
+    seconds: float
+    curve: list[tuple[int, float]] = field(default_factory=list)
+    """Steps, and the score of the evaluation that was made then."""
+    scores: list[float] = field(default_factory=list)
+    """Of each episode that the score is the mean of."""
+    usage: dict[str, float] = field(default_factory=dict)
+    """The share of steps of each skill."""
+
+
+class Results:
+    """A folder of results.
+
+    Args:
+        folder: is made where it is missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def file(self, suite: str, task: str, agent: str, seed: int) -> Path:
+        """Where a result is."""
+        return self.folder / suite / task / agent / f"{seed}.json"
+
+    def run_path(self, suite: str, task: str, agent: str, seed: int) -> Path:
+        """Where it is trained."""
+        return self.file(suite, task, agent, seed).with_suffix(".run")
+
+    def find(self, suite: str, task: str, agent: str, seed: int, budget: int) -> Result | None:
+        """A result that is there.
+
+        Raises:
+            SkillweaveError: the file is damaged, or was made with another budget.
+        """
+        path = self.file(suite, task, agent, seed)
+        if not path.exists():
+            return None
+        found = read(path)
+        if found.budget != budget:
+            raise SkillweaveError(
+                f"{path} is of {found.budget:,} steps, but {budget:,} are asked for: give another "
+                "folder with --out, or remove it"
+            )
+        return found
+
+    def save(self, result: Result) -> None:
+        """Write a result; a process that is killed leaves none, or all of it."""
+        path = self.file(result.suite, result.task, result.agent, result.seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(asdict(result), indent=1))
+        os.replace(part, path)
+
+    def all(self, suite: str) -> list[Result]:
+        """All results of a suite."""
+        return [read(path) for path in sorted((self.folder / suite).glob("*/*/*.json"))]
+
+
+def read(path: Path) -> Result:
+    """The result of a file.
+
+    Raises:
+        SkillweaveError: it is damaged.
+    """
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+        found["curve"] = [(int(steps), float(score)) for steps, score in found["curve"]]
+        return Result(**found)
+    except (ValueError, TypeError, KeyError) as error:
+        raise SkillweaveError(f"{path} is damaged ({error}): remove it, and run again") from error
+
+
+def curve_of(path: Path, unit: float, stages: tuple[str, ...]) -> list[tuple[int, float]]:
+    """What the periodic evaluations of a run found: steps of the whole run, and scores.
+
+    Args:
+        stages: whose evaluations are of the task.
+    """
+    run = RunDirectory.open(path)
+    before, total = {}, 0
+    for stage in run.manifest["stages"]:
+        before[stage["name"]] = total
+        total += int(stage.get("steps", 0))
+    found = []
+    for line in (path / "metrics.jsonl").read_text().splitlines():
+        told = json.loads(line)
+        if told.get("stage") in stages and "eval_return" in told:
+            found.append((before[told["stage"]] + told["steps"], told["eval_return"] / unit))
+    return found

@@ -1,0 +1,72 @@
+"""Shuttle: a half-cheetah runs between points (``skillweave train shuttle``)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.pay.suite import Policies, Suite, Task
+from skillweave import Array, Hierarchy
+from skillweave.recipes import shuttle
+
+POINTS = {
+    "shuttle-2": (2.0, -2.0),
+    "shuttle-4": (4.0, -4.0),
+    "patrol-forth": (2.0, 6.0, -2.0),
+    "patrol-back": (-4.0, 0.0, 4.0),
+}
+BEST, ROUND = 8.31, 8.0
+"""The paper's best median after 3M steps, and the metres of a round there."""
+FURTHER_STEPS = 300_000
+
+
+def bar(points: tuple[float, ...]) -> float:
+    """What counts as solved: the paper's best on its own task, for the same metres a second."""
+    metres = float(np.abs(np.subtract(points, np.roll(points, 1))).sum())
+    return BEST * ROUND / metres
+
+
+def source(task: Task) -> Hierarchy:
+    """Skills and selector learn together, from nothing."""
+    return shuttle.declare(POINTS[task.name])
+
+
+def further(task: Task, skills: Policies) -> Hierarchy:
+    """A selector over skills that are there already."""
+    found = shuttle.with_skills(POINTS[task.name], skills)
+    found.selector_steps = FURTHER_STEPS
+    return found
+
+
+def by_automaton(task: Task, skills: Policies) -> Hierarchy:
+    """The same skills, chosen by the task's own automaton: tells what bounds a result."""
+    return shuttle.by_automaton(POINTS[task.name], skills)
+
+
+def cells(obs: Array) -> Array:
+    """Where it is in metres, how fast in 2 metres a second, and on which leg, (n, 3)."""
+    leg = obs[:, shuttle.LEG].argmax(axis=1)
+    return np.stack([np.floor(obs[:, shuttle.X]), np.floor(obs[:, shuttle.SPEED] / 2.0), leg], 1)
+
+
+def suite() -> Suite:
+    """Four tasks."""
+    return Suite(
+        name="shuttle",
+        tasks=[Task(name, shuttle.spec(p), bar(p)) for name, p in POINTS.items()],
+        unit=shuttle.UNIT,
+        source=source,
+        further=further,
+        skills=lambda: shuttle.declare().skills,
+        flat=replace(shuttle.RUNNER, gamma=0.99, gae_lambda=0.95),
+        weights=(
+            {"forward": 1.0, "backward": 1.0},
+            {"forward": 1.0, "backward": 0.5},
+            {"forward": 0.5, "backward": 1.0},
+        ),
+        cells=cells,
+        bonus=10.0,
+        fixed={"automaton": by_automaton},
+        episodes=20,
+    )

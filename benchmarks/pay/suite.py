@@ -1,0 +1,125 @@
+"""What a suite declares: tasks, skills, budgets, and what the baselines need to know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from skillweave import Array, EnvSpec, Hierarchy, Skill, Step
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.types import Policy
+
+Policies = Mapping[str, Policy]
+"""The skills that were learnt on the first task, by name."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task of a suite.
+
+    Args:
+        name: letters, digits and dashes: it names files.
+        env: its environment, with its own reward.
+        solved: a score from here on counts as solved.
+    """
+
+    name: str
+    env: EnvSpec
+    solved: float
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Tasks for the same skills; the first is the one on which skills are learnt.
+
+    Args:
+        name: letters, digits and dashes: it names files.
+        tasks: in the order in which they are learnt.
+        unit: a score is a return divided by this.
+        source: the hierarchy that learns the first task, and its skills, from nothing.
+        further: the hierarchy that learns another task, given the skills.
+        skills: those whose rewards are added for F1.
+        flat: who learns without skills.
+        weights: what F1 chooses from: for each skill a weight of its reward.
+        task_weight: what F1 multiplies the task's own reward by.
+        cells: observations (n, ...) to whole numbers (n, k): what F2 counts visits of.
+        bonus: what a first visit of a cell is worth to F2, in units of the task's reward.
+        fixed: hierarchies in which nothing more is learnt, by name: ready selectors, mostly.
+        flat_steps: what a flat agent gets for each further task; None: an equal share of all steps
+            of the hierarchy, and never fewer than the hierarchy has there.
+        episodes: how many are played for a score.
+        greedy: whether agents act greedily then, or sample.
+        evaluations: points of a curve.
+        evaluated: episodes of each.
+    """
+
+    name: str
+    tasks: Sequence[Task]
+    unit: float
+    source: Callable[[Task], Hierarchy]
+    further: Callable[[Task, Policies], Hierarchy]
+    skills: Callable[[], Sequence[Skill]]
+    flat: AlgorithmConfig
+    weights: Sequence[Mapping[str, float]]
+    cells: Callable[[Array], Array]
+    task_weight: float = 1.0
+    bonus: float = 1.0
+    fixed: Mapping[str, Callable[[Task, Policies], Hierarchy]] = field(default_factory=dict)
+    flat_steps: int | None = None
+    episodes: int = 50
+    greedy: bool = True
+    evaluations: int = 12
+    evaluated: int = 10
+    scale: float = 1.0
+    """All budgets are multiplied by this."""
+
+    def scaled(self, factor: float) -> Suite:
+        """The same with other budgets."""
+        return replace(self, scale=self.scale * factor)
+
+    def quick(self) -> Suite:
+        """The same in a hundredth of the time: to see that all runs, not what it finds."""
+        return replace(self.scaled(0.01), episodes=4, evaluations=2, evaluated=2)
+
+    def hierarchy(self, task: Task, skills: Policies | None) -> Hierarchy:
+        """The hierarchy for a task: without ``skills`` it learns them, too."""
+        found = self.source(task) if skills is None else self.further(task, skills)
+        found.scale(self.scale)
+        found.env = replace(found.spec, workers=1)  # runs go side by side
+        return found
+
+    def steps(self) -> list[int]:
+        """What the hierarchy takes for each task; its skills are in the first."""
+        first, *others = self.tasks
+        ready: Any = {s.name: _nobody for s in self.source(first).skills}
+        further = [self.hierarchy(t, ready).total_steps for t in others]
+        return [self.hierarchy(first, None).total_steps, *further]
+
+    def steps_flat(self) -> list[int]:
+        """What a flat agent gets for each task: at least as much as the hierarchy."""
+        own = self.steps()
+        share = round(self.flat_steps * self.scale) if self.flat_steps else sum(own) // len(own)
+        return [own[0], *(max(n, share) for n in own[1:])]
+
+
+class Shaped(Skill):
+    """F1: the task's own reward, and the weighted sum of the skills' rewards."""
+
+    def __init__(
+        self, skills: Sequence[Skill], weights: Mapping[str, float], task_weight: float
+    ) -> None:
+        self.skills, self.weights, self.task_weight = skills, weights, task_weight
+
+    def reward(self, step: Step) -> Array:
+        """The sum."""
+        own = [self.weights[s.name] * s.reward(step) for s in self.skills if s.name in self.weights]
+        total: Array = np.sum([self.task_weight * step.reward, *own], axis=0)
+        return total
+
+
+def _nobody(obs: Array) -> Array:
+    """Stands for a learnt skill where only budgets are asked for."""
+    return np.zeros(len(obs))

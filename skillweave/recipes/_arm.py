@@ -1,0 +1,146 @@
+"""The robot's arm of the recipe ``pick-and-place``: its task, and what goes wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave import Array, EnvSpec, SkillweaveError
+
+NEAR = 0.05
+"""Metres from the goal at which the block is there, as Gymnasium-Robotics has it."""
+HOLD = 5
+"""Steps for which the block must be there."""
+TABLE = 0.425
+"""Height of a block's middle that lies on the table, in metres."""
+LIFTED = 0.02
+"""Metres above the table from which on a block counts as lifted."""
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """How often something goes wrong, as chances in each step."""
+
+    slip: float = 0.08
+    """The fingers of a gripper that has lifted the block open for a while."""
+    nudge: float = 0.08
+    """The block on the table is pushed."""
+    move: float = 0.02
+    """The goal moves to another place."""
+
+
+CALM = Disturbances(0.0, 0.0, 0.0)
+
+
+class Place(gym.Wrapper[Any, Any, Any, Any]):
+    """The task: pays 1 and ends when the block has been at the goal for a while.
+
+    Args:
+        env: Gymnasium-Robotics' environment.
+        disturbances: what goes wrong.
+    """
+
+    slip_steps = 5
+    """Steps for which fingers that slip are open."""
+    push = 1.2
+    """Speed of a block that is nudged, in metres a second; friction stops it after 5 to 10 cm."""
+
+    def __init__(self, env: gym.Env[Any, Any], disturbances: Disturbances = CALM) -> None:
+        super().__init__(env)
+        self.disturbances = disturbances
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (28,), np.float32)
+        self.held = self.slipping = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin anew."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.held = self.slipping = 0
+        return _flat(obs), info
+
+    def step(self, action: Any) -> Any:
+        """1 where the block has been at the goal for five steps, which ends the episode; else 0."""
+        self._disturb()
+        if self.slipping:
+            self.slipping -= 1
+            action = np.append(action[:3], np.float32(1.0))
+        obs, _, terminated, truncated, info = self.env.step(action)
+        distance = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"])
+        self.held = self.held + 1 if distance < NEAR else 0
+        placed = self.held >= HOLD
+        info["success"] = placed
+        return _flat(obs), float(placed), terminated or placed, truncated and not placed, info
+
+    def _disturb(self) -> None:
+        """Let this step's disturbances happen."""
+        world, chance = self.env.unwrapped, self.disturbances
+        if chance == CALM:
+            return
+        rng = self.env.unwrapped.np_random
+        slip, nudge, move = rng.random(3) < (chance.slip, chance.nudge, chance.move)
+        place = block_place(world)
+        lifted = place[2] > TABLE + LIFTED
+        if slip and lifted and not self.slipping:
+            self.slipping = self.slip_steps
+        if nudge and not lifted:
+            nudge_block(world, place, rng, self.push)
+        if move:
+            world.goal = world._sample_goal()  # type: ignore[attr-defined]
+
+
+def block_place(world: Any) -> Array:
+    """Where the block is, (3,)."""
+    place: Array = world._utils.get_site_xpos(world.model, world.data, "object0")
+    return place
+
+
+def nudge_block(world: Any, place: Array, rng: np.random.Generator, speed: float) -> None:
+    """Push the block somewhere; back to the middle where it lies at the edge of what is reached."""
+    angle = rng.uniform(-np.pi, np.pi)
+    way = np.array([np.cos(angle), np.sin(angle)])
+    inwards = world.initial_gripper_xpos[:2] - place[:2]
+    if np.linalg.norm(inwards) > 0.12:
+        way = inwards / np.linalg.norm(inwards)
+    joint = "object0:joint"
+    velocity = world._utils.get_joint_qvel(world.model, world.data, joint).copy()
+    velocity[:2] += speed * way
+    world._utils.set_joint_qvel(world.model, world.data, joint, velocity)
+
+
+def _flat(obs: dict[str, Array]) -> Array:
+    return np.concatenate([obs["observation"], obs["desired_goal"]]).astype(np.float32)
+
+
+def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """The arm, with or without disturbances.
+
+    Raises:
+        SkillweaveError: gymnasium-robotics is missing.
+    """
+    try:
+        import gymnasium_robotics
+        import mujoco  # noqa: F401
+    except ImportError as error:
+        raise SkillweaveError(
+            "the robot's arm needs the extra 'robotics': pip install 'skillweave[robotics]'"
+        ) from error
+    gym.register_envs(gymnasium_robotics)
+    arm = gym.make(
+        "FetchPickAndPlace-v4",
+        max_episode_steps=50 if disturbances == CALM else 100,
+        render_mode=render_mode,
+        disable_env_checker=True,
+    )
+    return Place(arm, disturbances)
+
+
+def spec(disturbances: Disturbances = CALM) -> EnvSpec:
+    """The task, for ``Hierarchy(env=...)``."""
+
+    def arm(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return make(disturbances, render_mode)
+
+    arm.__name__ = "PickAndPlace" if disturbances == CALM else "PickAndPlaceDisturbed"
+    return EnvSpec(arm)

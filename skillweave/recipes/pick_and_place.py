@@ -1,0 +1,195 @@
+"""Pick and place: a robot's arm grasps a block and brings it to a goal, in spite of disturbances.
+
+FetchPickAndPlace-v4 (Plappert et al. 2018, Gymnasium-Robotics). Four skills are functions of one
+line each; a fifth, ``recover``, is learnt. A selector learns when to use which; ``rule`` and
+``behaviour_tree`` choose by hand.
+
+An episode pays 1 and ends when the block has been within 5 cm of the goal for five steps, so a mean
+return is the share of episodes that succeed. It lasts 50 steps at most, as Gymnasium-Robotics', or
+100 where there are disturbances: the gripper slips, somebody nudges the block, the goal moves.
+
+Observations: the gripper's place (0 to 2), the block's (3 to 5), the block as seen from the gripper
+(6 to 8), the fingers (9, 10), angles and velocities (11 to 24), the goal (25 to 27); in metres.
+
+    skillweave train pick-and-place
+
+Needs gymnasium-robotics: ``pip install 'skillweave[robotics]'``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import skillweave as sw
+from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
+from skillweave.recipes._arm import CALM, Disturbances, spec
+
+GRIPPER, BLOCK, OFFSET = slice(0, 3), slice(3, 6), slice(6, 9)
+FINGERS, GOAL = slice(9, 11), slice(25, 28)
+
+
+def towards(way: Array, fingers: float) -> Array:
+    """The action (n, 4) that moves the gripper this way, (n, 3) metres; fingers: 1 opens them."""
+    speed = np.clip(10.0 * way, -1.0, 1.0)
+    return np.column_stack([speed, np.full(len(way), fingers)]).astype(np.float32)
+
+
+def above(obs: Array) -> Array:
+    """To a place above the block, with open fingers."""
+    return towards(obs[:, OFFSET] + (0.0, 0.0, 0.1), 1.0)
+
+
+def descend(obs: Array) -> Array:
+    """Down around the block, with open fingers."""
+    return towards(obs[:, OFFSET], 1.0)
+
+
+def close(obs: Array) -> Array:
+    """Close the fingers."""
+    return towards(np.zeros((len(obs), 3)), -1.0)
+
+
+def carry(obs: Array) -> Array:
+    """To the goal, with closed fingers."""
+    return towards(obs[:, GOAL] - obs[:, BLOCK], -1.0)
+
+
+def is_above(obs: Array) -> Array:
+    """The gripper is straight above the block, or around it, (N,) bool."""
+    aligned: Array = np.abs(obs[:, OFFSET][:, :2]).max(axis=1) < 0.015
+    return aligned
+
+
+def is_around(obs: Array) -> Array:
+    """The block is between the fingers, (N,) bool."""
+    around: Array = is_above(obs) & (np.abs(obs[:, OFFSET][:, 2]) < 0.012)
+    return around
+
+
+def is_grasped(obs: Array) -> Array:
+    """The block is between the fingers, and these are closed, (N,) bool."""
+    closed = obs[:, FINGERS].sum(axis=1) < 0.053
+    grasped: Array = closed & (np.abs(obs[:, OFFSET]).max(axis=1) < 0.03)
+    return grasped
+
+
+def rule(obs: Array) -> Array:
+    """What an engineer would write: which skill, (N,) by name."""
+    free = np.where(is_around(obs), "close", np.where(is_above(obs), "descend", "above"))
+    return np.where(is_grasped(obs), "carry", free)
+
+
+class Above(Skill):
+    """Go above the block."""
+
+    policy = above
+
+
+class Descend(Skill):
+    """Go down around the block."""
+
+    policy = descend
+
+
+class Close(Skill):
+    """Close the fingers."""
+
+    policy = close
+
+
+class Carry(Skill):
+    """Bring what is between the fingers to the goal."""
+
+    policy = carry
+
+
+class Recover(Skill):
+    """Get the block between the open fingers, wherever it is now. It is learnt."""
+
+    max_steps = 25
+
+    def initiation(self, obs: Array) -> Array:
+        """Where it is not grasped."""
+        return ~is_grasped(obs)
+
+    def reward(self, step: Step) -> Array:
+        """Progress of the fingers to the block, in decimetres; 1 for having it between them."""
+        before = np.linalg.norm(step.obs[:, OFFSET], axis=1)
+        after = np.linalg.norm(step.next_obs[:, OFFSET], axis=1)
+        reward: Array = 10.0 * (before - after) + self.success(step)
+        return reward
+
+    def termination(self, step: Step) -> Array:
+        """It is between them."""
+        return is_around(step.next_obs)
+
+    def success(self, step: Step) -> Array:
+        """It is between them."""
+        return is_around(step.next_obs)
+
+
+script = sw.Automaton(
+    states={"above": "above", "descend": "descend", "close": "close", "carry": "carry"},
+    transitions={
+        ("above", "descend"): lambda step: is_above(step.next_obs),
+        ("descend", "close"): lambda step: is_around(step.next_obs),
+        ("close", "carry"): lambda step: is_grasped(step.next_obs),
+    },
+)
+"""The four steps in their order, each until it is done: all one needs where nothing goes wrong."""
+
+behaviour_tree = sw.tree.Sequence(
+    sw.tree.Fallback(
+        is_grasped,
+        sw.tree.Sequence(
+            sw.tree.Fallback(is_above, "above"), sw.tree.Fallback(is_around, "descend"), "close"
+        ),
+    ),
+    "carry",
+)
+"""The same as ``rule``, as a tree: it begins anew after each call that has not succeeded."""
+
+RELU = Network(hidden=(64, 64), activation="relu")
+LEARNER = PPO(
+    num_envs=16,
+    n_steps=128,
+    batch_size=256,
+    update_epochs=8,
+    gamma=0.98,
+    gae_lambda=0.95,
+    network=RELU,
+)
+SELECTOR = PPO(
+    num_envs=16,
+    n_steps=256,
+    batch_size=128,
+    update_epochs=8,
+    gamma=0.98,
+    gae_lambda=0.95,
+    network=RELU,
+)
+BY_HAND = (Above, Descend, Close, Carry)
+
+
+def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
+    """The hierarchy whose selector is learnt; ``how`` changes any of its settings."""
+    settings: dict[str, Any] = {
+        "call_steps": 5,
+        "algorithm": LEARNER,
+        "selector": SELECTOR,
+        "skill_steps": 60_000,
+        "selector_steps": 140_000,
+    } | how
+    return Hierarchy(spec(disturbances), [*(s() for s in BY_HAND), Recover()], **settings)
+
+
+def by_hand(selector: Any, disturbances: Disturbances = CALM, call_steps: int = 1) -> Hierarchy:
+    """The four skills under ``rule``, ``script`` or ``behaviour_tree``: nothing is learnt."""
+    skills: Sequence[Skill] = [s() for s in BY_HAND]
+    return Hierarchy(spec(disturbances), skills, selector=selector, call_steps=call_steps)
+
+
+hierarchy = declare()

@@ -1,0 +1,264 @@
+"""The protocol on two tiny tasks: all agents, results that are kept, trainings that go on."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from benchmarks.pay import __main__ as command
+from benchmarks.pay import agents
+from benchmarks.pay.agents import CHAINS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_SEED, Bench
+from benchmarks.pay.figures import draw, make_table, reported
+from benchmarks.pay.flat import Bonus, Flat
+from benchmarks.pay.results import Results, curve_of
+from benchmarks.pay.suite import Shaped, Suite, Task
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, SkillweaveError, Step
+
+TINY = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
+
+
+class Line(gym.Env):
+    """Places −3 to 3; the end of one side pays 1."""
+
+    observation_space = gym.spaces.Box(-3.0, 3.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, goal=3):
+        self.goal = goal
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.steps = 0, 0
+        return self._obs(), {}
+
+    def step(self, action):
+        self.steps += 1
+        self.place = int(np.clip(self.place + 2 * action - 1, -3, 3))
+        there = self.place == self.goal
+        return self._obs(), float(there), there, self.steps == 12 and not there, {}
+
+    def _obs(self):
+        return np.array([self.place], np.float32)
+
+
+class Right(Skill):
+    """To the right."""
+
+    max_steps = 6
+
+    def reward(self, step):
+        return (step.next_obs - step.obs)[:, 0]
+
+
+class Left(Right):
+    """To the left."""
+
+    def reward(self, step):
+        return -super().reward(step)
+
+
+def declare(task, **how):
+    options = {"call_steps": 2, "algorithm": TINY, "selector": TINY} | how
+    return Hierarchy(task.env, [Right(), Left()], **options)
+
+
+def further(task, skills):
+    found = declare(task, selector_steps=192)
+    for skill in found.skills:
+        skill.policy = skills[skill.name]
+    return found
+
+
+def to_the_right(task, skills):
+    found = declare(task, selector=lambda obs: np.zeros(len(obs), np.int64))
+    for skill in found.skills:
+        skill.policy = skills[skill.name]
+    return found
+
+
+def suite():
+    return Suite(
+        name="line",
+        tasks=[Task("right", spec(3), 0.5), Task("left", spec(-3), 0.5)],
+        unit=1.0,
+        source=lambda task: declare(task, skill_steps=128, selector_steps=256),
+        further=further,
+        skills=lambda: [Right(), Left()],
+        flat=TINY,
+        weights=({"right": 1.0, "left": 1.0}, {"right": 1.0, "left": 0.0}),
+        cells=lambda obs: obs.astype(int),
+        fixed={"always-right": to_the_right},
+        episodes=4,
+    )
+
+
+def spec(goal):
+    return EnvSpec(lambda: Line(goal), workers=1)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    results = Results(tmp_path_factory.mktemp("pay"))
+    for chain in CHAINS:
+        Bench(suite(), results, seed=0).run(chain)
+    return results
+
+
+def test_every_agent_has_a_result_on_every_task(done):
+    found = [r for r in done.all("line") if r.seed == 0]
+    by_agent = Counter(r.agent for r in found)
+    assert set(by_agent.values()) == {2}
+    expected = {"hierarchy", "F0-flat", "F1-skill-rewards", "F2-bonus", "F3-fine-tuned"}
+    assert set(by_agent) == expected | {"F4-random-skills", "F4-best-skill", "always-right"}
+    assert all(len(r.scores) == 4 and np.mean(r.scores) == r.score for r in found)
+
+
+def test_budgets_are_equal_or_in_favour_of_the_flat_agents():
+    # 128 for each of two skills and 256 for the selector, then 192: 704 in all, 352 for each task.
+    assert suite().steps() == [512, 192]
+    assert suite().steps_flat() == [512, 352]
+    assert replace(suite(), flat_steps=100).steps_flat() == [512, 192]
+    assert suite().scaled(0.5).steps() == [256, 96]
+    assert suite().scaled(0.5).steps_flat() == [256, 176]
+
+
+def test_steps_are_counted_as_they_were_made(done):
+    for r in done.all("line"):
+        rollout = TINY.num_envs * TINY.n_steps
+        assert r.budget <= r.steps < r.budget + 3 * rollout + 1
+
+
+def test_the_best_single_skill_goes_to_the_side_that_pays(done):
+    found = {r.task: r for r in done.all("line") if r.agent == "always-right"}
+    best = {r.task: r for r in done.all("line") if r.agent == "F4-best-skill"}
+    assert best["right"].score >= found["right"].score
+    assert best["left"].score >= found["left"].score
+
+
+def test_what_is_there_is_not_run_again(done, monkeypatch):
+    before = {r.task + r.agent: r for r in done.all("line")}
+
+    def no(*args, **kwargs):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(Hierarchy, "train", no)
+    monkeypatch.setattr(Flat, "run", no)
+    for chain in CHAINS:
+        Bench(suite(), done, seed=0).run(chain)
+    assert {r.task + r.agent: r for r in done.all("line")} == before
+
+
+def test_a_result_of_other_budgets_is_not_taken_for_this_one(done):
+    with pytest.raises(SkillweaveError, match="give another folder with --out"):
+        Bench(suite().scaled(2.0), done, seed=0).run("flat")
+
+
+def test_who_was_killed_goes_on_and_comes_to_the_same(done, tmp_path, monkeypatch):
+    results = Results(tmp_path)
+    score = agents.Bench._score
+
+    def killed(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(agents.Bench, "_score", killed)
+    with pytest.raises(KeyboardInterrupt):
+        Bench(suite(), results, seed=0).run("hierarchy", ["left"])
+    assert results.all("line") == []
+    assert results.run_path("line", "right", HIERARCHY, 0).exists()
+    monkeypatch.setattr(agents.Bench, "_score", score)
+    Bench(suite(), results, seed=0).run("hierarchy", ["left"])
+    for task in ("right", "left"):
+        again = results.find("line", task, HIERARCHY, 0, suite().steps()[task == "left"])
+        first = done.find("line", task, HIERARCHY, 0, suite().steps()[task == "left"])
+        assert (again.scores, again.curve) == (first.scores, first.curve)
+
+
+def test_fine_tuning_begins_with_what_the_flat_agent_was_on_the_first_task(done, tmp_path):
+    bench = Bench(suite(), done, seed=0)
+    source = bench._source_agent()
+    task = suite().tasks[1]
+    agent = Flat(task.env, replace(TINY, learning_rate=1e-12), 64, starts_as=source)
+    run = agent.run(tmp_path / "run", seed=0)
+    for name, value in source.weights.items():
+        if not name.startswith("obs"):
+            np.testing.assert_allclose(run.policy.weights[name], value, atol=1e-6)
+    found = {r.agent: r for r in done.all("line") if r.task == "right" and r.seed == 0}
+    assert found[TUNED] == replace(found[FLAT], agent=TUNED)
+
+
+def test_weights_are_chosen_by_score_on_a_seed_that_is_not_reported(done, monkeypatch):
+    tuned = [r for r in done.all("line") if r.seed == TUNING_SEED]
+    assert {r.agent for r in tuned} == {"tuning-0", "tuning-1"}
+    assert not [r for r in reported(done.all("line"), [0, TUNING_SEED]) if r in tuned]
+    best = max(tuned, key=lambda r: r.score).agent
+    number = int(best.removeprefix("tuning-"))
+    if tuned[0].score != tuned[1].score:
+        assert Bench(suite(), done, 0).tuned_weights() == suite().weights[number]
+
+
+def test_curves_are_of_the_tasks_own_reward_whatever_is_learnt(done):
+    found = [r for r in done.all("line") if r.agent in (SHAPED, FLAT, HIERARCHY)]
+    for r in found:
+        steps = [s for s, _ in r.curve]
+        assert len(r.curve) > 1
+        assert steps == sorted(steps)
+        assert all(0.0 <= score <= 1.0 for _, score in r.curve)  # F1's own reward goes beyond
+
+
+def test_rewards_of_skills_are_added_by_weight():
+    no, one = np.zeros(2, bool), np.ones(2, np.int64)
+    obs, after = np.array([[0.0], [1.0]]), np.array([[2.0], [0.0]])
+    step = Step(obs, one, after, np.array([0.0, 1.0]), no, no, no, one, {})
+    shaped = Shaped([Right(), Left()], {"right": 0.5, "left": 0.1}, task_weight=10.0)
+    # Moves are +2 and −1: 0.5·2 − 0.1·2, and 10 − 0.5 + 0.1.
+    np.testing.assert_allclose(shaped.reward(step), [0.8, 9.6])
+
+
+def test_the_bonus_falls_with_the_visits_of_all_environments():
+    counts = Counter()
+    envs = [Bonus(Line(), lambda obs: obs.astype(int), 3.0, counts) for _ in range(2)]
+    for env in envs:
+        env.reset()
+    rewards = [env.step(1)[1] for env in envs] + [envs[0].step(1)[1]]
+    np.testing.assert_allclose(rewards, [3.0, 3.0 / np.sqrt(2), 3.0])
+
+
+def test_figures_and_the_table_are_made_from_the_files(done, tmp_path):
+    pytest.importorskip("matplotlib")
+    results = reported(done.all("line"), [0])
+    files = draw(suite(), results, tmp_path)
+    assert sorted(f.name for f in files) == [
+        "line-curves.png", "line-curves.svg", "line-solved.png", "line-solved.svg",
+    ]  # fmt: skip
+    assert all(f.stat().st_size > 1000 for f in files)
+    text = make_table(suite(), results)
+    assert text.count("F1-skill-rewards") == 3  # two tasks, and both together
+    assert "tuning" not in text
+
+
+def test_a_damaged_result_is_named(tmp_path, done):
+    folder = tmp_path / "line" / "right" / "hierarchy"
+    folder.mkdir(parents=True)
+    (folder / "0.json").write_text(json.dumps({"suite": "line"}))
+    with pytest.raises(SkillweaveError, match=r"0\.json is damaged"):
+        Results(tmp_path).all("line")
+
+
+def test_a_task_that_is_not_there_is_named_with_those_that_are():
+    with pytest.raises(SkillweaveError, match="no suite 'shuttl'; there are: shuttle"):
+        command.chosen(["shuttl"])
+    with pytest.raises(SkillweaveError, match="no task 'x' in shuttle; there are: shuttle-2"):
+        command.chosen(["shuttle/x"])
+    assert command.chosen(["shuttle/shuttle-4"]) == {"shuttle": ["shuttle-4"]}
+    assert set(command.chosen([])) == set(command.SUITES)
+
+
+def test_curves_count_the_steps_of_earlier_stages(done):
+    path = done.run_path("line", "right", HIERARCHY, 0)
+    curve = curve_of(path, 1.0, ("selector",))
+    assert curve[0][0] > 2 * 128  # skills came first

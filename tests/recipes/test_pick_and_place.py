@@ -1,0 +1,170 @@
+"""Pick and place: what pays, what ends an episode, what disturbs, and the skills' functions."""
+
+from __future__ import annotations
+
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from skillweave import SkillweaveError, Step
+from skillweave.recipes import _arm as world
+from skillweave.recipes import pick_and_place as arm
+
+
+class Distances(gym.Env):
+    """The block's distance to the goal, from a list."""
+
+    observation_space = gym.spaces.Dict({})
+    action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+    def __init__(self, distances):
+        self.distances = distances
+
+    def reset(self, *, seed=None, options=None):
+        self.left = list(self.distances)
+        return self._obs(1.0), {}
+
+    def step(self, action):
+        return self._obs(self.left.pop(0)), -1.0, False, not self.left, {}
+
+    def _obs(self, distance):
+        return {
+            "observation": np.zeros(25),
+            "achieved_goal": np.array([distance, 0.0, 0.0]),
+            "desired_goal": np.zeros(3),
+        }
+
+
+def play(distances):
+    env = world.Place(Distances(distances))
+    env.reset()
+    found = []
+    for _ in distances:
+        found.append(env.step(np.zeros(4, np.float32)))
+        if found[-1][2] or found[-1][3]:
+            break
+    return found
+
+
+def test_five_steps_at_the_goal_pay_one_and_end_the_episode():
+    told = play([0.2, 0.04, 0.04, 0.04, 0.04, 0.04, 0.04])
+    assert [r for _, r, *_ in told] == [0.0] * 5 + [1.0]
+    assert [t for _, _, t, *_ in told] == [False] * 5 + [True]
+    assert told[-1][4]["success"] is True
+
+
+def test_who_flies_past_the_goal_is_not_paid():
+    told = play([0.04, 0.04, 0.04, 0.04, 0.06, 0.04, 0.04, 0.04, 0.04])
+    assert [r for _, r, *_ in told] == [0.0] * 9
+    assert told[-1][2:4] == (False, True)
+
+
+def test_an_episode_that_is_won_in_its_last_step_has_not_run_out_of_time():
+    assert play([0.04] * 5)[-1][2:4] == (True, False)
+
+
+def observation(
+    gripper=(1.3, 0.7, 0.5), offset=(0.0, 0.0, -0.1), fingers=0.1, goal=(1.3, 0.7, 0.6)
+):
+    obs = np.zeros((1, 28), np.float32)
+    obs[:, arm.GRIPPER], obs[:, arm.OFFSET], obs[:, arm.GOAL] = gripper, offset, goal
+    obs[:, arm.BLOCK] = np.add(gripper, offset)
+    obs[:, arm.FINGERS] = fingers / 2
+    return obs
+
+
+@pytest.mark.parametrize(
+    ("offset", "fingers", "skill"),
+    [
+        ((0.1, 0.0, -0.1), 0.1, "above"),
+        ((0.01, 0.0, -0.1), 0.1, "descend"),
+        ((0.01, 0.0, -0.01), 0.1, "close"),
+        ((0.01, 0.0, -0.01), 0.05, "carry"),
+        ((0.1, 0.0, -0.1), 0.05, "above"),  # the fingers are closed on nothing
+    ],
+)
+def test_the_rule_chooses_by_where_the_block_is(offset, fingers, skill):
+    assert arm.rule(observation(offset=offset, fingers=fingers)).tolist() == [skill]
+
+
+def test_functions_move_towards_what_they_are_for():
+    obs = observation(offset=(0.05, -0.2, -0.1))
+    np.testing.assert_allclose(arm.above(obs), [[0.5, -1.0, 0.0, 1.0]], atol=1e-6)
+    np.testing.assert_allclose(arm.descend(obs), [[0.5, -1.0, -1.0, 1.0]], atol=1e-6)
+    np.testing.assert_allclose(arm.close(obs), [[0.0, 0.0, 0.0, -1.0]], atol=1e-6)
+    lifted = observation(offset=(0.0, 0.0, 0.0), goal=(1.35, 0.7, 0.9))
+    np.testing.assert_allclose(arm.carry(lifted), [[0.5, 0.0, 1.0, -1.0]], atol=1e-5)
+
+
+def test_recovering_is_paid_by_progress_to_the_block():
+    before, after = observation(offset=(0.3, 0.4, 0.0)), observation(offset=(0.0, 0.2, 0.0))
+    there = observation(offset=(0.0, 0.0, 0.0))
+    no, one = np.zeros(1, bool), np.ones(1, np.int64)
+
+    def step(a, b):
+        return Step(a, np.zeros((1, 4)), b, np.zeros(1), no, no, no, one, {})
+
+    skill = arm.Recover()
+    assert skill.reward(step(before, after)) == pytest.approx(10 * 0.3)
+    assert skill.reward(step(after, there)) == pytest.approx(10 * 0.2 + 1.0)
+    assert skill.termination(step(after, there))
+    assert not skill.termination(step(before, after))
+
+
+def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
+    with pytest.raises(SkillweaveError, match=r"skillweave\[robotics\]"):
+        arm.declare().train(tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def disturbed():
+    pytest.importorskip("mujoco")
+    pytest.importorskip("gymnasium_robotics")
+
+    def make(**chances):
+        none = {"slip": 0.0, "nudge": 0.0, "move": 0.0}
+        env = world.make(world.Disturbances(**none | chances))
+        return env, env.reset(seed=1)[0]
+
+    return make
+
+
+STILL = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+
+
+def test_a_nudge_moves_the_block_some_centimetres_and_leaves_it_on_the_table(disturbed):
+    env, obs = disturbed(nudge=1.0)
+    before = obs[arm.BLOCK]
+    obs, *_ = env.step(STILL)
+    env.disturbances = world.CALM  # once is enough
+    for _ in range(10):
+        obs, *_ = env.step(STILL)
+    moved = np.linalg.norm(obs[arm.BLOCK][:2] - before[:2])
+    assert 0.03 < moved < 0.15
+    assert obs[arm.BLOCK][2] == pytest.approx(world.TABLE, abs=0.01)
+
+
+def test_a_goal_that_moves_is_elsewhere_in_the_observation(disturbed):
+    env, obs = disturbed(move=1.0)
+    after, *_ = env.step(STILL)
+    assert np.linalg.norm(after[arm.GOAL] - obs[arm.GOAL]) > 0.01
+
+
+def test_a_gripper_that_slips_drops_the_block(disturbed):
+    env, obs = disturbed()
+    for _ in range(40):  # the rule lifts it
+        name = str(arm.rule(obs[None])[0])
+        obs = env.step(getattr(arm, name)(obs[None])[0])[0]
+        if obs[arm.BLOCK][2] > world.TABLE + 0.05:
+            break
+    assert obs[arm.BLOCK][2] > world.TABLE + 0.05
+    env.disturbances = world.Disturbances(slip=1.0, nudge=0.0, move=0.0)
+    obs, *_ = env.step(arm.close(obs[None])[0])
+    assert env.slipping == env.slip_steps - 1
+    for _ in range(6):
+        obs, *_ = env.step(arm.close(obs[None])[0])
+    assert obs[arm.BLOCK][2] < world.TABLE + 0.03
