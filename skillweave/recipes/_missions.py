@@ -16,8 +16,8 @@ import numpy as np
 from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
 
 LANDER = "LunarLander-v3"
-EPISODE = 600
-"""Steps of an episode, at most: 12 seconds."""
+EPISODE = 1000
+"""Steps of an episode, at most: 20 seconds, as LunarLander's."""
 KINDS = ("left", "right", "hover", "land")
 """What a leg of a mission can be."""
 LEGS = 3
