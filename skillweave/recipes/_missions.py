@@ -92,7 +92,7 @@ class Progress:
         self._time[ids] += 1
         leg, place = self.left[ids, 0], obs[:, :2]
         at = np.clip(leg, 0, LAND - 1)
-        inside = (np.abs(place - POINTS[at]) <= HALF[at]).all(axis=1)
+        inside = (np.abs(place - POINTS[at]) <= HALF[at] + 1e-6).all(axis=1)
         hovering = inside & (KINDS.index("hover") == leg)
         held = np.where(hovering, self.held[ids] + 1, 0)
         rested = ended & (reward == RESTED)

@@ -58,6 +58,8 @@ class Flight(Skill):
     """Fly at the speed that is wanted where it is, upright."""
 
     max_steps = 250
+    prize = 0.0
+    """For being at the point: where a call ends there, all that it could still be paid ends, too."""
     point: Array
 
     def wanted(self, obs: Array) -> Array:
@@ -66,11 +68,14 @@ class Flight(Skill):
         speed: Array = np.clip(way, (-0.6, -0.4), (0.6, 0.4))
         return speed
 
+    def deviation(self, obs: Array) -> Array:
+        """How far it is from that speed, from upright and from not turning, (n,)."""
+        speed: Array = np.hypot(*(obs[:, [VX, VY]] - self.wanted(obs)).T)
+        return speed + np.abs(obs[:, ANGLE]) + 0.3 * np.abs(obs[:, SPIN])
+
     def reward(self, step: Step) -> Array:
-        """Minus how far it is from that speed, from upright and from not turning."""
-        obs = step.next_obs
-        speed = np.hypot(*(obs[:, [VX, VY]] - self.wanted(obs)).T)
-        reward = -speed - np.abs(obs[:, ANGLE]) - 0.3 * np.abs(obs[:, SPIN])
+        """1 less the deviation; the prize; −20 for the end of an episode."""
+        reward = 1.0 - self.deviation(step.next_obs) + self.prize * self.success(step)
         return np.where(step.terminated, CRASH, reward)
 
     def success(self, step: Step) -> Array:
@@ -92,6 +97,7 @@ class Hover(Flight):
 class GoLeft(Flight):
     """Fly to the point on the left, until it is reached."""
 
+    prize = 100.0
     point = POINTS[KINDS.index("left")]
 
     def termination(self, step: Step) -> Array:
@@ -117,10 +123,10 @@ class Land(Flight):
         return np.column_stack([np.clip(-obs[:, X], -0.5, 0.5), sink])
 
     def reward(self, step: Step) -> Array:
-        """The same; on the ground 0.2 for each leg, less 0.3 for an engine; 20 for rest."""
+        """Less the deviation; on the ground 0.2 for each leg, less 0.3 for an engine; ±20."""
         touching = step.next_obs[:, LEGS].sum(axis=1)
         grounded = 0.2 * touching - 0.3 * (step.action != 0) - 0.1
-        reward = np.where(touching > 0, grounded, super().reward(step))
+        reward = np.where(touching > 0, grounded, -self.deviation(step.next_obs))
         return np.where(step.terminated, np.where(rested(step), -CRASH, CRASH), reward)
 
     def success(self, step: Step) -> Array:
@@ -162,11 +168,11 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
         "start_calls": 3,
         "algorithm": PILOT,
         "selector": SELECTOR,
-        "skill_steps": 500_000,
+        "skill_steps": 300_000,
         "selector_steps": 200_000,
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
-    found.skill("land").steps = 800_000
+    found.skill("land").steps = 700_000
     return found
 
 
