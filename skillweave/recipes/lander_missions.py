@@ -26,6 +26,8 @@ from skillweave.recipes._missions import KINDS, PAD, POINTS, spec
 X, Y, VX, VY, ANGLE, SPIN, LEGS = 0, 1, 2, 3, 4, 5, slice(6, 8)
 LEG = slice(8, 12)
 """The leg that is flown now, one-hot."""
+TO_DO = slice(8, 20)
+"""All legs that are still to be done."""
 MISSIONS: dict[str, tuple[tuple[str, ...], ...]] = {
     "land": (("land",),),
     "hover": (("hover", "land"),),
