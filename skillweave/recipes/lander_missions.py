@@ -47,7 +47,7 @@ MISSIONS["any"] = (*(m for found in MISSIONS.values() for m in found), *OTHERS)
 
 
 CRASH = -20.0
-"""What the end of an episode is worth to a skill, but for a landing."""
+"""What the end of an episode is worth to a skill, unless it has landed."""
 
 
 def rested(step: Step) -> Array:
@@ -61,7 +61,7 @@ class Flight(Skill):
 
     max_steps = 250
     prize = 0.0
-    """For being at the point: where a call ends there, all that it could still be paid ends, too."""
+    """For being at the point, where a call ends there: what else it could be paid ends, too."""
     point: Array
 
     def wanted(self, obs: Array) -> Array:
@@ -117,6 +117,7 @@ class Land(Flight):
     """Come to rest on the pad, from wherever it is."""
 
     max_steps = 400
+    prize = 100.0
     point = np.zeros(2)
 
     def wanted(self, obs: Array) -> Array:
@@ -125,11 +126,11 @@ class Land(Flight):
         return np.column_stack([np.clip(-obs[:, X], -0.5, 0.5), sink])
 
     def reward(self, step: Step) -> Array:
-        """Less the deviation; on the ground 0.2 for each leg, less 0.3 for an engine; ±20."""
-        touching = step.next_obs[:, LEGS].sum(axis=1)
-        grounded = 0.2 * touching - 0.3 * (step.action != 0) - 0.1
-        reward = np.where(touching > 0, grounded, -self.deviation(step.next_obs))
-        return np.where(step.terminated, np.where(rested(step), -CRASH, CRASH), reward)
+        """1 less the deviation, or on the ground less 0.5 for an engine; the prize for rest."""
+        touching = (step.next_obs[:, LEGS] > 0).any(axis=1)
+        engine = 0.5 * (step.action != 0)
+        reward = 1.0 - np.where(touching, engine, self.deviation(step.next_obs))
+        return np.where(step.terminated, np.where(rested(step), self.prize, CRASH), reward)
 
     def success(self, step: Step) -> Array:
         """It has come to rest on the pad."""
@@ -167,14 +168,14 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
     """The hierarchy on a mission; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": None,
-        "start_calls": 3,
+        "start_calls": 2,
         "algorithm": PILOT,
         "selector": SELECTOR,
-        "skill_steps": 300_000,
+        "skill_steps": 350_000,
         "selector_steps": 200_000,
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
-    found.skill("land").steps = 700_000
+    found.skill("land").steps = 600_000
     return found
 
 
