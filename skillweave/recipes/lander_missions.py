@@ -171,10 +171,11 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
         "start_calls": 2,
         "algorithm": PILOT,
         "selector": SELECTOR,
-        "skill_steps": 350_000,
+        "skill_steps": 400_000,
         "selector_steps": 200_000,
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
+    found.skill("go_right").steps = 500_000  # it begins on the left, too
     found.skill("land").steps = 600_000
     return found
 
