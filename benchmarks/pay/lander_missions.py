@@ -64,5 +64,5 @@ def suite() -> Suite:
         fixed={"by-leg": by_leg},
         # As much as learns the first task, skills included: more than a further task takes here.
         flat_steps=missions.declare().total_steps,
-        episodes=100,
+        evaluations=8,
     )

@@ -148,7 +148,13 @@ PILOT = PPO(
     network=RELU,
 )
 SELECTOR = PPO(
-    n_steps=128, batch_size=128, update_epochs=8, gamma=0.999, gae_lambda=0.95, network=RELU
+    n_steps=128,
+    batch_size=32,
+    update_epochs=10,
+    gamma=0.999,
+    gae_lambda=0.95,
+    learning_rate=2e-3,
+    network=RELU,
 )
 SKILLS = (Hover, GoLeft, GoRight, Land)
 
