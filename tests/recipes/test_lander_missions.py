@@ -171,13 +171,13 @@ def step_of(before, after, action=0, terminated=False):
 
 
 def test_skills_are_paid_for_the_speed_that_is_wanted_where_they_are():
-    # 0.2 to the left of the point wants 0.3 to the right; it is 0.1 too fast.
-    going = step_of(lander(SKY), lander((0.3, 0.75), speed=(0.4, 0.0)))
+    # 0.2 to the left of the point wants 0.5 to the right; it is 0.1 too fast.
+    going = step_of(lander(SKY), lander((0.3, 0.75), speed=(0.6, 0.0)))
     assert missions.GoRight().reward(going) == pytest.approx(0.9, abs=1e-6)
     assert not missions.GoRight().termination(going)
-    # Far away no more than 0.6 is wanted, and 0.4 downwards.
+    # Far away no more than 0.8 is wanted, and 0.4 downwards.
     far = step_of(lander(SKY), lander((0.5, 1.75)))
-    assert missions.GoLeft().reward(far) == pytest.approx(1.0 - np.hypot(0.6, 0.4), abs=1e-6)
+    assert missions.GoLeft().reward(far) == pytest.approx(1.0 - np.hypot(0.8, 0.4), abs=1e-6)
     there = step_of(lander(SKY), lander(LEFT, speed=(0.1, 0.0)))
     assert missions.GoLeft().termination(there)
     # 0.1 too fast, as 0 is wanted at the point; the prize is 100.
@@ -189,13 +189,17 @@ def test_skills_are_paid_for_the_speed_that_is_wanted_where_they_are():
 
 def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_ground():
     land = missions.Land()
-    high = step_of(lander(SKY), lander((0.2, 1.0), speed=(-0.2, -0.5)))
+    high = step_of(lander(SKY), lander((0.2, 1.0), speed=(-0.4, -0.2)))  # 0.4 of 0.5 down
     assert land.reward(high) == pytest.approx(1.0, abs=1e-6)
     ground = lander(PAD, speed=(0.0, -0.1), legs=(1.0, 0.0))
     assert land.reward(step_of(lander(SKY), ground, action=2)) == pytest.approx(0.5)
+    beside = step_of(lander(SKY), lander((0.4, 1.0), speed=(-0.8, 0.0)))  # it must not sink yet
+    assert land.reward(beside) == pytest.approx(1.0, abs=1e-6)
     rest = step_of(ground, lander(PAD, legs=(1.0, 1.0)), terminated=True)
     assert land.reward(rest) == 100.0
     assert land.success(rest)
+    off = step_of(ground, lander((0.3, 0.0), legs=(1.0, 1.0)), terminated=True)
+    assert land.reward(off) == missions.CRASH
     assert land.reward(step_of(lander(SKY), ground, terminated=True)) == missions.CRASH
 
 
