@@ -127,7 +127,7 @@ class Land(Flight):
         return np.column_stack([np.clip(-2.0 * obs[:, X], -0.8, 0.8), sink * over])
 
     def reward(self, step: Step) -> Array:
-        """1 less the deviation, or on the ground less 0.5 for an engine; the prize for rest there."""
+        """1 less the deviation, or on the ground less 0.5 for an engine; the prize on the pad."""
         touching = (step.next_obs[:, LEGS] > 0).any(axis=1)
         engine = 0.5 * (step.action != 0)
         reward = 1.0 - np.where(touching, engine, self.deviation(step.next_obs))
