@@ -150,11 +150,12 @@ PILOT = PPO(
 )
 SELECTOR = PPO(
     n_steps=128,
-    batch_size=32,
+    batch_size=32,  # a rollout has few decisions
     update_epochs=10,
     gamma=0.999,
     gae_lambda=0.95,
-    learning_rate=2e-3,
+    floor=0.3,  # else it settles on the first leg before it has seen another one done
+    floor_final=0.0,
     network=RELU,
 )
 SKILLS = (Hover, GoLeft, GoRight, Land)
@@ -176,6 +177,8 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
     settings: dict[str, Any] = {
         "call_steps": None,
         "start_calls": 2,
+        # A greedy one may stand still beside its point for ever.
+        "greedy_skills": False,
         "algorithm": PILOT,
         "selector": SELECTOR,
         "skill_steps": 300_000,
