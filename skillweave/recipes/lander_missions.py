@@ -154,8 +154,8 @@ SELECTOR = PPO(
     update_epochs=10,
     gamma=0.999,
     gae_lambda=0.95,
-    floor=0.3,  # else it settles on the first leg before it has seen another one done
-    floor_final=0.0,
+    ent_coef=0.05,
+    ent_coef_final=0.0,
     network=RELU,
 )
 SKILLS = (Hover, GoLeft, GoRight, Land)
@@ -182,7 +182,7 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
         "algorithm": PILOT,
         "selector": SELECTOR,
         "skill_steps": 300_000,
-        "selector_steps": 200_000,
+        "selector_steps": 250_000,
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
     found.skill("go_right").steps = 400_000  # it begins on the left, too
