@@ -1,0 +1,239 @@
+"""The lander of the recipe ``lander-missions``: missions of up to three legs, and gusts.
+
+What a mission is stands in one place, ``Progress``, for one environment (``Mission``) as for many
+side by side in EnvPool (``MissionPool``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
+
+LANDER = "LunarLander-v3"
+EPISODE = 1000
+"""Steps of an episode, at most: 20 seconds, as LunarLander's."""
+KINDS = ("left", "right", "hover", "land")
+"""What a leg of a mission can be."""
+LEGS = 3
+"""The most legs that a mission has."""
+LAND = KINDS.index("land")
+POINTS = np.array([(-0.5, 0.75), (0.5, 0.75), (0.0, 0.6)])
+"""Where left, right and hover are: x and y as the lander sees them."""
+HALF = np.array([(0.15, 0.15), (0.15, 0.15), (0.2, 0.2)])
+"""Half the width and height of the boxes around these points."""
+HOVER_STEPS = 100
+"""Two seconds."""
+PAD = 0.2
+"""Half the width of the pad, as the lander sees it."""
+RESTED = 100.0
+"""What LunarLander pays in the step in which the lander has come to rest, and in no other."""
+GUST_EVERY, GUST_STEPS = 80, 8
+"""A gust comes so often, and lasts so long."""
+SIZE = 8 + LEGS * len(KINDS) + 1
+
+
+class Progress:
+    """How far the missions of ``num_envs`` environments are done.
+
+    Args:
+        missions: each names its legs; each episode has one of them.
+        gusts: in a gust the engine on one side fires, whatever the pilot wants.
+
+    Raises:
+        SkillweaveError: a mission has too few or too many legs, or one that there is not.
+    """
+
+    def __init__(self, num_envs: int, missions: Sequence[Sequence[str]], gusts: bool) -> None:
+        for mission in missions:
+            unknown = [leg for leg in mission if leg not in KINDS]
+            if unknown or not 1 <= len(mission) <= LEGS:
+                raise SkillweaveError(
+                    f"a mission has 1 to {LEGS} legs of {', '.join(KINDS)}, not {tuple(mission)}"
+                )
+        rows = [[KINDS.index(leg) for leg in m] + [-1] * (LEGS - len(m)) for m in missions]
+        self._missions, self._gusts = np.array(rows), gusts
+        self.left = np.full((num_envs, LEGS), -1)
+        """What is still to be done, (num_envs, 3): numbers of kinds in order; −1: nothing."""
+        self.held = np.zeros(num_envs, np.int64)
+        """For how many steps it has hovered in the box."""
+        self.legs = np.ones(num_envs, np.int64)
+        """How many legs the whole mission has."""
+        self._time = np.zeros(num_envs, np.int64)
+
+    def begin(self, ids: Array, rngs: Sequence[np.random.Generator]) -> None:
+        """Missions begin in environments ``ids`` (k,); ``rngs`` has one generator for each."""
+        which = [int(rng.integers(len(self._missions))) for rng in rngs]
+        self.left[ids], self.held[ids] = self._missions[which], 0
+        self.legs[ids] = (self.left[ids] >= 0).sum(axis=1)
+        self._time[ids] = [int(rng.integers(2 * GUST_EVERY)) for rng in rngs]
+
+    def blown(self, action: Array, ids: Array) -> Array:
+        """What the engines do, (k,), where ``action`` (k,) is wanted."""
+        if not self._gusts:
+            return action
+        gust = self._time[ids] % GUST_EVERY < GUST_STEPS
+        side = np.where(self._time[ids] // GUST_EVERY % 2, 1, 3)
+        return np.where(gust, side, action).astype(action.dtype)
+
+    def advance(self, obs: Array, reward: Array, ended: Array, ids: Array) -> Array:
+        """What is paid, (k,): for a leg that this step has done, its share of the mission.
+
+        Args:
+            obs: the lander's, after the step (k, 8).
+            reward: LunarLander's, (k,).
+            ended: the episode has ended, for whatever reason, (k,) bool.
+        """
+        self._time[ids] += 1
+        leg, place = self.left[ids, 0], obs[:, :2]
+        at = np.clip(leg, 0, LAND - 1)
+        inside = (np.abs(place - POINTS[at]) <= HALF[at] + 1e-6).all(axis=1)
+        hovering = inside & (KINDS.index("hover") == leg)
+        held = np.where(hovering, self.held[ids] + 1, 0)
+        rested = ended & (reward == RESTED)
+        done = (leg >= 0) & (leg < KINDS.index("hover")) & inside
+        done |= held >= HOVER_STEPS
+        done |= (leg == LAND) & rested & (np.abs(place[:, 0]) <= PAD)
+        self.held[ids] = np.where(done, 0, held)
+        after = np.roll(self.left[ids], -1, axis=1)
+        after[:, -1] = -1
+        self.left[ids] = np.where(done[:, None], after, self.left[ids])
+        paid: Array = (done / self.legs[ids]).astype(np.float32)
+        return paid
+
+    def done(self, ids: Array) -> Array:
+        """The whole mission is, (k,) bool."""
+        done: Array = self.left[ids, 0] < 0
+        return done
+
+    def seen(self, obs: Array, ids: Array) -> Array:
+        """The lander's observations (k, 8), and the mission's after them: (k, 21)."""
+        legs = self.left[ids][:, :, None] == np.arange(len(KINDS))
+        parts = (obs, legs.reshape(len(ids), -1), self.held[ids, None] / HOVER_STEPS)
+        return np.concatenate(parts, axis=1, dtype=np.float32)
+
+
+SPACE = gym.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
+
+
+class Mission(gym.Wrapper[Any, Any, Any, Any]):
+    """One lander with a mission; ``info["success"]`` says whether all of it is done."""
+
+    def __init__(
+        self, env: gym.Env[Any, Any], missions: Sequence[Sequence[str]], gusts: bool = False
+    ) -> None:
+        super().__init__(env)
+        self.progress, self._me = Progress(1, missions, gusts), np.zeros(1, np.int64)
+        self._rng = np.random.default_rng()
+        self.observation_space = SPACE
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """A new mission."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        self.progress.begin(self._me, [self._rng])
+        return self.progress.seen(obs[None], self._me)[0], info
+
+    def step(self, action: Any) -> Any:
+        """Pays a share of 1 for each leg that is done."""
+        action = self.progress.blown(np.asarray([action]), self._me)[0]
+        obs, reward, terminated, truncated, info = self.env.step(int(action))
+        ended = np.array([terminated or truncated])
+        paid = self.progress.advance(obs[None], np.array([reward]), ended, self._me)
+        info = info | {"success": bool(self.progress.done(self._me)[0])}
+        seen = self.progress.seen(obs[None], self._me)[0]
+        return seen, float(paid[0]), terminated, truncated, info
+
+    def render(self) -> Any:
+        """The picture, with the box of the leg that is flown now."""
+        frame = self.env.render()
+        leg = int(self.progress.left[0, 0])
+        if isinstance(frame, np.ndarray) and 0 <= leg < LAND:
+            frame = frame.copy()
+            (left, right), (top, bottom) = _pixels(POINTS[leg], HALF[leg], frame.shape)
+            for rows, columns in (
+                ((top, top + 2), (left, right)),
+                ((bottom - 2, bottom), (left, right)),
+                ((top, bottom), (left, left + 2)),
+                ((top, bottom), (right - 2, right)),
+            ):
+                frame[slice(*rows), slice(*columns)] = (255, 200, 0)
+        return frame
+
+
+def _pixels(point: Array, half: Array, shape: Sequence[int]) -> tuple[Any, Any]:
+    """Columns and rows that a box spans in LunarLander's picture."""
+    x = (1.0 + point[0] + half[0] * np.array([-1.0, 1.0])) * shape[1] / 2.0
+    # The pad's height is a quarter of the picture, and the legs reach 18 pixels below the middle.
+    above = 0.25 * shape[0] + 18.0
+    y = shape[0] - above - (point[1] + half[1] * np.array([1.0, -1.0])) * shape[0] / 2.0
+    return x.astype(int), y.astype(int)
+
+
+class MissionPool(PoolWrapper):
+    """Many landers with missions.
+
+    Args:
+        pool: landers.
+        num_envs: how many.
+        seed: of the draws of missions and gusts.
+    """
+
+    def __init__(
+        self, pool: Any, missions: Sequence[Sequence[str]], gusts: bool, num_envs: int, seed: int
+    ) -> None:
+        super().__init__(pool, SPACE)
+        self.progress = Progress(num_envs, missions, gusts)
+        self._rngs = [np.random.default_rng([seed, i]) for i in range(num_envs)]
+
+    def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
+        """New missions."""
+        obs, info = self.pool.reset(ids)
+        self.progress.begin(ids, [self._rngs[i] for i in ids])
+        return self.progress.seen(obs, ids), info
+
+    def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """As ``Mission.step``, for all."""
+        action = self.progress.blown(action, ids)
+        obs, reward, terminated, truncated, info = self.pool.step(action, ids)
+        paid = self.progress.advance(obs, reward, terminated | truncated, ids)
+        info = info | {"success": self.progress.done(ids)}
+        return self.progress.seen(obs, ids), paid, terminated, truncated, info
+
+
+def make(
+    missions: Sequence[Sequence[str]], gusts: bool = False, render_mode: str | None = None
+) -> gym.Env[Any, Any]:
+    """One lander whose episodes have one of these missions."""
+    lander = gym.make(
+        LANDER, max_episode_steps=EPISODE, render_mode=render_mode, disable_env_checker=True
+    )
+    return Mission(lander, missions, gusts)
+
+
+def many(
+    missions: Sequence[Sequence[str]], gusts: bool, num_envs: int, threads: int, seed: int
+) -> MissionPool:
+    """The same landers in EnvPool."""
+    pool = envpool(LANDER, num_envs, threads, seed, max_episode_steps=EPISODE)
+    return MissionPool(pool, missions, gusts, num_envs, seed)
+
+
+def spec(name: str, missions: Sequence[Sequence[str]], gusts: bool = False) -> EnvSpec:
+    """The landers with these missions, for ``Hierarchy(env=...)``.
+
+    Args:
+        name: what runs are said to be of.
+    """
+
+    def lander(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return make(missions, gusts, render_mode)
+
+    lander.__name__ = f"Lander({name})"
+    return EnvSpec(lander, pool=partial(many, missions, gusts))

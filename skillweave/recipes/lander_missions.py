@@ -1,0 +1,210 @@
+"""Lander missions: visit points, hover, land, in the order that a mission says.
+
+LunarLander-v3 with a mission of up to three legs: visit a box on the left, one on the right, hover
+in a box for two seconds, land on the pad. A leg pays its share of 1 when it is done, and nothing
+else pays. Four skills are learnt once, each by a reward of its own that knows nothing of missions;
+a selector learns for each mission when to call which.
+
+Observations: LunarLander's (0 to 7); what is still to be done, leg by leg, each one-hot of left,
+right, hover, land (8 to 19); which share of the two seconds it has hovered (20).
+
+    skillweave train lander-missions
+
+Needs box2d: ``pip install 'skillweave[box2d]'``; with EnvPool it trains several times as fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skillweave import PPO, Array, Hierarchy, Network, Skill, SkillweaveError, Step
+from skillweave.recipes._missions import KINDS, PAD, POINTS, spec
+
+X, Y, VX, VY, ANGLE, SPIN, LEGS = 0, 1, 2, 3, 4, 5, slice(6, 8)
+LEG = slice(8, 12)
+"""The leg that is flown now, one-hot."""
+TO_DO = slice(8, 20)
+"""All legs that are still to be done."""
+MISSIONS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "land": (("land",),),
+    "hover": (("hover", "land"),),
+    "tour": (("left", "right", "land"),),
+}
+OTHERS = (
+    ("left", "land"),
+    ("right", "land"),
+    ("right", "left", "land"),
+    ("left", "hover", "land"),
+    ("right", "hover", "land"),
+    ("hover", "left", "land"),
+    ("hover", "right", "land"),
+)
+MISSIONS["any"] = (*(m for found in MISSIONS.values() for m in found), *OTHERS)
+"""Each episode has another mission: what skills are learnt on."""
+
+
+CRASH = -20.0
+"""What the end of an episode is worth to a skill, unless it has landed."""
+
+
+def rested(step: Step) -> Array:
+    """It has come to rest, (N,) bool: LunarLander's physics then sets its speed to 0."""
+    still: Array = (step.next_obs[:, [VX, VY]] == 0.0).all(axis=1)
+    return step.terminated & still
+
+
+class Flight(Skill):
+    """Fly at the speed that is wanted where it is, upright."""
+
+    max_steps = 300
+    prize = 0.0
+    """For being at the point, where a call ends there: what else it could be paid ends, too."""
+    point: Array
+
+    def wanted(self, obs: Array) -> Array:
+        """Speeds, (n, 2): towards the point, the slower the nearer."""
+        way = (self.point - obs[:, [X, Y]]) * (2.5, 1.0)
+        speed: Array = np.clip(way, (-0.8, -0.4), (0.8, 0.4))
+        return speed
+
+    def deviation(self, obs: Array) -> Array:
+        """How far it is from that speed, from upright and from not turning, (n,)."""
+        speed: Array = np.hypot(*(obs[:, [VX, VY]] - self.wanted(obs)).T)
+        return speed + np.abs(obs[:, ANGLE]) + 0.3 * np.abs(obs[:, SPIN])
+
+    def reward(self, step: Step) -> Array:
+        """1 less the deviation; the prize; −20 for the end of an episode."""
+        reward = 1.0 - self.deviation(step.next_obs) + self.prize * self.success(step)
+        return np.where(step.terminated, CRASH, reward)
+
+    def success(self, step: Step) -> Array:
+        """It is at the point, slow and upright."""
+        obs = step.next_obs
+        far = np.hypot(*(obs[:, [X, Y]] - self.point).T)
+        moving = np.hypot(obs[:, VX], obs[:, VY]) + np.abs(obs[:, ANGLE])
+        there: Array = (far + 0.5 * moving < 0.25) & ~step.terminated
+        return there
+
+
+class Hover(Flight):
+    """Fly to the point above the pad, and stay there."""
+
+    call_steps = 50
+    point = POINTS[KINDS.index("hover")]
+
+
+class GoLeft(Flight):
+    """Fly to the point on the left, until it is reached."""
+
+    prize = 100.0
+    point = POINTS[KINDS.index("left")]
+
+    def termination(self, step: Step) -> Array:
+        """It is there."""
+        return self.success(step)
+
+
+class GoRight(GoLeft):
+    """Fly to the point on the right, until it is reached."""
+
+    point = POINTS[KINDS.index("right")]
+
+
+class Land(Flight):
+    """Come to rest on the pad, from wherever it is."""
+
+    max_steps = 400
+    prize = 100.0
+    point = np.zeros(2)
+
+    def wanted(self, obs: Array) -> Array:
+        """Speeds, (n, 2): towards the middle; above the pad down, the slower the lower."""
+        sink = -0.1 - 0.4 * np.clip(obs[:, Y], 0.0, 1.0)
+        over = np.clip(1.2 - 4.0 * np.abs(obs[:, X]), 0.0, 1.0)
+        return np.column_stack([np.clip(-2.0 * obs[:, X], -0.8, 0.8), sink * over])
+
+    def reward(self, step: Step) -> Array:
+        """1 less the deviation, or on the ground less 0.5 for an engine; the prize on the pad."""
+        touching = (step.next_obs[:, LEGS] > 0).any(axis=1)
+        engine = 0.5 * (step.action != 0)
+        reward = 1.0 - np.where(touching, engine, self.deviation(step.next_obs))
+        return np.where(step.terminated, np.where(self.success(step), self.prize, CRASH), reward)
+
+    def success(self, step: Step) -> Array:
+        """It has come to rest on the pad."""
+        on_pad: Array = rested(step) & (np.abs(step.next_obs[:, X]) <= PAD)
+        return on_pad
+
+
+RELU = Network(activation="relu")  # tanh costs more than all the rest of so small a network
+PILOT = PPO(
+    batch_size=256,
+    update_epochs=8,
+    gamma=0.99,
+    gae_lambda=0.95,
+    ent_coef_final=0.0,
+    network=RELU,
+)
+SELECTOR = PPO(
+    n_steps=128,
+    batch_size=32,  # a rollout has few decisions
+    update_epochs=10,
+    gamma=0.999,
+    gae_lambda=0.95,
+    ent_coef=0.05,
+    ent_coef_final=0.0,
+    network=RELU,
+)
+SKILLS = (Hover, GoLeft, GoRight, Land)
+
+
+def environment(mission: str = "any", gusts: bool = False) -> Any:
+    """The landers with a mission, by its name.
+
+    Raises:
+        SkillweaveError: there is none of this name.
+    """
+    if mission not in MISSIONS:
+        raise SkillweaveError(f"no mission {mission!r}; there are: {', '.join(MISSIONS)}")
+    return spec(mission + (" in gusts" if gusts else ""), MISSIONS[mission], gusts)
+
+
+def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
+    """The hierarchy on a mission; ``how`` changes any of its settings."""
+    settings: dict[str, Any] = {
+        "call_steps": None,
+        "start_calls": 2,
+        # A greedy one may stand still beside its point for ever.
+        "greedy_skills": False,
+        "algorithm": PILOT,
+        "selector": SELECTOR,
+        "skill_steps": 300_000,
+        "selector_steps": 250_000,
+    } | how
+    found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
+    found.skill("go_right").steps = 400_000  # it begins on the left, too
+    found.skill("land").steps = 600_000
+    return found
+
+
+def with_skills(
+    mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
+) -> Hierarchy:
+    """The hierarchy on a mission with skills that are there already, by name."""
+    found = declare(mission, gusts, **how)
+    for skill in found.skills:
+        skill.policy = skills[skill.name]
+    return found
+
+
+def by_leg(obs: Array) -> Array:
+    """The skill of the leg that is flown now, (N,) by name: the selector as one would write it."""
+    names = np.array(["go_left", "go_right", "hover", "land"])
+    named: Array = names[obs[:, LEG].argmax(axis=1)]
+    return named
+
+
+hierarchy = declare()

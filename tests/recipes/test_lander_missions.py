@@ -1,0 +1,228 @@
+"""Lander missions: legs, hovering and gusts by hand, over flights that are written down."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from skillweave import SkillweaveError, Step
+from skillweave.recipes import _missions as world
+from skillweave.recipes import lander_missions as missions
+
+LEFT, RIGHT, ABOVE, PAD = (-0.5, 0.75), (0.5, 0.75), (0.0, 0.6), (0.1, 0.0)
+SKY = (0.0, 1.2)
+ONE = np.zeros(1, np.int64)
+
+
+def lander(place, speed=(0.0, 0.0), legs=(0.0, 0.0)):
+    return np.array([*place, *speed, 0.0, 0.0, *legs], np.float32)
+
+
+def fly(mission, places, rested=False):
+    """What is paid in each step, and the progress after all; it may rest in the last step."""
+    progress = world.Progress(1, [mission], gusts=False)
+    progress.begin(ONE, [np.random.default_rng(0)])
+    paid = []
+    for i, place in enumerate(places):
+        last = rested and i == len(places) - 1
+        reward, ended = np.array([100.0 if last else 1.0]), np.array([last])
+        paid.append(float(progress.advance(lander(place)[None], reward, ended, ONE)[0]))
+    return paid, progress
+
+
+def test_each_leg_of_a_tour_pays_a_third_in_its_order():
+    tour = ("left", "right", "land")
+    third = pytest.approx(1 / 3)
+    paid, progress = fly(tour, [SKY, RIGHT, LEFT, LEFT, SKY, RIGHT, PAD], rested=True)
+    assert paid == [0, 0, third, 0, 0, third, third]
+    assert progress.done(ONE)
+    paid, progress = fly(tour, [LEFT, PAD], rested=True)  # landed too early: the tour is not done
+    assert paid == [third, 0]
+    assert not progress.done(ONE)
+
+
+def test_the_edge_of_a_box_belongs_to_it():
+    assert fly(("left", "land"), [(-0.35, 0.75)])[0] == [0.5]
+    assert fly(("left", "land"), [(-0.34, 0.75)])[0] == [0.0]
+    assert fly(("left", "land"), [(-0.5, 0.91)])[0] == [0.0]
+
+
+def test_hovering_takes_two_seconds_without_leaving_the_box():
+    enough = world.HOVER_STEPS
+    paid, _ = fly(("hover", "land"), [ABOVE] * enough + [ABOVE])
+    assert paid == [0] * (enough - 1) + [0.5, 0]
+    paid, progress = fly(("hover", "land"), [ABOVE] * (enough - 1) + [SKY] + [ABOVE] * 3)
+    assert sum(paid) == 0
+    assert progress.held == [3]
+
+
+def test_a_landing_counts_only_at_rest_and_on_the_pad():
+    assert fly(("land",), [PAD, PAD])[0] == [0, 0]
+    assert fly(("land",), [SKY, PAD], rested=True)[0] == [0, 1]
+    assert fly(("land",), [SKY, (0.21, 0.0)], rested=True)[0] == [0, 0]
+
+
+def test_what_is_still_to_be_done_stands_in_the_observation():
+    _, progress = fly(("hover", "right"), [ABOVE] * 25)
+    seen = progress.seen(lander(ABOVE)[None], ONE)[0]
+    np.testing.assert_array_equal(seen[:8], lander(ABOVE))
+    np.testing.assert_array_equal(seen[8:20], [0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0])
+    assert seen[20] == 0.25
+
+
+@pytest.mark.parametrize("legs", [(), ("left",) * 4, ("left", "up")])
+def test_missions_that_there_are_not_are_refused(legs):
+    with pytest.raises(SkillweaveError, match="a mission has 1 to 3 legs of left, right, hover"):
+        world.Progress(1, [legs], gusts=False)
+    with pytest.raises(SkillweaveError, match=r"no mission 'moon'; there are: .*tour"):
+        missions.declare("moon")
+
+
+def test_gusts_fire_the_engines_of_alternating_sides():
+    progress = world.Progress(1, [("land",)], gusts=True)
+    progress.begin(ONE, [np.random.default_rng(0)])
+    progress._time[:] = 0
+    fired = []
+    for _ in range(2 * world.GUST_EVERY):
+        fired.append(int(progress.blown(np.array([2]), ONE)[0]))
+        progress.advance(lander(SKY)[None], np.zeros(1), np.zeros(1, bool), ONE)
+    calm = [2] * (world.GUST_EVERY - world.GUST_STEPS)
+    assert fired == [3] * world.GUST_STEPS + calm + [1] * world.GUST_STEPS + calm
+
+
+class Film(gym.Env):
+    """Shows what is written down, episode after episode; keeps the actions."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (8,), np.float32)
+    action_space = gym.spaces.Discrete(4)
+
+    def __init__(self, number):
+        self.rng, self.actions = np.random.default_rng(number), []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return lander(SKY), {}
+
+    def step(self, action):
+        self.actions.append(action)
+        end = self.rng.random() < 0.05
+        places = [*[LEFT, RIGHT, ABOVE, ABOVE], PAD] if end else [LEFT, RIGHT, ABOVE, ABOVE]
+        reward = 100.0 if end and self.rng.random() < 0.7 else -1.0
+        place = places[int(self.rng.integers(len(places)))]
+        return lander(place), reward, end and reward > 0, end and reward < 0, {}
+
+
+class Films:
+    """The same as a pool."""
+
+    observation_space, action_space = Film.observation_space, Film.action_space
+
+    def __init__(self, n):
+        self.films = [Film(i) for i in range(n)]
+
+    def reset(self, ids):
+        return np.stack([self.films[i].reset()[0] for i in ids]), {}
+
+    def step(self, action, ids):
+        rows = [self.films[i].step(int(a)) for i, a in zip(ids, action, strict=True)]
+        obs, reward, terminated, truncated, _ = zip(*rows, strict=True)
+        return np.stack(obs), np.array(reward), np.array(terminated), np.array(truncated), {}
+
+
+def test_a_pool_and_single_landers_are_the_same_for_the_same_flights():
+    n, legs, rng = 6, missions.MISSIONS["any"], np.random.default_rng(1)
+    pool = world.MissionPool(Films(n), legs, True, n, seed=0)
+    pool._rngs = [np.random.default_rng(100 + i) for i in range(n)]
+    alone = [world.Mission(Film(i), legs, gusts=True) for i in range(n)]
+    obs, _ = pool.reset(np.arange(n))
+    mine = [env.reset(seed=100 + i)[0] for i, env in enumerate(alone)]
+    np.testing.assert_array_equal(obs, mine)
+    paid = 0.0
+    for _ in range(300):
+        ids = np.flatnonzero(rng.random(n) < 0.8)  # the others stand still
+        if not len(ids):
+            continue
+        action = rng.integers(4, size=len(ids))
+        obs, reward, terminated, truncated, info = pool.step(action, ids)
+        for row, (i, act) in enumerate(zip(ids, action, strict=True)):
+            one = alone[i].step(int(act))
+            np.testing.assert_array_equal(obs[row], one[0])
+            assert (reward[row], terminated[row], truncated[row]) == one[1:4]
+            assert info["success"][row] == one[4]["success"]
+            paid += one[1]
+        ended = ids[terminated | truncated]
+        if len(ended):
+            begun = pool.reset(ended)[0]
+            np.testing.assert_array_equal(begun, [alone[i].reset()[0] for i in ended])
+    assert paid > 3.0
+    assert [film.actions for film in pool.pool.films] == [env.env.actions for env in alone]
+
+
+def step_of(before, after, action=0, terminated=False):
+    def seen(obs):
+        return np.concatenate([obs, np.zeros(13, np.float32)])[None]
+
+    no, end = np.zeros(1, bool), np.array([terminated])
+    return Step(
+        seen(before), np.array([action]), seen(after), np.zeros(1, np.float32), end, no, no,
+        np.ones(1, np.int64), {},
+    )  # fmt: skip
+
+
+def test_skills_are_paid_for_the_speed_that_is_wanted_where_they_are():
+    # 0.2 to the left of the point wants 0.5 to the right; it is 0.1 too fast.
+    going = step_of(lander(SKY), lander((0.3, 0.75), speed=(0.6, 0.0)))
+    assert missions.GoRight().reward(going) == pytest.approx(0.9, abs=1e-6)
+    assert not missions.GoRight().termination(going)
+    # Far away no more than 0.8 is wanted, and 0.4 downwards.
+    far = step_of(lander(SKY), lander((0.5, 1.75)))
+    assert missions.GoLeft().reward(far) == pytest.approx(1.0 - np.hypot(0.8, 0.4), abs=1e-6)
+    there = step_of(lander(SKY), lander(LEFT, speed=(0.1, 0.0)))
+    assert missions.GoLeft().termination(there)
+    # 0.1 too fast, as 0 is wanted at the point; the prize is 100.
+    assert missions.GoLeft().reward(there) == pytest.approx(100.9, abs=1e-5)
+    crashed = step_of(lander(SKY), lander(LEFT, speed=(0.1, 0.0)), terminated=True)
+    assert missions.GoLeft().reward(crashed) == missions.CRASH
+    assert not missions.GoLeft().success(crashed)
+
+
+def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_ground():
+    land = missions.Land()
+    high = step_of(lander(SKY), lander((0.2, 1.0), speed=(-0.4, -0.2)))  # 0.4 of 0.5 down
+    assert land.reward(high) == pytest.approx(1.0, abs=1e-6)
+    ground = lander(PAD, speed=(0.0, -0.1), legs=(1.0, 0.0))
+    assert land.reward(step_of(lander(SKY), ground, action=2)) == pytest.approx(0.5)
+    beside = step_of(lander(SKY), lander((0.4, 1.0), speed=(-0.8, 0.0)))  # it must not sink yet
+    assert land.reward(beside) == pytest.approx(1.0, abs=1e-6)
+    rest = step_of(ground, lander(PAD, legs=(1.0, 1.0)), terminated=True)
+    assert land.reward(rest) == 100.0
+    assert land.success(rest)
+    off = step_of(ground, lander((0.3, 0.0), legs=(1.0, 1.0)), terminated=True)
+    assert land.reward(off) == missions.CRASH
+    assert land.reward(step_of(lander(SKY), ground, terminated=True)) == missions.CRASH
+
+
+def test_the_selector_by_hand_calls_the_skill_of_the_leg():
+    progress = world.Progress(4, [(kind,) for kind in world.KINDS], gusts=False)
+    progress.left[:, 0] = np.arange(4)
+    obs = progress.seen(np.stack([lander(SKY)] * 4), np.arange(4))
+    assert missions.by_leg(obs).tolist() == ["go_left", "go_right", "hover", "land"]
+
+
+def test_landers_in_envpool_and_in_gymnasium_have_the_same_missions():
+    pytest.importorskip("envpool")
+    pool, one = world.many(missions.MISSIONS["tour"], False, 2, 1, 0), missions.environment("tour")
+    obs, _ = pool.reset(np.arange(2, dtype=np.int32))
+    env = one.make()
+    single, _ = env.reset(seed=0)
+    assert obs.shape == (2, 21)
+    np.testing.assert_array_equal(obs[0, 8:], single[8:])
+    assert np.abs(obs[:, :8] - single[:8]).max() < 2.0
+    for _ in range(200):
+        obs, reward, terminated, _, info = env.step(0)
+        if terminated:
+            break
+    assert terminated
+    assert not info["success"]
+    assert reward == 0.0
