@@ -174,7 +174,7 @@ class Hierarchy(Declaration):
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
-        """The hierarchy of a run that needs none of the user's code (plain data says it all)."""
+        """The hierarchy of a run's ``manifest`` that needs none of the user's code."""
         entries = {s["name"]: s for s in manifest["skills"]}
         return cls._recorded(spec_of(manifest), manifest, entries)
 

@@ -123,7 +123,7 @@ class HierarchyPolicy:
         return memory["skill"]
 
     def acts(self, memory: Memory, row: int = 0) -> str:
-        """The path of the skill that acts in one environment: ``inner/skill`` for example."""
+        """By the ``memory``, the path of the skill that acts in environment ``row``: ``inner/skill``."""
         i = int(memory["skill"][row])
         name, policy = self.labels[i], self.skills.policies[i]
         if not isinstance(policy, HierarchyPolicy):
