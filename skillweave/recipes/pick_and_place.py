@@ -224,8 +224,8 @@ def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
         "call_steps": 10,
         "algorithm": LEARNER,
         "selector": SELECTOR,
-        "skill_steps": 30_000,
-        "selector_steps": 90_000,
+        "skill_steps": 20_000,
+        "selector_steps": 60_000,
     } | how
     skills = [Above(), Descend(), Close(), Carry(), Recover()]
     return Hierarchy(spec(disturbances), skills, **settings)
