@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,17 @@ def source(task: Task) -> Hierarchy:
 
 def further(task: Task, skills: Policies) -> Hierarchy:
     """A selector over the same skills, learnt anew."""
-    found = arm.declare(DISTURBANCES[task.name], selector_steps=FURTHER_STEPS)
+    return with_skills(arm.declare, task, skills)
+
+
+def anchored(task: Task, skills: Policies) -> Hierarchy:
+    """The same, kept near the behaviour tree while it learns."""
+    return with_skills(arm.anchored, task, skills)
+
+
+def with_skills(declare: Callable[..., Hierarchy], task: Task, skills: Policies) -> Hierarchy:
+    """A hierarchy with the learnt skill."""
+    found = declare(DISTURBANCES[task.name], selector_steps=FURTHER_STEPS)
     found.skill("recover").policy = skills["recover"]
     return found
 
@@ -56,6 +67,7 @@ def suite() -> Suite:
         weights=({"recover": 0.1}, {"recover": 0.01}),
         cells=cells,
         bonus=0.1,
+        variants={"tree-anchored": anchored},
         fixed={
             "rule": by_hand(arm.rule),
             "script": by_hand(arm.script),
