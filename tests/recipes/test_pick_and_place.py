@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -215,3 +216,17 @@ def test_calls_end_where_there_is_nothing_left_to_do():
     assert after == [(True, False), (False, False), (True, True)]
     assert [ends(close, o) for o in (around, held)] == [(False, False), (True, True)]
     assert [ends(carry, o) for o in (held, around)] == [(False, False), (True, False)]
+
+
+@pytest.mark.parametrize("declare", [arm.declare, arm.anchored])
+def test_a_selector_is_learnt_over_skills_with_and_without_the_tree_beside_it(declare, tmp_path):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("gymnasium_robotics")
+    small = replace(arm.SELECTOR, num_envs=2, n_steps=64, update_epochs=1)
+    found = declare(world.Disturbances(), selector=small, selector_steps=256)
+    found.env = replace(found.spec, workers=1)
+    found.skill("recover").policy = arm.above
+    run = found.train(tmp_path / "run", quiet=True)
+    assert ("guide" in run.info()) == (declare is arm.anchored)
+    usage = run.evaluate(2).to_json()["skill_usage"]
+    assert sum(usage.values()) == pytest.approx(1.0)
