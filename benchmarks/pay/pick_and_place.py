@@ -14,7 +14,7 @@ from skillweave.recipes import pick_and_place as arm
 
 DISTURBANCES = {"calm": world.CALM, "disturbed": world.Disturbances()}
 SOLVED = {"calm": 0.95, "disturbed": 0.85}
-FURTHER_STEPS = 60_000
+FURTHER_STEPS = 30_000
 
 
 def source(task: Task) -> Hierarchy:
