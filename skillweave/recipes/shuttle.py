@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -110,8 +109,10 @@ class Body:
     ``backward`` knows only legs in which the source task runs backwards.
     """
 
-    size = LEG.start
-    shapes: Mapping[str, tuple[int, ...]] = MappingProxyType({})
+    size: int = LEG.start
+
+    def __init__(self, obs: Any) -> None:
+        self.shapes: dict[str, tuple[int, ...]] = {}
 
     def init_(self, views: Any, generators: Any) -> None:
         """There is nothing to fill."""
@@ -121,7 +122,7 @@ class Body:
         return inputs["vector"][..., : self.size]
 
 
-register_encoder("half-cheetah's body", lambda obs: Body())
+register_encoder("half-cheetah's body", Body)
 
 RELU = Network(hidden=(64, 64), activation="relu")  # tanh costs more than all the rest of it
 RUNNER = PPO(
