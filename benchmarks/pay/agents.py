@@ -53,18 +53,20 @@ class Bench:
         source = self.suite.tasks[0]
         budgets = dict(zip(self._names(), self.suite.steps(), strict=True))
         for task in self._with_source(tasks):
-            skills = None if task is source else self._skills()
-            self._weave(task, HIERARCHY, skills, budgets[task.name], keep=task is source)
+            hierarchy = self.suite.hierarchy(task, None if task is source else self._skills())
+            self._weave(task, HIERARCHY, hierarchy, budgets[task.name], keep=task is source)
         for task in tasks:
+            for agent, declare in self.suite.variants.items():
+                hierarchy = self.suite.fitted(declare(task, self._skills()))
+                self._weave(task, agent, hierarchy, hierarchy.total_steps)
             self._without_learning(task)
 
     def _weave(
-        self, task: Task, agent: str, skills: Policies | None, budget: int, keep: bool
+        self, task: Task, agent: str, hierarchy: Hierarchy, budget: int, keep: bool = False
     ) -> None:
         if self._found(task, agent, budget):
             return
         path, started = self._path(task, agent), time.perf_counter()
-        hierarchy = self.suite.hierarchy(task, skills)
         hierarchy.eval_every = max(1, budget // self.suite.evaluations)
         hierarchy.eval_episodes = self.suite.evaluated
         if path.exists():

@@ -114,4 +114,5 @@ class Bonus(gym.Wrapper[Any, Any, Any, Any]):
 def with_bonus(spec: EnvSpec, cells: Callable[[Array], Array], size: float) -> EnvSpec:
     """The environment with a bonus for what was seldom seen."""
     add = partial(Bonus, cells=cells, size=size, counts=Counter())
-    return replace(spec, wrappers=(*spec.wrappers, add), pool=None, workers=1)  # pools have none
+    # A pool would not have the wrapper, and counts are of one process.
+    return replace(spec, wrappers=(*spec.wrappers, add), workers=1, pool=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from skillweave.recipes import pick_and_place as arm
 
 DISTURBANCES = {"calm": world.CALM, "disturbed": world.Disturbances()}
 SOLVED = {"calm": 0.95, "disturbed": 0.85}
-FURTHER_STEPS = 140_000
+FURTHER_STEPS = 30_000
 
 
 def source(task: Task) -> Hierarchy:
@@ -23,7 +24,17 @@ def source(task: Task) -> Hierarchy:
 
 def further(task: Task, skills: Policies) -> Hierarchy:
     """A selector over the same skills, learnt anew."""
-    found = arm.declare(DISTURBANCES[task.name], selector_steps=FURTHER_STEPS)
+    return with_skills(arm.declare, task, skills)
+
+
+def anchored(task: Task, skills: Policies) -> Hierarchy:
+    """The same, kept near the behaviour tree while it learns."""
+    return with_skills(arm.anchored, task, skills)
+
+
+def with_skills(declare: Callable[..., Hierarchy], task: Task, skills: Policies) -> Hierarchy:
+    """A hierarchy with the learnt skill."""
+    found = declare(DISTURBANCES[task.name], selector_steps=FURTHER_STEPS)
     found.skill("recover").policy = skills["recover"]
     return found
 
@@ -56,6 +67,7 @@ def suite() -> Suite:
         weights=({"recover": 0.1}, {"recover": 0.01}),
         cells=cells,
         bonus=0.1,
+        variants={"tree-anchored": anchored},
         fixed={
             "rule": by_hand(arm.rule),
             "script": by_hand(arm.script),

@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.pay.suite import Policies, Suite, Task
 from skillweave import Array, Hierarchy
+from skillweave.recipes import _cheetah as cheetah
 from skillweave.recipes import shuttle
 
 POINTS = {
@@ -46,20 +47,20 @@ def by_automaton(task: Task, skills: Policies) -> Hierarchy:
 
 def cells(obs: Array) -> Array:
     """How far the point is in metres, how fast in 2 metres a second, and on which leg, (n, 3)."""
-    leg = obs[:, shuttle.LEG].argmax(axis=1)
-    return np.stack([np.floor(obs[:, shuttle.X]), np.floor(obs[:, shuttle.SPEED] / 2.0), leg], 1)
+    leg = obs[:, cheetah.LEG].argmax(axis=1)
+    return np.stack([np.floor(obs[:, cheetah.X]), np.floor(obs[:, cheetah.SPEED] / 2.0), leg], 1)
 
 
 def suite() -> Suite:
     """Four tasks."""
     return Suite(
         name="shuttle",
-        tasks=[Task(name, shuttle.spec(p), bar(p)) for name, p in POINTS.items()],
+        tasks=[Task(name, cheetah.spec(p), bar(p)) for name, p in POINTS.items()],
         unit=shuttle.UNIT,
         source=source,
         further=further,
         skills=lambda: shuttle.declare().skills,
-        flat=replace(shuttle.RUNNER, gamma=0.99, gae_lambda=0.95),
+        flat=replace(shuttle.RUNNER, gamma=0.99, gae_lambda=0.95, network=shuttle.RELU),
         weights=(
             {"forward": 1.0, "backward": 1.0},
             {"forward": 1.0, "backward": 0.5},

@@ -47,6 +47,7 @@ class Suite:
         task_weight: what F1 multiplies the task's own reward by.
         cells: observations (n, ...) to whole numbers (n, k): what F2 counts visits of.
         bonus: what a first visit of a cell is worth to F2, in units of the task's reward.
+        variants: hierarchies that learn a selector over the same skills in another way, by name.
         fixed: hierarchies in which nothing more is learnt, by name: ready selectors, mostly.
         flat_steps: what a flat agent gets for each further task; None: an equal share of all steps
             of the hierarchy, and never fewer than the hierarchy has there.
@@ -67,6 +68,7 @@ class Suite:
     cells: Callable[[Array], Array]
     task_weight: float = 1.0
     bonus: float = 1.0
+    variants: Mapping[str, Callable[[Task, Policies], Hierarchy]] = field(default_factory=dict)
     fixed: Mapping[str, Callable[[Task, Policies], Hierarchy]] = field(default_factory=dict)
     flat_steps: int | None = None
     episodes: int = 50
@@ -86,7 +88,10 @@ class Suite:
 
     def hierarchy(self, task: Task, skills: Policies | None) -> Hierarchy:
         """The hierarchy for a task: without ``skills`` it learns them, too."""
-        found = self.source(task) if skills is None else self.further(task, skills)
+        return self.fitted(self.source(task) if skills is None else self.further(task, skills))
+
+    def fitted(self, found: Hierarchy) -> Hierarchy:
+        """A hierarchy with the suite's budgets."""
         found.scale(self.scale)
         found.env = replace(found.spec, workers=1)  # runs go side by side
         return found

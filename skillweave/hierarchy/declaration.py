@@ -174,7 +174,7 @@ class Declaration(Nestable):
         return len(self.skills) * len(lengths)
 
     def chooses_from(self, path: str, actions: gym.Space[Any]) -> gym.Space[Any]:
-        """What a selector or skill at this ``path`` chooses from; ``actions``: the environment's."""
+        """What a selector or skill at ``path`` chooses from; ``actions``: the environment's."""
         node, _, name = path.rpartition("/")
         if name != SELECTOR:
             return actions

@@ -123,7 +123,7 @@ class HierarchyPolicy:
         return memory["skill"]
 
     def acts(self, memory: Memory, row: int = 0) -> str:
-        """By the ``memory``, the path of the skill that acts in environment ``row``: ``inner/skill``."""
+        """By the ``memory``, the path of who acts in environment ``row``: ``inner/skill``."""
         i = int(memory["skill"][row])
         name, policy = self.labels[i], self.skills.policies[i]
         if not isinstance(policy, HierarchyPolicy):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -16,23 +16,21 @@ HOLD = 5
 """Steps for which the block must be there."""
 TABLE = 0.425
 """Height of a block's middle that lies on the table, in metres."""
-LIFTED = 0.02
-"""Metres above the table from which on a block counts as lifted."""
 
 
 @dataclass(frozen=True)
 class Disturbances:
-    """How often something goes wrong, as chances in each step."""
+    """What goes wrong in an episode, each once, in a step that is drawn at its beginning."""
 
-    slip: float = 0.08
-    """The fingers of a gripper that has lifted the block open for a while."""
-    nudge: float = 0.08
-    """The block on the table is pushed."""
-    move: float = 0.02
-    """The goal moves to another place."""
+    nudge: int = 10
+    """The block is pushed in one of the first so many steps in which nobody holds it; 0: never."""
+    slip: int = 10
+    """The fingers open for a while in one of the first so many steps in which they hold it."""
+    move: int = 25
+    """The goal moves to another place in one of the first so many steps."""
 
 
-CALM = Disturbances(0.0, 0.0, 0.0)
+CALM = Disturbances(0, 0, 0)
 
 
 class Place(gym.Wrapper[Any, Any, Any, Any]):
@@ -52,12 +50,19 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self.disturbances = disturbances
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (28,), np.float32)
-        self.held = self.slipping = 0
+        self.there = self.slipping = 0
+        self.due: dict[str, int] = {}
+        self.holds = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin anew."""
         obs, info = self.env.reset(seed=seed, options=options)
-        self.held = self.slipping = 0
+        self.there = self.slipping = 0
+        windows = asdict(self.disturbances)
+        self.due = {
+            k: int(self.env.unwrapped.np_random.integers(n)) for k, n in windows.items() if n
+        }
+        self.holds = False
         return _flat(obs), info
 
     def step(self, action: Any) -> Any:
@@ -67,27 +72,39 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
             self.slipping -= 1
             action = np.append(action[:3], np.float32(1.0))
         obs, _, terminated, truncated, info = self.env.step(action)
+        self.holds = bool(is_held(obs["observation"]))
         distance = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"])
-        self.held = self.held + 1 if distance < NEAR else 0
-        placed = self.held >= HOLD
+        self.there = self.there + 1 if distance < NEAR else 0
+        placed = self.there >= HOLD
         info["success"] = placed
         return _flat(obs), float(placed), terminated or placed, truncated and not placed, info
 
     def _disturb(self) -> None:
         """Let this step's disturbances happen."""
-        world, chance = self.env.unwrapped, self.disturbances
-        if chance == CALM:
-            return
-        rng = self.env.unwrapped.np_random
-        slip, nudge, move = rng.random(3) < (chance.slip, chance.nudge, chance.move)
-        place = block_place(world)
-        lifted = place[2] > TABLE + LIFTED
-        if slip and lifted and not self.slipping:
+        world: Any = self.env.unwrapped
+        if self.holds and self._happens("slip"):
             self.slipping = self.slip_steps
-        if nudge and not lifted:
-            nudge_block(world, place, rng, self.push)
-        if move:
-            world.goal = world._sample_goal()  # type: ignore[attr-defined]
+        if not self.holds and self._happens("nudge"):
+            nudge_block(world, block_place(world), world.np_random, self.push)
+        if self._happens("move"):
+            world.goal = world._sample_goal()
+
+    def _happens(self, what: str) -> bool:
+        """Whether it is to happen in this step; a step nearer to it otherwise."""
+        if what not in self.due:
+            return False
+        self.due[what] -= 1
+        if self.due[what] >= 0:
+            return False
+        del self.due[what]
+        return True
+
+
+def is_held(obs: Array) -> Array:
+    """The block is between the fingers, and these are closed; (..., 25 or 28) to (...) bool."""
+    closed = obs[..., 9:11].sum(axis=-1) < 0.053
+    held: Array = closed & (np.abs(obs[..., 6:9]).max(axis=-1) < 0.03)
+    return held
 
 
 def block_place(world: Any) -> Array:

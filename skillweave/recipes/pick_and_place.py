@@ -18,7 +18,6 @@ Needs gymnasium-robotics: ``pip install 'skillweave[robotics]'``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ import numpy as np
 import skillweave as sw
 from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
 from skillweave.recipes._arm import CALM, Disturbances, spec
+from skillweave.recipes._arm import is_held as is_grasped
 
 GRIPPER, BLOCK, OFFSET = slice(0, 3), slice(3, 6), slice(6, 9)
 FINGERS, GOAL = slice(9, 11), slice(25, 28)
@@ -69,13 +69,6 @@ def is_around(obs: Array) -> Array:
     return around
 
 
-def is_grasped(obs: Array) -> Array:
-    """The block is between the fingers, and these are closed, (N,) bool."""
-    closed = obs[:, FINGERS].sum(axis=1) < 0.053
-    grasped: Array = closed & (np.abs(obs[:, OFFSET]).max(axis=1) < 0.03)
-    return grasped
-
-
 def rule(obs: Array) -> Array:
     """What an engineer would write: which skill, (N,) by name."""
     free = np.where(is_around(obs), "close", np.where(is_above(obs), "descend", "above"))
@@ -83,27 +76,78 @@ def rule(obs: Array) -> Array:
 
 
 class Above(Skill):
-    """Go above the block."""
+    """Go above the block, until it is there."""
 
     policy = above
 
+    def initiation(self, obs: Array) -> Array:
+        """Where the block is not grasped."""
+        return ~is_grasped(obs)
+
+    def termination(self, step: Step) -> Array:
+        """It is above the block."""
+        return is_above(step.next_obs)
+
+    def success(self, step: Step) -> Array:
+        """It is above the block."""
+        return is_above(step.next_obs)
+
 
 class Descend(Skill):
-    """Go down around the block."""
+    """Go down around the block, until it is there or no longer above it."""
 
     policy = descend
 
+    def initiation(self, obs: Array) -> Array:
+        """Above the block, which is not grasped."""
+        return is_above(obs) & ~is_grasped(obs)
+
+    def termination(self, step: Step) -> Array:
+        """The block is between the fingers, or elsewhere."""
+        return is_around(step.next_obs) | ~is_above(step.next_obs)
+
+    def success(self, step: Step) -> Array:
+        """The block is between the fingers."""
+        return is_around(step.next_obs)
+
 
 class Close(Skill):
-    """Close the fingers."""
+    """Close the fingers, until they hold the block."""
 
     policy = close
 
+    def initiation(self, obs: Array) -> Array:
+        """Around the block."""
+        return is_around(obs) | is_grasped(obs)
+
+    def termination(self, step: Step) -> Array:
+        """They hold it."""
+        return is_grasped(step.next_obs)
+
+    def success(self, step: Step) -> Array:
+        """They hold it."""
+        return is_grasped(step.next_obs)
+
 
 class Carry(Skill):
-    """Bring what is between the fingers to the goal."""
+    """Bring what is between the fingers to the goal, until it is lost."""
 
     policy = carry
+
+    def initiation(self, obs: Array) -> Array:
+        """Where the block is grasped."""
+        return is_grasped(obs)
+
+    def termination(self, step: Step) -> Array:
+        """It is lost."""
+        return ~is_grasped(step.next_obs)
+
+
+class Anywhere(Skill):
+    """One of the four functions for those who choose by hand: it may start anywhere."""
+
+    def __init__(self, name: str, policy: Any) -> None:
+        self.name, self.policy = name, policy
 
 
 class Recover(Skill):
@@ -164,31 +208,38 @@ LEARNER = PPO(
 )
 SELECTOR = PPO(
     num_envs=16,
-    n_steps=256,
-    batch_size=128,
+    n_steps=128,
+    batch_size=64,
     update_epochs=8,
     gamma=0.98,
     gae_lambda=0.95,
     network=RELU,
 )
-BY_HAND = (Above, Descend, Close, Carry)
+FUNCTIONS = {"above": above, "descend": descend, "close": close, "carry": carry}
 
 
 def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
     """The hierarchy whose selector is learnt; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
-        "call_steps": 5,
+        "call_steps": 10,
         "algorithm": LEARNER,
         "selector": SELECTOR,
-        "skill_steps": 60_000,
-        "selector_steps": 140_000,
+        "skill_steps": 20_000,
+        "selector_steps": 60_000,
     } | how
-    return Hierarchy(spec(disturbances), [*(s() for s in BY_HAND), Recover()], **settings)
+    skills = [Above(), Descend(), Close(), Carry(), Recover()]
+    return Hierarchy(spec(disturbances), skills, **settings)
+
+
+def anchored(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
+    """The same; while the selector learns, it is kept near the behaviour tree."""
+    near = {"guide": behaviour_tree, "guide_restricts": False, "guide_nats": 0.1}
+    return declare(disturbances, **near | how)
 
 
 def by_hand(selector: Any, disturbances: Disturbances = CALM, call_steps: int = 1) -> Hierarchy:
-    """The four skills under ``rule``, ``script`` or ``behaviour_tree``: nothing is learnt."""
-    skills: Sequence[Skill] = [s() for s in BY_HAND]
+    """The four functions under ``rule``, ``script`` or ``behaviour_tree``: nothing is learnt."""
+    skills = [Anywhere(name, function) for name, function in FUNCTIONS.items()]
     return Hierarchy(spec(disturbances), skills, selector=selector, call_steps=call_steps)
 
 

@@ -7,7 +7,8 @@ step costs 0.1·‖action‖². Their scores are returns divided by 1,000, and s
 
 Observations: x as seen from the point that is run to, so that skills serve other points, too; z and
 the angles (1 to 8), velocities (9 to 17), the leg of the patrol that
-is run now, one-hot (18 to 20; the paper's task has two legs, so the last number is always 0).
+is run now, one-hot (18 to 20; the paper's task has two legs, so the last number is always 0). The
+selector sees all of it, skills all but the leg.
 
     skillweave train shuttle
 
@@ -21,104 +22,27 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from skillweave import (
     PPO,
     Array,
     Automaton,
-    EnvSpec,
     Hierarchy,
     Network,
     Skill,
-    SkillweaveError,
     Step,
     Together,
+    register_encoder,
 )
+from skillweave.recipes._cheetah import LEG, SPEED, spec
 
 UNIT = 1000.0
 """A score is a return divided by this: the mean reward of a step."""
-ROUND = 1000.0
-"""What a finished round pays."""
-LEGS = 3
-"""The most points that a patrol has."""
 ARRIVAL, HASTE = 300.0, 40.0
 """What the end of a leg is worth to a skill, and what is taken off for each metre a second at which
 it is passed. A call ends there, and its value: who were not paid for it would rather not arrive.
 Who passes a point at full speed runs on for four metres more."""
-X, SPEED, LEG = 0, 9, slice(18, 21)
-
-
-class Patrol(gym.Wrapper[Any, Any, Any, Any]):
-    """Visits points in their order, over and over.
-
-    A point is visited when it is passed, in the direction in which it lies from the point before.
-
-    Args:
-        env: a half-cheetah whose observations begin with x.
-        points: two or three, in metres; each differs from the one before.
-
-    Raises:
-        SkillweaveError: there are too few or too many points, or one is followed by itself.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], points: tuple[float, ...] = (2.0, -2.0)) -> None:
-        super().__init__(env)
-        ways = np.sign(np.subtract(points, np.roll(points, 1)))
-        if not 2 <= len(points) <= LEGS or not ways.all():
-            raise SkillweaveError(
-                f"a patrol has 2 to {LEGS} points, each other than the one before, not {points}"
-            )
-        self.points, self.ways = points, ways
-        size = env.observation_space.shape[0] + LEGS  # type: ignore[index]
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.leg = 0
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin with the first point."""
-        obs, info = self.env.reset(seed=seed, options=options)
-        self.leg = 0
-        return self._with_leg(obs), info
-
-    def step(self, action: Any) -> Any:
-        """The automaton's reward: 1000 where a round is finished, else what the action costs."""
-        obs, _, terminated, truncated, info = self.env.step(action)
-        reward = float(info["reward_ctrl"])
-        if self.ways[self.leg] * (info["x_position"] - self.points[self.leg]) > 0:
-            self.leg = (self.leg + 1) % len(self.points)
-            reward = reward if self.leg else ROUND
-        return self._with_leg(obs), reward, terminated, truncated, info
-
-    def _with_leg(self, obs: Any) -> Array:
-        found = np.zeros(len(obs) + LEGS, np.float32)
-        found[: len(obs)] = obs
-        found[X] -= self.points[self.leg]
-        found[len(obs) + self.leg] = 1.0
-        return found
-
-
-def make(
-    points: tuple[float, ...] = (2.0, -2.0), render_mode: str | None = None
-) -> gym.Env[Any, Any]:
-    """The half-cheetah with this patrol.
-
-    Raises:
-        SkillweaveError: mujoco is missing.
-    """
-    try:
-        import mujoco  # noqa: F401
-    except ImportError as error:
-        raise SkillweaveError(
-            "the half-cheetah needs the extra 'mujoco': pip install 'skillweave[mujoco]'"
-        ) from error
-    cheetah = gym.make(
-        "HalfCheetah-v5",
-        exclude_current_positions_from_observation=False,
-        render_mode=render_mode,
-        disable_env_checker=True,
-    )
-    return Patrol(cheetah, points)
 
 
 def moved(step: Step) -> Array:
@@ -178,6 +102,28 @@ class Stop(Skill):
         return -np.abs(moved(step)) - effort(step)
 
 
+class Body:
+    """An encoder without parameters: all but the leg of the patrol.
+
+    Skills see no more than that, so that they serve patrols whose legs are others: with the leg,
+    ``backward`` knows only legs in which the source task runs backwards.
+    """
+
+    size: int = LEG.start
+
+    def __init__(self, obs: Any) -> None:
+        self.shapes: dict[str, tuple[int, ...]] = {}
+
+    def init_(self, views: Any, generators: Any) -> None:
+        """There is nothing to fill."""
+
+    def __call__(self, views: Any, inputs: Mapping[str, Any]) -> Any:
+        """(P, B, O) to (P, B, size)."""
+        return inputs["vector"][..., : self.size]
+
+
+register_encoder("half-cheetah's body", Body)
+
 RELU = Network(hidden=(64, 64), activation="relu")  # tanh costs more than all the rest of it
 RUNNER = PPO(
     num_envs=64,
@@ -188,23 +134,28 @@ RUNNER = PPO(
     gamma=0.98,
     gae_lambda=0.92,
     ent_coef=0.0,
-    network=RELU,
+    network=replace(RELU, encoder="half-cheetah's body"),
 )
 SELECTOR = PPO(num_envs=64, n_steps=64, batch_size=128, gamma=0.995, gae_lambda=0.95, network=RELU)
 
 # At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort
-# costs, and would stand still; and skills learn to turn where others have run.
-FLOOR = Together(floor=0.95, floor_final=0.0)
+# costs, and would stand still; and skills learn to turn where others have run. In the end a few
+# are, so that skills keep knowing how to begin elsewhere than where the task asks for them.
+FLOOR = Together(floor=0.95, floor_final=0.05)
 
-
-def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
-    """The half-cheetah with a patrol of these points, for ``Hierarchy(env=...)``."""
-
-    def cheetah(render_mode: str | None = None) -> gym.Env[Any, Any]:
-        return make(points, render_mode)
-
-    cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)})"
-    return EnvSpec(cheetah)
+FURTHER_CALL_STEPS = 100
+"""Skills that are there already end by themselves where a leg is done. By lot, calls of 40 steps
+hardly ever run eight metres the same way; these do half of the time."""
+FURTHER_SELECTOR = replace(
+    SELECTOR,
+    num_envs=16,
+    n_steps=512,
+    batch_size=64,
+    update_epochs=10,
+    floor=0.5,
+    floor_final=0.0,
+)
+"""Fewer environments: a rollout holds about seven calls of each, one after another."""
 
 
 def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
@@ -222,8 +173,12 @@ def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
 
 def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """The hierarchy on a patrol with skills that are there already, by name."""
-    selector = replace(SELECTOR, floor=FLOOR.floor, floor_final=FLOOR.floor_final)
-    found = declare(points, **{"learn": "apart", "selector": selector} | how)
+    settings = {
+        "learn": "apart",
+        "selector": FURTHER_SELECTOR,
+        "call_steps": FURTHER_CALL_STEPS,
+    } | how
+    found = declare(points, **settings)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found

@@ -74,6 +74,12 @@ def further(task, skills):
     return found
 
 
+def long_calls(task, skills):
+    found = further(task, skills)
+    found.call_steps = 4
+    return found
+
+
 def to_the_right(task, skills):
     found = declare(task, selector=lambda obs: np.zeros(len(obs), np.int64))
     for skill in found.skills:
@@ -92,6 +98,7 @@ def suite():
         flat=TINY,
         weights=({"right": 1.0, "left": 1.0}, {"right": 1.0, "left": 0.0}),
         cells=lambda obs: obs.astype(int),
+        variants={"long-calls": long_calls},
         fixed={"always-right": to_the_right},
         episodes=4,
     )
@@ -114,7 +121,12 @@ def test_every_agent_has_a_result_on_every_task(done):
     by_agent = Counter(r.agent for r in found)
     assert set(by_agent.values()) == {2}
     expected = {"hierarchy", "F0-flat", "F1-skill-rewards", "F2-bonus", "F3-fine-tuned"}
-    assert set(by_agent) == expected | {"F4-random-skills", "F4-best-skill", "always-right"}
+    assert set(by_agent) == expected | {
+        "F4-random-skills",
+        "F4-best-skill",
+        "always-right",
+        "long-calls",
+    }
     assert all(len(r.scores) == 4 and np.mean(r.scores) == r.score for r in found)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -125,9 +126,9 @@ def disturbed():
     pytest.importorskip("mujoco")
     pytest.importorskip("gymnasium_robotics")
 
-    def make(**chances):
-        none = {"slip": 0.0, "nudge": 0.0, "move": 0.0}
-        env = world.make(world.Disturbances(**none | chances))
+    def make(**within):
+        none = {"slip": 0, "nudge": 0, "move": 0}
+        env = world.make(world.Disturbances(**none | within))
         return env, env.reset(seed=1)[0]
 
     return make
@@ -137,11 +138,9 @@ STILL = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
 
 
 def test_a_nudge_moves_the_block_some_centimetres_and_leaves_it_on_the_table(disturbed):
-    env, obs = disturbed(nudge=1.0)
+    env, obs = disturbed(nudge=1)
     before = obs[arm.BLOCK]
-    obs, *_ = env.step(STILL)
-    env.disturbances = world.CALM  # once is enough
-    for _ in range(10):
+    for _ in range(11):  # it happens in the first step, and no more
         obs, *_ = env.step(STILL)
     moved = np.linalg.norm(obs[arm.BLOCK][:2] - before[:2])
     assert 0.03 < moved < 0.15
@@ -149,22 +148,85 @@ def test_a_nudge_moves_the_block_some_centimetres_and_leaves_it_on_the_table(dis
 
 
 def test_a_goal_that_moves_is_elsewhere_in_the_observation(disturbed):
-    env, obs = disturbed(move=1.0)
+    env, obs = disturbed(move=1)
     after, *_ = env.step(STILL)
     assert np.linalg.norm(after[arm.GOAL] - obs[arm.GOAL]) > 0.01
 
 
-def test_a_gripper_that_slips_drops_the_block(disturbed):
-    env, obs = disturbed()
-    for _ in range(40):  # the rule lifts it
+def test_a_goal_moves_once_in_one_of_the_steps_that_are_named(disturbed):
+    env, _ = disturbed(move=4)
+    moves = []
+    for _ in range(12):
+        env.reset()
+        goals = [env.step(STILL)[0][arm.GOAL] for _ in range(8)]
+        changes = [i + 1 for i in range(7) if (goals[i] != goals[i + 1]).any()]
+        assert len(changes) <= 1  # none: it was in the first step
+        moves += changes or [0]
+    assert set(moves) <= {0, 1, 2, 3}
+    assert len(set(moves)) > 1
+
+
+def test_a_gripper_slips_once_after_it_has_taken_hold_and_drops_the_block(disturbed):
+    env, obs = disturbed(slip=1)
+    held, slips = [], []
+    for _ in range(60):  # the rule lifts it, and again
         name = str(arm.rule(obs[None])[0])
-        obs = env.step(getattr(arm, name)(obs[None])[0])[0]
-        if obs[arm.BLOCK][2] > world.TABLE + 0.05:
+        obs, _, placed, *_ = env.step(getattr(arm, name)(obs[None])[0])
+        held.append(env.holds)
+        slips.append(env.slipping)
+        if placed:
             break
-    assert obs[arm.BLOCK][2] > world.TABLE + 0.05
-    env.disturbances = world.Disturbances(slip=1.0, nudge=0.0, move=0.0)
-    obs, *_ = env.step(arm.close(obs[None])[0])
-    assert env.slipping == env.slip_steps - 1
-    for _ in range(6):
-        obs, *_ = env.step(arm.close(obs[None])[0])
-    assert obs[arm.BLOCK][2] < world.TABLE + 0.03
+    first = held.index(True)
+    assert not any(slips[: first + 1])
+    # Five steps, the first of which is made when the counter stands at four.
+    assert [s for s in slips if s] == [4, 3, 2, 1]
+    assert slips[first + 1] == 4
+    assert not all(held[first:])
+    assert placed
+
+
+def test_skills_may_start_where_they_make_sense():
+    far, over = observation(offset=(0.1, 0.0, -0.1)), observation(offset=(0.01, 0.0, -0.1))
+    around = observation(offset=(0.01, 0.0, -0.01))
+    held = observation(offset=(0.01, 0.0, -0.01), fingers=0.05)
+    skills = arm.hierarchy.skills
+    assert [s.name for s in skills] == ["above", "descend", "close", "carry", "recover"]
+    allowed = [[bool(s.initiation(o)[0]) for s in skills] for o in (far, over, around, held)]
+    assert allowed == [
+        [True, False, False, False, True],
+        [True, True, False, False, True],
+        [True, True, True, False, True],
+        [False, False, True, True, False],
+    ]
+
+
+def test_calls_end_where_there_is_nothing_left_to_do():
+    far, over = observation(offset=(0.1, 0.0, -0.1)), observation(offset=(0.01, 0.0, -0.1))
+    around = observation(offset=(0.01, 0.0, -0.01))
+    held = observation(offset=(0.01, 0.0, -0.01), fingers=0.05)
+    no, one = np.zeros(1, bool), np.ones(1, np.int64)
+
+    def ends(skill, after):
+        step = Step(far, np.zeros((1, 4)), after, np.zeros(1), no, no, no, one, {})
+        return bool(skill.termination(step)[0]), bool(skill.success(step)[0])
+
+    above, descend, close, carry, _ = arm.hierarchy.skills
+    assert [ends(above, o) for o in (far, over)] == [(False, False), (True, True)]
+    after = [ends(descend, o) for o in (far, over, around)]
+    assert after == [(True, False), (False, False), (True, True)]
+    assert [ends(close, o) for o in (around, held)] == [(False, False), (True, True)]
+    assert [ends(carry, o) for o in (held, around)] == [(False, False), (True, False)]
+
+
+@pytest.mark.parametrize("declare", [arm.declare, arm.anchored])
+def test_a_selector_is_learnt_over_skills_with_and_without_the_tree_beside_it(declare, tmp_path):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("gymnasium_robotics")
+    small = replace(arm.SELECTOR, num_envs=2, n_steps=64, update_epochs=1)
+    found = declare(world.Disturbances(), selector=small, selector_steps=256)
+    found.env = replace(found.spec, workers=1)
+    found.skill("recover").policy = arm.above
+    run = found.train(tmp_path / "run", quiet=True)
+    assert ("guide" in run.info()) == (declare is arm.anchored)
+    usage = run.evaluate(2).to_json()["skill_usage"]
+    assert sum(usage.values()) == pytest.approx(1.0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from skillweave import SkillweaveError, Step
+from skillweave.recipes import _cheetah as cheetah
 from skillweave.recipes import shuttle
 
 COST = -0.25
@@ -38,16 +39,16 @@ class Runner(gym.Env):
 
 def run(points, places):
     """Rewards, and the leg after each step."""
-    env = shuttle.Patrol(Runner(places), points)
+    env = cheetah.Patrol(Runner(places), points)
     obs, _ = env.reset()
     assert obs.shape == (21,)
-    assert obs[shuttle.LEG].tolist() == [1.0, 0.0, 0.0]
+    assert obs[cheetah.LEG].tolist() == [1.0, 0.0, 0.0]
     rewards, legs = [], []
     for _ in places:
         obs, reward, *_ = env.step(np.zeros(6))
         rewards.append(reward)
-        legs.append(int(obs[shuttle.LEG].argmax()))
-        assert obs[shuttle.LEG].sum() == 1.0
+        legs.append(int(obs[cheetah.LEG].argmax()))
+        assert obs[cheetah.LEG].sum() == 1.0
     return rewards, legs
 
 
@@ -78,7 +79,7 @@ def test_one_step_passes_one_point_at_most():
 @pytest.mark.parametrize("points", [(2.0,), (1.0, 1.0), (1.0, 2.0, 3.0, 4.0), (1.0, 2.0, 2.0)])
 def test_points_that_make_no_patrol_are_refused(points):
     with pytest.raises(SkillweaveError, match="a patrol has 2 to 3 points"):
-        shuttle.Patrol(Runner([]), points)
+        cheetah.Patrol(Runner([]), points)
 
 
 def step_of(x, next_x, leg, next_leg, action=0.5):
@@ -112,21 +113,85 @@ def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypat
 
 def test_the_half_cheetah_itself_has_the_papers_observations_rewards_and_length():
     pytest.importorskip("mujoco")
-    env = shuttle.spec().make()
+    env = cheetah.spec().make()
     obs, _ = env.reset(seed=3)
     assert obs.shape == (21,)
     action = np.full(6, 0.5, np.float32)
     for i in range(1, 1001):
         obs, reward, terminated, truncated, info = env.step(action)
-        point = (2.0, -2.0)[int(obs[shuttle.LEG].argmax())]
-        assert obs[shuttle.X] == pytest.approx(info["x_position"] - point, abs=1e-5)
+        point = (2.0, -2.0)[int(obs[cheetah.LEG].argmax())]
+        assert obs[cheetah.X] == pytest.approx(info["x_position"] - point, abs=1e-5)
         assert (truncated, terminated) == (i == 1000, False)
         if reward < 500:
             assert reward == pytest.approx(-0.15)  # 0.1·6·0.5²
 
 
 def test_x_is_seen_from_the_point_that_is_run_to():
-    env = shuttle.Patrol(Runner([1.0, 3.0, -1.0]), (2.0, -2.0))
+    env = cheetah.Patrol(Runner([1.0, 3.0, -1.0]), (2.0, -2.0))
     seen = [env.reset()[0], *(env.step(np.zeros(6))[0] for _ in range(3))]
     # 2 is run to from 0 and 1; from 3 and −1 it is −2.
-    assert [float(obs[shuttle.X]) for obs in seen] == [-2.0, -1.0, 5.0, 1.0]
+    assert [float(obs[cheetah.X]) for obs in seen] == [-2.0, -1.0, 5.0, 1.0]
+
+
+class Runners:
+    """Two ``Runner`` side by side, as a pool."""
+
+    observation_space, action_space = Runner.observation_space, Runner.action_space
+
+    def __init__(self, *places):
+        self.envs = [Runner(p) for p in places]
+
+    def reset(self, ids):
+        return np.stack([self.envs[i].reset()[0] for i in ids]), {}
+
+    def step(self, action, ids):
+        told = [self.envs[i].step(a) for i, a in zip(ids, action, strict=True)]
+        obs, reward, terminated, truncated, infos = zip(*told, strict=True)
+        info = {k: np.array([i[k] for i in infos]) for k in infos[0]}
+        return np.stack(obs), *map(np.array, (reward, terminated, truncated)), info
+
+
+def test_a_pool_of_patrols_sees_and_pays_as_each_patrol_alone():
+    points, places = (2.0, 6.0, -2.0), ([3.0, 7.0, -3.0, 3.0], [1.0, 3.0, 5.0, 7.0])
+    pool = cheetah.Patrols(Runners(*places), 2, points)
+    alone = [cheetah.Patrol(Runner(p), points) for p in places]
+    seen = pool.reset(np.arange(2))[0]
+    np.testing.assert_array_equal(seen, [env.reset()[0] for env in alone])
+    # The second environment stands still while the first does two steps, and begins anew.
+    for ids in ([0], [0], [0, 1], [1], [0, 1]):
+        obs, reward, _, truncated, _ = pool.step(np.zeros((len(ids), 6)), np.array(ids))
+        for row, i in enumerate(ids):
+            one = alone[i].step(np.zeros(6))
+            np.testing.assert_array_equal(obs[row], one[0])
+            assert (reward[row], truncated[row]) == (one[1], one[3])
+    np.testing.assert_array_equal(pool.reset(np.array([0]))[0], [alone[0].reset()[0]])
+    again = pool.step(np.zeros((2, 6)), np.arange(2))[0]
+    np.testing.assert_array_equal(again, [env.step(np.zeros(6))[0] for env in alone])
+
+
+def test_envpools_half_cheetah_moves_as_gymnasiums():
+    pytest.importorskip("mujoco")
+    pytest.importorskip("envpool")
+    points = (0.02, -0.02)  # so near that legs are done
+    pool, env, one = cheetah.many(2, 1, 3, points), cheetah.make(points), np.array([1], np.int32)
+    pool.reset(np.arange(2, dtype=np.int32))
+    env.reset()
+    state = pool.pool.step(np.zeros((1, 6), np.float32), one)[0][0]  # in 64 bits, one step later
+    env.unwrapped.set_state(state[:9], state[9:18])
+    rng, legs = np.random.default_rng(0), set()
+    for _ in range(60):
+        action = rng.uniform(-1, 1, 6).astype(np.float32)
+        obs, reward, *_ = pool.step(action[None], one)
+        ours = env.step(action)
+        np.testing.assert_allclose(obs[0], ours[0], atol=1e-5)
+        assert reward[0] == pytest.approx(ours[1], abs=1e-5)
+        legs.add(int(obs[0][cheetah.LEG].argmax()))
+    assert legs == {0, 1}
+
+
+def test_skills_see_all_but_the_leg():
+    torch = pytest.importorskip("torch")
+    vector = torch.arange(42.0).reshape(1, 2, 21)
+    assert torch.equal(shuttle.Body(None)({}, {"vector": vector}), vector[..., :18])
+    assert shuttle.RUNNER.network.encoder
+    assert not shuttle.SELECTOR.network.encoder

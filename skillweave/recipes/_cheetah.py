@@ -1,0 +1,150 @@
+"""The half-cheetah of the recipe ``shuttle``: its task, alone and in EnvPool."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
+
+ROUND = 1000.0
+"""What a finished round pays."""
+LEGS = 3
+"""The most points that a patrol has."""
+WITH_X: Any = {"exclude_current_positions_from_observation": False}
+X, SPEED, LEG = 0, 9, slice(18, 21)
+
+
+class Route:
+    """The points of a patrol, in their order, over and over; what is seen of them, what they pay.
+
+    A point is visited when it is passed, in the direction in which it lies from the point before.
+
+    Args:
+        points: two or three, in metres; each differs from the one before.
+
+    Raises:
+        SkillweaveError: there are too few or too many points, or one is followed by itself.
+    """
+
+    def __init__(self, points: tuple[float, ...]) -> None:
+        self.points = np.array(points)
+        self.ways = np.sign(np.subtract(points, np.roll(points, 1)))
+        if not 2 <= len(points) <= LEGS or not self.ways.all():
+            raise SkillweaveError(
+                f"a patrol has 2 to {LEGS} points, each other than the one before, not {points}"
+            )
+
+    def walk(self, leg: Array, x: Array, cost: Array) -> tuple[Array, Array]:
+        """The legs (k,) after steps that have led to ``x``, and what they pay: the automaton's
+        reward, 1000 where a round is finished, else what the action costs."""
+        passed = self.ways[leg] * (x - self.points[leg]) > 0
+        after = np.where(passed, (leg + 1) % len(self.points), leg)
+        return after, np.where(passed & (after == 0), ROUND, cost)
+
+    def see(self, obs: Array, leg: Array) -> Array:
+        """Observations (k, O) whose first number is x, with the legs (k,)."""
+        found = np.zeros((len(obs), obs.shape[1] + LEGS), np.float32)
+        found[:, : obs.shape[1]] = obs
+        found[:, X] -= self.points[leg]
+        found[np.arange(len(obs)), obs.shape[1] + leg] = 1.0
+        return found
+
+    @staticmethod
+    def space(before: Any) -> gym.spaces.Box:
+        """Of what is seen."""
+        return gym.spaces.Box(-np.inf, np.inf, (before.shape[0] + LEGS,), np.float32)
+
+
+class Patrol(gym.Wrapper[Any, Any, Any, Any]):
+    """A half-cheetah on a route.
+
+    Args:
+        env: its observations begin with x.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], points: tuple[float, ...] = (2.0, -2.0)) -> None:
+        super().__init__(env)
+        self.route, self.leg = Route(points), np.zeros(1, np.int64)
+        self.observation_space = self.route.space(env.observation_space)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin with the first point."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.leg[:] = 0
+        return self.route.see(obs[None], self.leg)[0], info
+
+    def step(self, action: Any) -> Any:
+        """As the route pays."""
+        obs, _, terminated, truncated, info = self.env.step(action)
+        x, cost = np.array([info["x_position"]]), np.array([info["reward_ctrl"]])
+        self.leg, reward = self.route.walk(self.leg, x, cost)
+        seen = self.route.see(obs[None], self.leg)[0]
+        return seen, float(reward[0]), terminated, truncated, info
+
+
+class Patrols(PoolWrapper):
+    """A pool of half-cheetahs on a route, as ``Patrol`` has one."""
+
+    def __init__(self, pool: Any, num_envs: int, points: tuple[float, ...]) -> None:
+        self.route, self.leg = Route(points), np.zeros(num_envs, np.int64)
+        super().__init__(pool, self.route.space(pool.observation_space))
+        self.action_space = gym.spaces.Box(-1.0, 1.0, pool.action_space.shape, np.float32)
+
+    def see(self, obs: Any, ids: Array) -> Array:
+        """With the legs."""
+        return self.route.see(obs, self.leg[ids])
+
+    def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
+        """Begin with the first point."""
+        self.leg[ids] = 0
+        return super().reset(ids)
+
+    def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """As the route pays."""
+        obs, _, terminated, truncated, info = self.pool.step(action, ids)
+        legs = self.route.walk(self.leg[ids], info["x_position"], info["reward_ctrl"])
+        self.leg[ids], reward = legs
+        return self.see(obs, ids), reward, terminated, truncated, info
+
+
+def make(
+    points: tuple[float, ...] = (2.0, -2.0), render_mode: str | None = None
+) -> gym.Env[Any, Any]:
+    """The half-cheetah with this patrol.
+
+    Raises:
+        SkillweaveError: mujoco is missing.
+    """
+    try:
+        import mujoco  # noqa: F401
+    except ImportError as error:
+        raise SkillweaveError(
+            "the half-cheetah needs the extra 'mujoco': pip install 'skillweave[mujoco]'"
+        ) from error
+    cheetah = gym.make(
+        "HalfCheetah-v5",
+        **WITH_X,
+        render_mode=render_mode,
+        disable_env_checker=True,
+    )
+    return Patrol(cheetah, points)
+
+
+def many(num_envs: int, threads: int, seed: int, points: tuple[float, ...]) -> Patrols:
+    """The same in EnvPool, several times as fast; bit for bit the same dynamics."""
+    cheetahs = envpool("HalfCheetah-v5", num_envs, threads, seed, **WITH_X)
+    return Patrols(cheetahs, num_envs, points)
+
+
+def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
+    """The half-cheetah with a patrol of these points, for ``Hierarchy(env=...)``."""
+
+    def cheetah(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return make(points, render_mode)
+
+    cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)})"
+    return EnvSpec(cheetah, pool=partial(many, points=points))
