@@ -127,7 +127,7 @@ class Declaration(Nestable):
             )
         if not isinstance(self.together, Together):
             raise SkillweaveError(
-                f"together is {short(self.together)}; write together=Together(floor=0.3)"
+                f"together is {short(self.together)}; write together=Together(task_weight=1.0)"
             )
 
     @property

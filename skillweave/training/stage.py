@@ -89,9 +89,9 @@ class Together:
         SkillweaveError: a value is out of its range.
     """
 
-    floor: float = 0.3
+    floor: float = 1.0
     """The least share of calls that are drawn uniformly from those allowed, at the start."""
-    floor_final: float = 0.02
+    floor_final: float = 0.1
     """The same at the end of the budget, reached linearly."""
     task_weight: float = 0.0
     """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
