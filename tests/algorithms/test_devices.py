@@ -130,7 +130,7 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
     )  # fmt: skip
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         learner = RolloutLearner(Stack(algorithm, on_device(algorithm, mode)), Seeds(0))
-        keep_to_guide(learner, {"guide_nats": 0.1})
+        keep_to_guide(learner, 0.1)
         assert learner.anchor is not None
         batch = moved(batch, mode)
         batch.anchor = learner.anchor
