@@ -104,11 +104,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", seed=given.seed, quiet=True)
         started = time.perf_counter()
-        run.export(Path(folder) / "onnx")
+        export = run.export(Path(folder) / "onnx")
         exporting = time.perf_counter() - started
         from skillweave.export.runner import Runner
 
-        runner = Runner(Path(folder) / "onnx", hierarchy=hierarchy)
+        runner = Runner(export.path, export.functions)
         seen, times = observations(run, 2_000), []
         seconds(runner.act, runner.reset, seen)  # warm
         for _ in range(given.rounds):

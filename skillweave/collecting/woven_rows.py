@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -105,16 +106,24 @@ class Rows:
         """The row is full."""
         self._at += 1
 
+    @cached_property
+    def _shared(self) -> dict[str, Array | None]:
+        """What is the same for all leaves, once the rows are full."""
+        return {
+            "steps": np.ones(self._reward.shape, np.int64),
+            "obs_mask": stacked(self._masks),
+            "next_obs_mask": stacked(self._next_masks),
+        }
+
     def of_leaf(self, leaf: int) -> Experience:
         """What a leaf did."""
         memory = self._memory.get(leaf)
         return Experience(
-            obs=self._obs, action=self._action, reward=self._reward,
-            steps=np.ones(self._reward.shape, np.int64), terminated=self._terminated,
-            truncated=self._truncated, next_obs=self._next_obs, obs_mask=stacked(self._masks),
-            next_obs_mask=stacked(self._next_masks), valid=self._owner == leaf,
+            obs=self._obs, action=self._action, reward=self._reward, terminated=self._terminated,
+            truncated=self._truncated, next_obs=self._next_obs, valid=self._owner == leaf,
             head=self._heads.get(leaf), memory=memory,
             starts=None if memory is None else self._fresh, overridden=self._overridden,
+            **self._shared,  # type: ignore[arg-type]
         )  # fmt: skip
 
     def of_critic(self, path: str) -> Experience:

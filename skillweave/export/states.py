@@ -34,7 +34,7 @@ class States:
         self.files: dict[str, bytes] = {}
         self.code: dict[str, str] = {}
         """By name, what the runner must be given, and what it is."""
-        self._known: dict[str, Any] = {}
+        self.functions: dict[str, Any] = {}
 
     def policy(self, policy: Policy, name: str = "", sampled: bool = False) -> dict[str, Any]:
         """A policy, and all below it, as JSON.
@@ -176,7 +176,7 @@ class States:
     def _asks(self, name: str, function: Any, what: str) -> str:
         """The name under which the runner is given a function; of two functions, a number too."""
         names = [name, *(f"{name}#{i}" for i in range(2, 1000))]
-        free = next(n for n in names if self._known.get(n, function) == function)
-        self._known[free] = function
+        free = next(n for n in names if self.functions.get(n, function) == function)
+        self.functions[free] = function
         self.code[free] = what
         return free

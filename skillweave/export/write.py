@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ class Export:
     files: tuple[str, ...]  # their names in it
     code: dict[str, str]
     """Python code that the runner must be given, by name, and what it is."""
+    functions: dict[str, Callable[..., Any]]
+    """The same code itself, for a runner in this process: ``Runner(path, code=functions)``."""
 
     def __str__(self) -> str:
         said = f"{self.path}: {len(self.files)} files"
@@ -67,7 +70,7 @@ def write_export(path: Path, policy: Policy, env: str) -> Export:
     files = states.files | {"policy.json": text.encode(), "runner.py": runner}
     for name, content in files.items():
         write_bytes(path / name, content)
-    return Export(path, tuple(files), states.code)
+    return Export(path, tuple(files), states.code, states.functions)
 
 
 def _inputs(space: gym.Space[Any]) -> list[list[Any]]:

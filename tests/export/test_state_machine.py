@@ -184,26 +184,6 @@ POLICIES: dict[str, Any] = {
 }  # fmt: skip
 
 
-def code_of(policy: HierarchyPolicy, prefix: str = "") -> dict[str, Any]:
-    """All functions that a policy has, under the names of the export."""
-    found: dict[str, Any] = {}
-    for skill, own in zip(policy.skills.skills, policy.skills.policies, strict=True):
-        name = f"{prefix}{skill.name}"
-        for method in ("initiation", "termination", "success"):
-            found[f"{name}.{method}"] = getattr(skill, method)
-        found[f"{name}.policy"] = getattr(own, "function", None)
-        if isinstance(own, HierarchyPolicy):
-            found |= code_of(own, f"{name}/")
-    for reflex in policy.skills.reflexes:
-        found[f"{prefix}{reflex.name}.condition"] = reflex.condition
-        found[f"{prefix}{reflex.name}.action"] = reflex.action
-    found[f"{prefix}selector"] = getattr(policy.selector, "function", None)
-    found[f"{prefix}selector.far"] = found[f"{prefix}guide.far"] = far
-    guide = None if policy.guide is None else policy.guide.selector
-    found[f"{prefix}guide"] = getattr(guide, "function", None)
-    return found
-
-
 def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple[int, int, bool]]:
     """Whole episodes, in which both act alike; of each step the skill, the action, a decision."""
     env, player, told = LongWalk(), Player(policy), []
@@ -226,8 +206,7 @@ def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple
 def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
     policy = make()
     export = write_export(tmp_path, policy, "walk")
-    code = {k: v for k, v in code_of(policy).items() if k in export.code}
-    told = played(policy, Runner(tmp_path, code), 6)
+    told = played(policy, Runner(tmp_path, export.functions), 6)
     skills, actions, decisions = (set(x) for x in zip(*told, strict=True))
     assert len(skills) > 1  # so that choices are compared, and calls of several steps
     assert len(actions) > 1
@@ -237,7 +216,7 @@ def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
 def test_why_calls_are_interrupted_is_the_same(tmp_path: Path) -> None:
     policy = interrupted()
     export = write_export(tmp_path, policy, "walk")
-    runner = Runner(tmp_path, {k: v for k, v in code_of(policy).items() if k in export.code})
+    runner = Runner(tmp_path, export.functions)
     env, player, whys = LongWalk(), Player(policy), set()
     obs, info = env.reset(seed=1)
     for _ in range(29):
@@ -256,8 +235,8 @@ def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
     assert "'shy.condition': observations (1, ...) to (1,) bool" in str(export)
     with pytest.raises(ValueError, match=r"shy\.condition.*observations .* bool"):
         Runner(tmp_path)
-    given = {"careful.policy": lambda o: [1], "left.policy": lambda o: [0]}
-    assert Runner(tmp_path, given, policy.skills).root is not None  # has skills and reflexes
+    assert set(export.functions) == set(export.code)
+    assert Runner(tmp_path, export.functions).root is not None
 
 
 def test_two_functions_of_one_name_are_told_apart(tmp_path: Path) -> None:
