@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, got_key
-from test_resume import StopAt, Stopped, assert_same, new_run
-from test_together import ON, declare
+from small_runs import ON, StopAt, Stopped, assert_same, new_run
+from test_together import declare
 
 from skillweave import Automaton, SkillweaveError, Together
 from skillweave.collecting import skill_rows

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_resume import assert_same, new_run
-from test_together import Left, Other, Push, declare
+from small_runs import Left, Push, assert_same, new_run
+from test_together import Other, declare
 
 from skillweave import SkillweaveError
 from skillweave.hierarchy import training

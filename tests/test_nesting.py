@@ -7,18 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_resume import assert_same, lines, policies, stopped_run
+from small_runs import MEMORY, OFF, ON, Balance, Left, Push, Whole, lines, policies, stopped_run
 
 from skillweave import (
-    DQN,
-    PPO,
-    RNN,
     TD3,
     Automaton,
     EnvSpec,
     Hierarchy,
     Lengths,
-    Network,
     Reflex,
     Skill,
     SkillweaveError,
@@ -33,22 +29,7 @@ from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.play import SeededEpisodes, play
 
-SMALL = Network(hidden=(8,))
-ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
-OFF = DQN(
-    num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
-)
-MEMORY = PPO(num_envs=4, n_steps=16, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6)))
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
-
-
-class Left(Skill):
-    """Moves to the left."""
-
-    max_steps = 15
-
-    def reward(self, step):
-        return -step.next_obs[:, 0] + 0.1 * step.timed_out
 
 
 class Right(Skill):
@@ -56,25 +37,6 @@ class Right(Skill):
 
     def reward(self, step):
         return step.next_obs[:, 0]
-
-
-class Balance(Skill):
-    """Stays up, until it is far away."""
-
-    def initiation(self, obs):
-        return np.abs(obs[:, 2]) < 0.15
-
-    def termination(self, step):
-        return np.abs(step.next_obs[:, 0]) > 0.5
-
-
-class Push(Skill):
-    """Is ready."""
-
-    call_steps = 2
-
-    def policy(self, obs):
-        return (obs[:, 2] > 0).astype(np.int64)
 
 
 def options(**how):
@@ -178,16 +140,7 @@ def ready(obs):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """An uninterrupted run of each kind, made once."""
-    made = {}
-
-    def make(kind):
-        if kind not in made:
-            path = tmp_path_factory.mktemp("whole") / "run"
-            made[kind] = KINDS[kind]().train(path, seed=3, quiet=True), path
-        return made[kind]
-
-    return make
+    return Whole(KINDS, tmp_path_factory)
 
 
 LATER = [("apart", 12), ("apart", 22), ("then", 32), ("inside, then", 7), ("three", 8)]
@@ -195,21 +148,15 @@ LATER = [("apart", 12), ("apart", 22), ("then", 32), ("inside, then", 7), ("thre
 
 @pytest.mark.parametrize(("kind", "tick"), [*((k, t) for k in KINDS for t in (3, 5)), *LATER])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, tick):
-    run = stopped_run(KINDS[kind](), tmp_path / "run", tick)
-    assert not run.finished
-    KINDS[kind]().resume(run.path, quiet=True)
-    assert_same(run.path, whole(kind)[1])
+    whole.assert_resumes(kind, tick, tmp_path / "run")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
-    run, path = whole(kind)
-    found = run.evaluate(3)
-    assert KINDS[kind]().load(path).evaluate(3) == found
-    run.save_weights(tmp_path / "weights")
-    assert KINDS[kind]().load_weights(tmp_path / "weights").evaluate(3) == found
+    whole.assert_loads(kind, tmp_path / "weights")
+    run, _ = whole(kind)
     paths = [name for name, _ in every_skill(run.hierarchy.skills)]
-    assert list(found.skills) == paths
+    assert list(run.evaluate(3).skills) == paths
 
 
 @pytest.mark.parametrize("kind", ["together", "then", "off-policy", "three"])

@@ -15,6 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_runs import (
+    StopAt,
+    Stopped,
+    assert_metrics_fit,
+    assert_same,
+    lines,
+    new_run,
+    policies,
+    stopped_run,
+)
 from toys import ASKS, Echo
 
 from skillweave import DQN, SAC, TD3, Hierarchy, Network, recipes
@@ -24,7 +34,7 @@ from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.scene import Scene
-from skillweave.training.stage import Stage, assign_workers
+from skillweave.training.stage import Stage
 from skillweave.training.trainer import train_stage
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
@@ -68,92 +78,10 @@ hierarchy = Hierarchy(
 ENGINES = ["sync", "envpool"]
 
 
-class Stopped(Exception):
-    """What interrupts a run here."""
-
-
-class StopAt:
-    """A listener that raises at its n-th tick."""
-
-    def __init__(self, tick: int) -> None:
-        self.left = tick
-
-    def stage(self, name: str, budget: int) -> None:
-        pass
-
-    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        self.left -= 1
-        if self.left == 0:
-            raise Stopped
-
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        pass
-
-    def message(self, text: str) -> None:
-        pass
-
-
 def write_recipe(folder: Path, engine: str = "sync") -> Path:
     path = folder / f"{engine}.py"
     path.write_text(RECIPE.replace("ENGINE", engine))
     return path
-
-
-def policies(run: Path) -> dict[str, tuple[dict[str, Any], bytes]]:
-    """Header (as JSON, its keys in any order) and the tensors' bytes of every policy."""
-    found = {}
-    for path in sorted((run / "policies").iterdir()):
-        data = path.read_bytes()
-        size = int.from_bytes(data[:8], "little")
-        found[path.name] = (json.loads(data[8 : 8 + size]), data[8 + size :])
-    return found
-
-
-def lines(run: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-
-
-def assert_same(run: Path, reference: Path) -> None:
-    mine, theirs = policies(run), policies(reference)
-    assert mine.keys() == theirs.keys()
-    assert len(mine) >= 1
-    for name, (header, weights) in theirs.items():
-        assert mine[name][1] == weights, f"{name}: other weights"
-        assert mine[name][0] == header, f"{name}: another header"
-    assert_metrics_fit(run, reference)
-
-
-def assert_metrics_fit(run: Path, reference: Path) -> None:
-    """No line twice, none missing, updates and steps rising; all numbers but times the same."""
-    mine, theirs = lines(run), lines(reference)
-    keys = [(r["stage"], r["update"]) for r in mine]
-    assert len(set(keys)) == len(keys), "a line stands twice"
-    assert keys == [(r["stage"], r["update"]) for r in theirs]
-    for stage in {r["stage"] for r in mine}:
-        rows = [r for r in mine if r["stage"] == stage]
-        for field in ("update", "steps"):
-            values = [r[field] for r in rows]
-            assert values == sorted(set(values)), f"{field} of {stage} does not rise"
-    for a, b in zip(mine, theirs, strict=True):
-        assert {**a, "seconds": 0} == {**b, "seconds": 0}
-
-
-def new_run(hierarchy: Hierarchy, path: Path, **options: Any) -> RunDirectory:
-    """A new run of as many workers as the recipe says."""
-    content = training.manifest(hierarchy, **{"seed": 3, "flat": False} | options)
-    assign_workers(content["stages"], hierarchy.spec)
-    return RunDirectory.create(path, content | {"recipe": None})
-
-
-def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> RunDirectory:
-    """A new run that was interrupted by an exception at a tick."""
-    run = new_run(hierarchy, path, **options)
-    try:
-        with pytest.raises(Stopped):
-            training.train(hierarchy, run, (StopAt(tick),))
-    finally:
-        run.close()
-    return run
 
 
 Reference = Callable[[str], tuple[Path, Path]]

@@ -5,58 +5,32 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_resume import assert_same, lines, policies, stopped_run
+from small_runs import (
+    MEMORY,
+    OFF,
+    ON,
+    SMALL,
+    Balance,
+    Left,
+    Push,
+    Whole,
+    assert_same,
+    lines,
+    policies,
+)
 
 from skillweave import (
-    DQN,
-    PPO,
-    RNN,
     SAC,
     EnvSpec,
     Evolution,
     Hierarchy,
     Lengths,
     Mutations,
-    Network,
     Skill,
     SkillweaveError,
     Together,
 )
 from skillweave.runs.directory import RunDirectory
-
-SMALL = Network(hidden=(8,))
-ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
-OFF = DQN(
-    num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
-)
-
-
-class Left(Skill):
-    """Moves to the left."""
-
-    max_steps = 15
-
-    def reward(self, step):
-        return -step.next_obs[:, 0] + 0.1 * step.timed_out
-
-
-class Balance(Skill):
-    """Stays up, until it is far away."""
-
-    def initiation(self, obs):
-        return np.abs(obs[:, 2]) < 0.15
-
-    def termination(self, step):
-        return np.abs(step.next_obs[:, 0]) > 0.5
-
-
-class Push(Skill):
-    """Is ready."""
-
-    call_steps = 2
-
-    def policy(self, obs):
-        return (obs[:, 2] > 0).astype(np.int64)
 
 
 def declare(*skills, **how):
@@ -84,9 +58,7 @@ class Other(Balance):
 class Remembers(Left):
     """Learns with a memory."""
 
-    algorithm = PPO(
-        num_envs=4, n_steps=16, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6))
-    )
+    algorithm = MEMORY
 
 
 KINDS = {
@@ -107,34 +79,18 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """An uninterrupted run of each kind, made once."""
-    made = {}
-
-    def make(kind):
-        if kind not in made:
-            path = tmp_path_factory.mktemp("whole") / "run"
-            made[kind] = KINDS[kind]().train(path, seed=3, quiet=True), path
-        return made[kind]
-
-    return make
+    return Whole(KINDS, tmp_path_factory)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("tick", [2, 4, 5])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, tick):
-    run = stopped_run(KINDS[kind](), tmp_path / "run", tick)
-    assert not run.finished
-    KINDS[kind]().resume(run.path, quiet=True)
-    assert_same(run.path, whole(kind)[1])
+    whole.assert_resumes(kind, tick, tmp_path / "run")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
-    run, path = whole(kind)
-    scores = run.evaluate(3).returns
-    assert KINDS[kind]().load(path).evaluate(3).returns == scores
-    run.save_weights(tmp_path / "weights")
-    assert KINDS[kind]().load_weights(tmp_path / "weights").evaluate(3).returns == scores
+    whole.assert_loads(kind, tmp_path / "weights")
 
 
 def test_all_who_learn_change_and_all_who_are_ready_stay(whole):

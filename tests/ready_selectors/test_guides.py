@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from ready_selectors import chain
 from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, got_key, has_key
-from test_resume import assert_same, lines, stopped_run
-from test_together import SMALL
+from small_runs import OFF, ON, SMALL, Whole, lines
 
 from skillweave import (
-    DQN,
     PPO,
     Automaton,
     Evolution,
@@ -27,11 +25,6 @@ from skillweave import (
     tree,
 )
 from skillweave.runs.directory import RunDirectory
-
-ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
-OFF = DQN(
-    num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
-)
 
 
 class GetKey(Skill):
@@ -130,16 +123,7 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """An uninterrupted run of each kind, made once."""
-    made: dict[str, Any] = {}
-
-    def make(kind):
-        if kind not in made:
-            path = tmp_path_factory.mktemp("whole") / "run"
-            made[kind] = KINDS[kind]().train(path, seed=3, quiet=True), path
-        return made[kind]
-
-    return make
+    return Whole(KINDS, tmp_path_factory)
 
 
 STOPS = [(kind, tick) for kind in KINDS for tick in (3, 5, 22) if tick < 20 or "then" in kind]
@@ -147,20 +131,14 @@ STOPS = [(kind, tick) for kind in KINDS for tick in (3, 5, 22) if tick < 20 or "
 
 @pytest.mark.parametrize(("kind", "tick"), STOPS)
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, tick):
-    run = stopped_run(KINDS[kind](), tmp_path / "run", tick)
-    assert not run.finished
-    KINDS[kind]().resume(run.path, quiet=True)
-    assert_same(run.path, whole(kind)[1])
+    whole.assert_resumes(kind, tick, tmp_path / "run")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
-    run, path = whole(kind)
-    scores = run.evaluate(6)
-    assert KINDS[kind]().load(path).evaluate(6) == scores
-    run.save_weights(tmp_path / "weights")
-    assert KINDS[kind]().load_weights(tmp_path / "weights").evaluate(6) == scores
-    assert evaluate(run.policy, SPEC, episodes=6, num_envs=1) == scores
+    whole.assert_loads(kind, tmp_path / "weights")
+    run, _ = whole(kind)
+    assert evaluate(run.policy, SPEC, episodes=6, num_envs=1) == run.evaluate(6)
 
 
 def test_skills_learn_where_a_ready_selector_calls_them(whole):

@@ -1,0 +1,165 @@
+"""Small runs on CartPole, stopped and resumed: what several files of tests share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skillweave import DQN, PPO, RNN, Hierarchy, Network, Run, Skill
+from skillweave.hierarchy import training
+from skillweave.runs.directory import RunDirectory
+from skillweave.training.stage import assign_workers
+
+SMALL = Network(hidden=(8,))
+ON = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
+OFF = DQN(
+    num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, train_freq=4, network=SMALL
+)
+MEMORY = PPO(num_envs=4, n_steps=16, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6)))
+
+
+class Left(Skill):
+    """Moves to the left."""
+
+    max_steps = 15
+
+    def reward(self, step):
+        return -step.next_obs[:, 0] + 0.1 * step.timed_out
+
+
+class Balance(Skill):
+    """Stays up, until it is far away."""
+
+    def initiation(self, obs):
+        return np.abs(obs[:, 2]) < 0.15
+
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 0]) > 0.5
+
+
+class Push(Skill):
+    """Is ready."""
+
+    call_steps = 2
+
+    def policy(self, obs):
+        return (obs[:, 2] > 0).astype(np.int64)
+
+
+class Stopped(Exception):
+    """What interrupts a run here."""
+
+
+class StopAt:
+    """A listener that raises at its n-th tick."""
+
+    def __init__(self, tick: int) -> None:
+        self.left = tick
+
+    def stage(self, name: str, budget: int) -> None:
+        pass
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Stopped
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        pass
+
+    def message(self, text: str) -> None:
+        pass
+
+
+def policies(run: Path) -> dict[str, tuple[dict[str, Any], bytes]]:
+    """Header (as JSON, its keys in any order) and the tensors' bytes of every policy."""
+    found = {}
+    for path in sorted((run / "policies").iterdir()):
+        data = path.read_bytes()
+        size = int.from_bytes(data[:8], "little")
+        found[path.name] = (json.loads(data[8 : 8 + size]), data[8 + size :])
+    return found
+
+
+def lines(run: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_same(run: Path, reference: Path) -> None:
+    mine, theirs = policies(run), policies(reference)
+    assert mine.keys() == theirs.keys()
+    assert len(mine) >= 1
+    for name, (header, weights) in theirs.items():
+        assert mine[name][1] == weights, f"{name}: other weights"
+        assert mine[name][0] == header, f"{name}: another header"
+    assert_metrics_fit(run, reference)
+
+
+def assert_metrics_fit(run: Path, reference: Path) -> None:
+    """No line twice, none missing, updates and steps rising; all numbers but times the same."""
+    mine, theirs = lines(run), lines(reference)
+    keys = [(r["stage"], r["update"]) for r in mine]
+    assert len(set(keys)) == len(keys), "a line stands twice"
+    assert keys == [(r["stage"], r["update"]) for r in theirs]
+    for stage in {r["stage"] for r in mine}:
+        rows = [r for r in mine if r["stage"] == stage]
+        for field in ("update", "steps"):
+            values = [r[field] for r in rows]
+            assert values == sorted(set(values)), f"{field} of {stage} does not rise"
+    for a, b in zip(mine, theirs, strict=True):
+        assert {**a, "seconds": 0} == {**b, "seconds": 0}
+
+
+def new_run(hierarchy: Hierarchy, path: Path, **options: Any) -> RunDirectory:
+    """A new run of as many workers as the recipe says."""
+    content = training.manifest(hierarchy, **{"seed": 3, "flat": False} | options)
+    assign_workers(content["stages"], hierarchy.spec)
+    return RunDirectory.create(path, content | {"recipe": None})
+
+
+def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> RunDirectory:
+    """A new run that was interrupted by an exception at a tick."""
+    run = new_run(hierarchy, path, **options)
+    try:
+        with pytest.raises(Stopped):
+            training.train(hierarchy, run, (StopAt(tick),))
+    finally:
+        run.close()
+    return run
+
+
+Kinds = Mapping[str, Callable[[], Hierarchy]]
+
+
+class Whole:
+    """An uninterrupted run of each kind of hierarchy, made once."""
+
+    def __init__(self, kinds: Kinds, tmp_path_factory: pytest.TempPathFactory) -> None:
+        self.kinds, self._folders = kinds, tmp_path_factory
+        self._made: dict[str, tuple[Run, Path]] = {}
+
+    def __call__(self, kind: str) -> tuple[Run, Path]:
+        if kind not in self._made:
+            path = self._folders.mktemp("whole") / "run"
+            self._made[kind] = self.kinds[kind]().train(path, seed=3, quiet=True), path
+        return self._made[kind]
+
+    def assert_resumes(self, kind: str, tick: int, path: Path) -> None:
+        """A run that is stopped at a tick, and resumed, ends as if it had not been."""
+        run = stopped_run(self.kinds[kind](), path, tick)
+        assert not run.finished
+        self.kinds[kind]().resume(run.path, quiet=True)
+        assert_same(run.path, self(kind)[1])
+
+    def assert_loads(self, kind: str, file: Path) -> None:
+        """What was learnt is loaded from the run, and from one file of weights."""
+        run, path = self(kind)
+        found = run.evaluate(3)
+        assert self.kinds[kind]().load(path).evaluate(3) == found
+        run.save_weights(file)
+        assert self.kinds[kind]().load_weights(file).evaluate(3) == found
