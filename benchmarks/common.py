@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import multiprocessing
 import os
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.types import Array
+from skillweave.types import Array, SkillweaveError
 
 
 def machine() -> str:
@@ -43,6 +44,20 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def cases_asked(
+    parser: argparse.ArgumentParser, cases: Iterable[str], steps: int
+) -> argparse.Namespace:
+    """What the command line says of a benchmark whose cases are trained for so many steps."""
+    parser.add_argument("cases", nargs="*", default=["together", "flat"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--steps", type=int, default=steps)
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    if unknown := [case for case in asked.cases if case not in cases]:
+        raise SkillweaveError(f"no case {unknown[0]!r}; there are: {', '.join(cases)}")
+    return asked
 
 
 def run_command(

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import median, report, table, workers
+from benchmarks.common import cases_asked, median, report, table, workers
 from examples import nested
 from skillweave import Hierarchy, SkillweaveError
 from skillweave.runs.directory import RunDirectory
@@ -103,14 +103,7 @@ def one(case: str, steps: int, seed: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", default=["together", "flat"])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--steps", type=int, default=150_000)
-    parser.add_argument("--processes", type=int, default=2)
-    asked = parser.parse_args()
-    unknown = [c for c in asked.cases if c not in CASES]
-    if unknown:
-        raise SkillweaveError(f"no case {unknown[0]!r}; there are: {', '.join(CASES)}")
+    asked = cases_asked(parser, CASES, steps=150_000)
     rows, found = [], {}
     head = ("case", "median", "worst", "length", "steps", "s", "killed, resumed", "each")
     with workers(asked.processes) as pool:

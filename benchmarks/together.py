@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import median, report, table, workers
+from benchmarks.common import cases_asked, median, report, table, workers
 from examples import doorkey
-from skillweave import Hierarchy, Lengths, SkillweaveError, Together
+from skillweave import Hierarchy, Lengths, Together
 
 FLOOR = Together(floor=1.0, floor_final=0.1)
 
@@ -70,16 +70,9 @@ def one(case: str, size: str, steps: int, engine: str, seed: int) -> dict[str, A
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", default=["together", "flat"])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--size", default="8x8")
-    parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--engine", choices=("auto", "sync"), default="auto")
-    parser.add_argument("--processes", type=int, default=2)
-    asked = parser.parse_args()
-    unknown = [c for c in asked.cases if c not in CASES]
-    if unknown:
-        raise SkillweaveError(f"no case {unknown[0]!r}; there are: {', '.join(CASES)}")
+    asked = cases_asked(parser, CASES, steps=500_000)
     rows, found = [], {}
     with workers(asked.processes) as pool:
         futures = {

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from reporting.cart import RECIPE
 from reporting.walkway import CALLS, declare
 
 from skillweave.cli import main
@@ -26,23 +27,6 @@ pytest.importorskip("imageio_ffmpeg")
 playwright = pytest.importorskip("playwright.sync_api")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 
-RECIPE = """
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill
-
-class Left(Skill):
-    max_steps = 10
-    def success(self, step):
-        return step.next_obs[:, 0] < 0
-
-class Balance(Skill):
-    pass
-
-small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
-hierarchy = Hierarchy(
-    env=EnvSpec("CartPole-v1", engine="sync"), skills=[Left(), Balance()], call_steps=5,
-    algorithm=small, selector=small, skill_steps=512, selector_steps=512,
-)
-"""
 EVOLVE = ("left.population=2", "left.generations=2", "left.episodes=1")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reporting.cart import RECIPE
 from reporting.walkway import CALLS, Moody, Walkway, declare
 
 from skillweave import EnvSpec, SkillweaveError
@@ -23,31 +24,6 @@ from skillweave.reporting.report.skills_table import transition_rows, transition
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.call_log import CallLog, EpisodeLog
 from skillweave.training.evaluation import episode_seeds, evaluate
-
-RECIPE = """
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill
-
-class Left(Skill):
-    max_steps = 10
-    def reward(self, step):
-        return -step.next_obs[:, 0]
-    def success(self, step):
-        return step.next_obs[:, 0] < 0
-
-class Balance(Skill):
-    pass
-
-small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
-hierarchy = Hierarchy(
-    env=EnvSpec("CartPole-v1", engine="sync"),
-    skills=[Left(), Balance()],
-    call_steps=5,
-    algorithm=small,
-    selector=small,
-    skill_steps=256,
-    selector_steps=512,
-)
-"""
 
 
 def test_transitions_by_hand(tmp_path: Path) -> None:
