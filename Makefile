@@ -1,4 +1,4 @@
-# make demo   train, score and film the lunar-lander recipe
+# make demo   train, score and film the lunar-lander recipe, and compare it with a flat agent
 # make test   the tests            make check   ruff, mypy, import order, tests
 # make bench  the benchmarks       make weights the shipped weights, made anew
 # make docs   the documentation, as a site in site/
@@ -25,10 +25,10 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 	touch $@
 
 demo: .venv/demo
-	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render
+	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --versus-flat
 
 smoke: .venv/demo
-	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --scale 0.02 --evaluate 5
+	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --versus-flat --scale 0.02 --evaluate 5
 
 test: .venv/dev
 	$(PYTEST)

@@ -36,6 +36,8 @@ class Train(Output):
     """The root of every random stream."""
     flat: bool = False
     """Train one plain agent on the same number of steps instead: the baseline."""
+    versus_flat: bool = False
+    """Afterwards train the baseline too, on the same number of steps, and say which is better."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
     evolve: UseAppendAction[tuple[str, ...]] = ()

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import ast
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
-from skillweave.api import Run
 from skillweave.cli import commands
-from skillweave.cli.evolve import parse_evolve
-from skillweave.cli.overrides import apply_overrides, list_settings
+from skillweave.cli.overrides import list_settings
 from skillweave.cli.run_lines import run_lines
 from skillweave.cli.targets import declared_by_run, target
+from skillweave.cli.telling import save_score, tell
+from skillweave.cli.training import resume, train
 from skillweave.compat.agilerl_files import convert
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.files import read_tensors
-from skillweave.training.evaluation import Evaluation
-from skillweave.training.evaluation_file import load_evaluation, save_evaluation
+from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import SkillweaveError
 
 
@@ -30,9 +26,9 @@ def run(command: commands.Command) -> int:
     """Carry a command out and print its result."""
     match command:
         case commands.Train():
-            _train(command)
+            train(command)
         case commands.Resume():
-            _resume(command)
+            resume(command)
         case commands.Evaluate():
             _evaluate(command)
         case commands.Render():
@@ -56,38 +52,6 @@ def run(command: commands.Command) -> int:
     return 0
 
 
-def _train(command: commands.Train) -> None:
-    if command.evaluate < 0:
-        raise SkillweaveError(f"evaluate is {command.evaluate}; it must be at least 0")
-    hierarchy = recipes.load(command.recipe)
-    apply_overrides(hierarchy, command.set)
-    hierarchy.scale(command.scale)
-    evolve = parse_evolve(command.evolve, hierarchy, command.flat)
-    name = Path(command.recipe).stem + ("-flat" if command.flat else "")
-    path = command.out or _free(Path("runs") / f"{name}-s{command.seed}")
-    try:
-        trained = hierarchy.train(
-            path,
-            seed=command.seed,
-            flat=command.flat,
-            quiet=command.quiet,
-            track=command.track,
-            evolve=evolve,
-        )
-    except KeyboardInterrupt:
-        raise _interrupted(path) from None
-    _tell_trained(command, trained, command.evaluate, command.render)
-
-
-def _resume(command: commands.Resume) -> None:
-    declared = declared_by_run(command.run, command.recipe, "resume_needs_recipe")
-    try:
-        trained = declared.resume(command.run, quiet=command.quiet)
-    except KeyboardInterrupt:
-        raise _interrupted(command.run) from None
-    _tell_trained(command, trained, command.evaluate)
-
-
 def _evaluate(command: commands.Evaluate) -> None:
     found = target(command)
     score = found.evaluate(
@@ -99,8 +63,8 @@ def _evaluate(command: commands.Evaluate) -> None:
     result = {"target": command.target, "env": found.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}
     if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
-        _save(found, score, command.seed, command.deterministic)
-    _tell(command, result | score.to_json(), score.for_people())
+        save_score(found, score, command.seed, command.deterministic)
+    tell(command, result | score.to_json(), score.for_people())
 
 
 def _render(command: commands.Render) -> None:
@@ -114,12 +78,12 @@ def _render(command: commands.Render) -> None:
         skill=command.skill,
     )
     returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])
-    _tell(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
+    tell(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
 
 
 def _plot(command: commands.Plot) -> None:
     paths = [str(path) for path in plot_run(RunDirectory.open(command.run), command.out)]
-    _tell(command, {"paths": paths}, "\n".join(paths))
+    tell(command, {"paths": paths}, "\n".join(paths))
 
 
 def _report(command: commands.Report) -> None:
@@ -156,7 +120,7 @@ def _compare(command: commands.Compare) -> None:
 def _tell_page(command: commands.Output, told: dict[str, Any]) -> None:
     lines = [f"{told['path']}: {told['bytes'] / 1e6:.1f} MB, written in {told['seconds']:.1f} s"]
     lines += [f"missing: {line}" for line in told["missing"]]
-    _tell(command, told, "\n".join(lines))
+    tell(command, told, "\n".join(lines))
 
 
 def _list(command: commands.List) -> None:
@@ -172,26 +136,26 @@ def _list(command: commands.List) -> None:
     if runs:
         lines.append("runs:")
         lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in runs]
-    _tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
+    tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
 
 
 def _info(command: commands.Info) -> None:
     if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
         settings = list_settings(recipes.load(command.target))
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
-        _tell(command, {"recipe": command.target, "settings": _plain(settings)}, text)
+        tell(command, {"recipe": command.target, "settings": _plain(settings)}, text)
         return
     found = RunDirectory.open(command.target)
     m = found.manifest
     saved = load_evaluation(found)
     told = {} if saved is None else {"evaluation": saved.to_json()}
-    _tell(command, m | told, "\n".join(run_lines(m, saved, command.target)))
+    tell(command, m | told, "\n".join(run_lines(m, saved, command.target)))
 
 
 def _weights(command: commands.Weights) -> None:
     trained = declared_by_run(command.run, command.recipe).load(command.run)
     path = trained.save_weights(command.out)
-    _tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
+    tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
 
 
 def _export(command: commands.Export) -> None:
@@ -200,7 +164,7 @@ def _export(command: commands.Export) -> None:
     name = Path(command.target).name.removesuffix(".safetensors")
     found = target(command).export(command.out or Path(f"{name}-onnx"))
     told = {"path": str(found.path), "files": list(found.files), "code": found.code}
-    _tell(command, told, str(found))
+    tell(command, told, str(found))
 
 
 def _import_agilerl(command: commands.ImportAgilerl) -> None:
@@ -213,58 +177,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
     out = command.out or command.file.with_suffix(".safetensors")
     algo = convert(command.file, out)
     text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"
-    _tell(command, {"path": str(out), "algorithm": algo}, text)
-
-
-def _tell_trained(
-    command: commands.Train | commands.Resume, trained: Run, episodes: int, render: bool = False
-) -> None:
-    manifest = trained.info()
-    result: dict[str, Any] = {"run": str(trained.path), "stages": manifest["stages"]}
-    seconds = sum(p["seconds"] for p in manifest["stages"])
-    steps = sum(p["steps"] for p in manifest["stages"])
-    lines = [
-        f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"
-    ]
-    if episodes:
-        score = trained.evaluate(episodes)
-        result["evaluation"] = score.to_json()
-        _save(trained, score)
-        lines.append(f"score   {score.for_people()}")
-    if render:
-        film = trained.render(trained.path / f"{manifest['kind']}.gif")
-        result["film"] = film
-        lines.append(f"film    {film['path']}")
-    lines.append(f"run     {trained.path}  (skillweave info|evaluate|render {trained.path})")
-    _tell(command, result, "\n".join(lines))
-
-
-def _tell(command: commands.Output, data: dict[str, Any], text: str) -> None:
-    print(json.dumps(data, default=str) if command.json else text)
-
-
-def _save(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = True) -> None:
-    """Keep a score in its run for ``info``; one that cannot be written is told all the same."""
-    try:
-        save_evaluation(RunDirectory.open(trained.path), score, seed, deterministic)
-    except SkillweaveError as error:
-        print(f"the evaluation is not kept in the run: {error}", file=sys.stderr)
-
-
-def _interrupted(path: Path) -> KeyboardInterrupt:
-    """The same interrupt, with what is saved and how to go on."""
-    if not (path / "run.json").exists():
-        return KeyboardInterrupt("nothing was trained yet")
-    manifest = RunDirectory.open(path).manifest
-    recipe, hint = manifest.get("recipe"), ""
-    if manifest.get("resume_needs_recipe", True) and recipe not in recipes.names():
-        hint = f" --recipe {recipe or 'FILE.py'}"
-    try:
-        at = read_tensors(path / "checkpoint.safetensors")[1]
-        saved = f"saved at {at['steps']:,} steps of {at['stage']}"
-    except SkillweaveError:
-        saved = "saved at the start"
-    return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}{hint}")
+    tell(command, {"path": str(out), "algorithm": algo}, text)
 
 
 def _run_line(path: Path) -> dict[str, Any]:
@@ -276,15 +189,6 @@ def _run_line(path: Path) -> dict[str, Any]:
     return {"path": str(path), "status": status} | {
         k: found.manifest[k] for k in ("kind", "env", "seed")
     }
-
-
-def _free(path: Path) -> Path:
-    """``path``, or the first of path-2, path-3, … that does not exist."""
-    number, candidate = 1, path
-    while candidate.exists():
-        number += 1
-        candidate = path.with_name(f"{path.name}-{number}")
-    return candidate
 
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:

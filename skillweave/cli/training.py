@@ -1,0 +1,141 @@
+"""Trains a recipe, and the flat agent that it is held against; finishes what was stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from skillweave import recipes
+from skillweave.api import Hierarchy, Run
+from skillweave.cli import commands
+from skillweave.cli.evolve import parse_evolve
+from skillweave.cli.overrides import apply_overrides
+from skillweave.cli.targets import declared_by_run
+from skillweave.cli.telling import save_score, tell
+from skillweave.evolution.config import Evolution
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_tensors
+from skillweave.types import SkillweaveError
+
+
+def train(command: commands.Train) -> None:
+    """Train a recipe, and perhaps the flat baseline after it."""
+    if command.evaluate < 0:
+        raise SkillweaveError(f"evaluate is {command.evaluate}; it must be at least 0")
+    if command.versus_flat and command.flat:
+        raise SkillweaveError("--flat trains the baseline alone: leave out --versus-flat")
+    if command.versus_flat and not command.evaluate:
+        raise SkillweaveError("--versus-flat compares scores: let --evaluate be at least 1")
+    flat_out = command.out and command.out.with_name(f"{command.out.name}-flat")
+    if command.versus_flat and flat_out and flat_out.exists():
+        raise SkillweaveError(f"{flat_out} is there already: the flat agent would be written there")
+    hierarchy = recipes.load(command.recipe)
+    apply_overrides(hierarchy, command.set)
+    hierarchy.scale(command.scale)
+    evolve = parse_evolve(command.evolve, hierarchy, command.flat)
+    trained = _trained(command, hierarchy, command.flat, command.out, evolve)
+    result, lines = _told(trained, command.evaluate, command.render)
+    if command.versus_flat:
+        hierarchy.flat_steps = None  # as many as the hierarchy
+        flat = _trained(command, hierarchy, True, flat_out)
+        result["flat"], more = _told(flat, command.evaluate)
+        verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
+        lines += ["", "the flat agent:", *more, "", *verdict]
+    tell(command, result, "\n".join(lines))
+
+
+def resume(command: commands.Resume) -> None:
+    """Finish a run that was stopped."""
+    declared = declared_by_run(command.run, command.recipe, "resume_needs_recipe")
+    try:
+        trained = declared.resume(command.run, quiet=command.quiet)
+    except KeyboardInterrupt:
+        raise _interrupted(command.run) from None
+    result, lines = _told(trained, command.evaluate)
+    tell(command, result, "\n".join(lines))
+
+
+def _trained(
+    command: commands.Train,
+    hierarchy: Hierarchy,
+    flat: bool,
+    out: Path | None,
+    evolve: dict[str, Evolution | None] | None = None,
+) -> Run:
+    name = Path(command.recipe).stem + ("-flat" if flat else "")
+    path = out or _free(Path("runs") / f"{name}-s{command.seed}")
+    try:
+        return hierarchy.train(
+            path,
+            seed=command.seed,
+            flat=flat,
+            quiet=command.quiet,
+            track=command.track,
+            evolve=evolve,
+        )
+    except KeyboardInterrupt:
+        raise _interrupted(path) from None
+
+
+def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
+    """In plain words, which evaluation is better, and what that means."""
+    (low, high), (flat_low, flat_high) = hierarchy["ci95"], flat["ci95"]
+    both = f"hierarchy {hierarchy['mean']:.1f}, flat agent {flat['mean']:.1f} with as many steps"
+    if low > flat_high:
+        return [f"{both}: the hierarchy is better."]
+    if flat_low > high:
+        found = "the flat agent is better. One agent can learn this task from its reward alone."
+    else:
+        found = "there is no clear difference."
+    return [
+        f"{both}: {found}",
+        "Skills pay where one agent cannot, and where many tasks need the same skills. Try next:",
+        "  skillweave train lander-missions",
+    ]
+
+
+def _told(trained: Run, episodes: int, render: bool = False) -> tuple[dict[str, Any], list[str]]:
+    """What a run has come to, for programs and for people."""
+    manifest = trained.info()
+    result: dict[str, Any] = {"run": str(trained.path), "stages": manifest["stages"]}
+    seconds = sum(p["seconds"] for p in manifest["stages"])
+    steps = sum(p["steps"] for p in manifest["stages"])
+    lines = [
+        f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"
+    ]
+    if episodes:
+        score = trained.evaluate(episodes)
+        result["evaluation"] = score.to_json()
+        save_score(trained, score)
+        lines.append(f"score   {score.for_people()}")
+    if render:
+        film = trained.render(trained.path / f"{manifest['kind']}.gif")
+        result["film"] = film
+        lines.append(f"film    {film['path']}")
+    lines.append(f"run     {trained.path}  (skillweave info|evaluate|render {trained.path})")
+    return result, lines
+
+
+def _interrupted(path: Path) -> KeyboardInterrupt:
+    """The same interrupt, with what is saved and how to go on."""
+    if not (path / "run.json").exists():
+        return KeyboardInterrupt("nothing was trained yet")
+    manifest = RunDirectory.open(path).manifest
+    recipe, hint = manifest.get("recipe"), ""
+    if manifest.get("resume_needs_recipe", True) and recipe not in recipes.names():
+        hint = f" --recipe {recipe or 'FILE.py'}"
+    try:
+        at = read_tensors(path / "checkpoint.safetensors")[1]
+        saved = f"saved at {at['steps']:,} steps of {at['stage']}"
+    except SkillweaveError:
+        saved = "saved at the start"
+    return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}{hint}")
+
+
+def _free(path: Path) -> Path:
+    """``path``, or the first of path-2, path-3, … that does not exist."""
+    number, candidate = 1, path
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}-{number}")
+    return candidate
