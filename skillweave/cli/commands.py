@@ -180,6 +180,30 @@ class Export(Output):
 
 
 @dataclass(frozen=True)
+class Push(Output):
+    """Put a finished run on the Hugging Face Hub, with a page about it."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+    name: Positional[str] = tyro.MISSING
+    """OWNER/NAME on the hub; made if it is not there. An older run there is replaced."""
+    private: bool = False
+    """Others may not read it."""
+
+
+@dataclass(frozen=True)
+class Pull(Output):
+    """Copy a run from the Hugging Face Hub into a new folder."""
+
+    name: Positional[str] = tyro.MISSING
+    """OWNER/NAME on the hub."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """A new directory for the run; default: runs/NAME, numbered if taken."""
+    revision: str | None = None
+    """A branch, a tag or a commit; default: the latest."""
+
+
+@dataclass(frozen=True)
 class ImportAgilerl(Output):
     """Convert a checkpoint of AgileRL 0.1 or 1.0, which is a pickle."""
 
@@ -203,6 +227,8 @@ COMMANDS = (
     Info,
     Weights,
     Export,
+    Push,
+    Pull,
     ImportAgilerl,
 )
 Command = (
@@ -217,6 +243,8 @@ Command = (
     | Info
     | Weights
     | Export
+    | Push
+    | Pull
     | ImportAgilerl
 )
 

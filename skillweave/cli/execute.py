@@ -10,11 +10,11 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave.api import Run
-from skillweave.cli import commands
+from skillweave.cli import commands, share
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.cli.run_lines import run_lines
-from skillweave.cli.targets import declared_by_run, target
+from skillweave.cli.targets import declared_by_run, free, target
 from skillweave.compat.agilerl_files import convert
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -51,6 +51,10 @@ def run(command: commands.Command) -> int:
             _weights(command)
         case commands.Export():
             _export(command)
+        case commands.Push():
+            _tell(command, *share.push(command))
+        case commands.Pull():
+            _tell(command, *share.pull(command))
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0
@@ -64,7 +68,7 @@ def _train(command: commands.Train) -> None:
     hierarchy.scale(command.scale)
     evolve = parse_evolve(command.evolve, hierarchy, command.flat)
     name = Path(command.recipe).stem + ("-flat" if command.flat else "")
-    path = command.out or _free(Path("runs") / f"{name}-s{command.seed}")
+    path = command.out or free(Path("runs") / f"{name}-s{command.seed}")
     try:
         trained = hierarchy.train(
             path,
@@ -276,15 +280,6 @@ def _run_line(path: Path) -> dict[str, Any]:
     return {"path": str(path), "status": status} | {
         k: found.manifest[k] for k in ("kind", "env", "seed")
     }
-
-
-def _free(path: Path) -> Path:
-    """``path``, or the first of path-2, path-3, … that does not exist."""
-    number, candidate = 1, path
-    while candidate.exists():
-        number += 1
-        candidate = path.with_name(f"{path.name}-{number}")
-    return candidate
 
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:
