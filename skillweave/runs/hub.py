@@ -55,7 +55,8 @@ def check_name(name: object) -> str:
     Raises:
         SkillweaveError: it is no name like ``owner/name``.
     """
-    if not isinstance(name, str) or not re.fullmatch(r"[\w.-]{1,96}/[\w.-]{1,96}", name, re.ASCII):
+    part = r"\w([\w.-]{0,94}\w)?"
+    if not isinstance(name, str) or not re.fullmatch(f"{part}/{part}", name, re.ASCII):
         raise SkillweaveError(
             f"{short(name)} is no name on the hub; write owner/name: letters, digits, '-', '_', '.'"
         )
@@ -220,11 +221,15 @@ def _check_kinds(name: str, files: Sequence[str]) -> None:
 
 def _refused(files: Sequence[str]) -> str:
     """The files that are of no known kind, as words; empty: there are none."""
-    others = [
-        short(f) for f in files if PurePosixPath(f).suffix not in KINDS and f != MADE_BY_THE_HUB
-    ]
+    others = [short(f) for f in files if not _is_data(f)]
     more = f" and {len(others) - 3} more" if len(others) > 3 else ""
     return ", ".join(others[:3]) + more
+
+
+def _is_data(file: str) -> bool:
+    path = PurePosixPath(file)
+    inside = not path.is_absolute() and ".." not in path.parts and "\\" not in file
+    return file == MADE_BY_THE_HUB or (inside and path.suffix in KINDS)
 
 
 # Errors
@@ -273,6 +278,8 @@ def _sentence(
     what = shortened(f"{type(error).__name__}: {error}".replace("\n", " "), 300)
     if status is not None:
         return f"{endpoint} refused {name} with the answer {status}; try again later. {what}"
+    if isinstance(error, ValueError):  # the hub's library does not even ask
+        return f"{name} is refused: {what}"
     after = "Nothing was pushed" if writes else f"And no copy of {name} is on this machine"
     return (
         f"{endpoint} cannot be reached. {after}. Check the network, HF_ENDPOINT and "
