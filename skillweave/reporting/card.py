@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
+from urllib.parse import quote
 
 from skillweave.reporting.report.curves import reached_steps, read_curves
 from skillweave.reporting.report.facts import facts, plain, settings, stage_rows
@@ -37,8 +39,8 @@ def write_card(
         _measured(saved),
         _training(run),
         *(_shown(path) for path in figures),
-        _table("Settings", ("setting", "value"), settings(run)),
-        _table("Made with", ("what", "version"), run.manifest["versions"]),
+        _folded("All settings", ("setting", "value"), settings(run)),
+        _folded("Versions", ("of", "version"), run.manifest["versions"]),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -77,10 +79,9 @@ def _recipe(run: RunDirectory) -> str:
 
 
 def _shown(path: str) -> str:
-    """A picture, or where browsers show no such picture, a link to it."""
-    if path.endswith(".mp4"):
-        return f"[{text(path)}](./{path})"
-    return f"![{text(PurePosixPath(path).stem)}](./{path})"
+    """A picture, or a link where pages show no such picture."""
+    link = f"[{text(PurePosixPath(path).stem)}](./{quote(path)})"
+    return link if path.endswith(".mp4") else f"!{link}"
 
 
 def _use(run: RunDirectory, name: str) -> str:
@@ -96,7 +97,8 @@ def _use(run: RunDirectory, name: str) -> str:
     lines += [
         "```python", "import skillweave as sw", "", f'run = sw.from_hub("{name}"{given})',
         "print(run.evaluate(episodes=10))", "```", "",
-        "The files are safetensors and JSON. No code comes with them.",
+        "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
+        "comes with them.",
     ]  # fmt: skip
     if stays := [s for s in run.manifest.get("skills", ()) if _is_onnx(s)]:
         names = ", ".join(text(s["name"]) for s in stays)
@@ -135,9 +137,10 @@ def _training(run: RunDirectory) -> str:
     return "\n".join(lines)
 
 
-def _table(title: str, head: tuple[str, str], rows: Mapping[str, Any]) -> str:
-    lines = [f"## {title}", "", _row(head), _row(["---"] * 2)]
-    return "\n".join([*lines, *(_row([k, plain(v)]) for k, v in rows.items())])
+def _folded(title: str, head: tuple[str, str], rows: Mapping[str, Any]) -> str:
+    """A table that people open where they want to see it."""
+    lines = [f"<details><summary>{title}</summary>", "", _row(head), _row(["---"] * 2)]
+    return "\n".join([*lines, *(_row([k, plain(v)]) for k, v in rows.items()), "", "</details>"])
 
 
 def _row(cells: Sequence[str]) -> str:
@@ -146,4 +149,5 @@ def _row(cells: Sequence[str]) -> str:
 
 def text(value: str) -> str:
     """A value in Markdown as it is: nothing in it is read as Markdown or HTML."""
-    return re.sub(r"([\\`*_{}\[\]<>()#|&~!$])", r"\\\1", " ".join(value.split()))
+    plain_text = re.sub(r"([\\`*_{}\[\]()#|~!$])", r"\\\1", " ".join(value.split()))
+    return html.escape(plain_text, quote=False)

@@ -185,27 +185,34 @@ def download(name: str, revision: str | None = None) -> Path:
         )
     with _asking(api, name, revision=revision):
         info = _info(api, name, revision)
-        if info is None:
-            how: dict[str, Any] = {"local_files_only": True}
+        how = {"revision": revision, "allow_patterns": list(WANTED)}
+        if isinstance(info, Exception):  # no answer
+            path = _downloaded_before(api, name, how, info)
         else:
             _check_kinds(name, [file.rfilename for file in info.siblings or ()])
-            how = {}
-        found = api.snapshot_download(name, revision=revision, allow_patterns=list(WANTED), **how)
-    path = Path(found)
-    if info is not None and path.name != info.sha:
-        raise SkillweaveError(f"{name} was changed while it was downloaded; try again")
+            path = Path(api.snapshot_download(name, **how))
+            if path.name != info.sha:
+                raise SkillweaveError(f"{name} was changed while it was downloaded; try again")
     _check_kinds(name, [p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()])
     return path
 
 
 def _info(api: Any, name: str, revision: str | None) -> Any:
-    """What the hub says of a repository; None: it does not answer."""
+    """What the hub says of a repository, or the error where it does not answer."""
     try:
         return api.model_info(name, revision=revision, timeout=SECONDS)
     except Exception as error:
         if _status(error) is None or _status(error) >= 500:
-            return None
+            return error
         raise
+
+
+def _downloaded_before(api: Any, name: str, how: Mapping[str, Any], error: Exception) -> Path:
+    """The folder of an earlier download; where there is none, ``error`` is raised."""
+    try:
+        return Path(api.snapshot_download(name, local_files_only=True, **how))
+    except Exception:
+        raise error from None
 
 
 def _check_kinds(name: str, files: Sequence[str]) -> None:
@@ -280,7 +287,7 @@ def _sentence(
         return f"{endpoint} refused {name} with the answer {status}; try again later. {what}"
     if isinstance(error, ValueError):  # the hub's library does not even ask
         return f"{name} is refused: {what}"
-    after = "Nothing was pushed" if writes else f"And no copy of {name} is on this machine"
+    after = "Nothing was pushed" if writes else f"There is no copy of {name} on this machine"
     return (
         f"{endpoint} cannot be reached. {after}. Check the network, HF_ENDPOINT and "
         f"HF_HUB_OFFLINE, then try again. {what}"
