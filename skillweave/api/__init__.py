@@ -127,7 +127,7 @@ class Hierarchy(Declaration):
             seed: the root of every random stream.
             flat: train one plain agent on the same number of steps instead: the baseline.
             quiet: no progress.
-            track: "tensorboard", "wandb".
+            track: any of "tensorboard", "wandb" and "mlflow".
             evolve: a population for every stage, or for some by name (a skill's, "selector",
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
 
@@ -222,7 +222,7 @@ def train_agent(
         run_dir: a new directory; an existing run is never overwritten.
         seed: the root of every random stream.
         quiet: no progress.
-        track: "tensorboard", "wandb".
+        track: any of "tensorboard", "wandb" and "mlflow".
         evolve: an ``Evolution``: a population in place of one agent.
 
     Returns:

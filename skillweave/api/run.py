@@ -16,6 +16,7 @@ from skillweave.messages import as_path, whole_number
 from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import render_policy
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import track_film
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
@@ -106,7 +107,7 @@ class Run:
         skill: str | None = None,
         max_steps: int | None = None,
     ) -> dict[str, Any]:
-        """Write a captioned film.
+        """Write a captioned film; one in the run's own folder goes to its trackers, too.
 
         Args:
             path: the file; its ending says which, ``.gif`` or ``.mp4``.
@@ -123,7 +124,7 @@ class Run:
         seed = whole_number(seed, "seed", 0)
         plain = isinstance(self.declaration, PlainAgent)
         skills = () if plain else self.hierarchy.skills
-        return render_policy(
+        told = render_policy(
             self.declaration.spec,
             policy,
             path,
@@ -134,6 +135,9 @@ class Run:
             max_steps=max_steps,
             rng=np.random.default_rng(seed),
         )
+        if path.parent.resolve() == self.path.resolve():
+            track_film(RunDirectory.open(self.path), path)
+        return told
 
     def act(self, obs: Any, **told: Any) -> Any:
         """The greedy action for one observation.

@@ -40,7 +40,7 @@ class Train(Output):
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
     evolve: UseAppendAction[tuple[str, ...]] = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
-    track: UseAppendAction[tuple[Literal["tensorboard", "wandb"], ...]] = ()
+    track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()
     """Send metrics to a tracker as well."""
     scale: float = 1.0
     """Multiply every training budget: 0.1 for a quick look."""
