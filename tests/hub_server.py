@@ -56,7 +56,8 @@ class Hub:
     large: dict[str, bytes] = field(default_factory=dict)
     asked: list[str] = field(default_factory=list)
     breaks_at: str = ""
-    """Requests whose path has this in it are answered with 500."""
+    answer: int = 500
+    """Requests whose path has ``breaks_at`` in it are answered with this."""
 
     def make(self, name: str, files: dict[str, bytes], private: bool = False) -> Repo:
         repo = self.repos[name] = Repo(private)
@@ -95,7 +96,7 @@ class Handler(BaseHTTPRequestHandler):
         self.hub.asked.append(f"{self.command} {path}")
         try:
             if self.hub.breaks_at and self.hub.breaks_at in path:
-                raise Answer(500, {"error": "the disk of the hub is full"})
+                raise Answer(self.hub.answer, {"error": "the disk of the hub is full"})
             for method, pattern, act in ROUTES:
                 found = re.fullmatch(pattern, path)
                 if found and self.command in method:

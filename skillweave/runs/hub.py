@@ -242,9 +242,13 @@ def _is_data(file: str) -> bool:
 # Errors
 
 
-def _status(error: Exception) -> Any:
+def _status(error: BaseException | None) -> Any:
     """The number of the hub's answer; None: there was no answer."""
-    return getattr(getattr(error, "response", None), "status_code", None)
+    while error is not None:
+        if (response := getattr(error, "response", None)) is not None:
+            return response.status_code
+        error = error.__cause__
+    return None
 
 
 @contextmanager
@@ -285,7 +289,7 @@ def _sentence(
     what = shortened(f"{type(error).__name__}: {error}".replace("\n", " "), 300)
     if status is not None:
         return f"{endpoint} refused {name} with the answer {status}; try again later. {what}"
-    if isinstance(error, ValueError):  # the hub's library does not even ask
+    if isinstance(error, errors.HFValidationError) or type(error) is ValueError:  # it was not asked
         return f"{name} is refused: {what}"
     after = "Nothing was pushed" if writes else f"There is no copy of {name} on this machine"
     return (

@@ -290,10 +290,12 @@ def test_what_is_something_else_or_public_is_left_alone(run: sw.Run, hub: Hub) -
 
 
 def test_where_the_hub_fails_nothing_is_half_pushed(run: sw.Run, hub: Hub) -> None:
-    hub.breaks_at = "/commit/"
-    with pytest.raises(SkillweaveError, match="the answer 500; try again later"):
-        run.push(NAME)
-    assert hub.files(NAME) == {}
+    for path, answer in (("/commit/", 500), ("/large/", 501), ("/large/", 403)):
+        hub.breaks_at, hub.answer = path, answer
+        why = "you may not write" if answer == 403 else f"the answer {answer}; try again later"
+        with pytest.raises(SkillweaveError, match=why):
+            run.push(NAME)
+        assert hub.files(NAME) == {}
     hub.breaks_at = ""
     run.push(NAME)
     assert same_actions(sw.from_hub(NAME), run)
