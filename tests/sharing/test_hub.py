@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hub_server import Hub, serve
+from hub_server import Hub, go_to, serve
 
 import skillweave as sw
 from skillweave.cli import main
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import MissingExtra, SkillweaveError
 
-constants = pytest.importorskip("huggingface_hub.constants")
+pytest.importorskip("huggingface_hub")
 
 NAME = "ada/cart"
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
@@ -71,22 +71,10 @@ def run(trained: sw.Run, tmp_path: Path) -> sw.Run:
     return sw.Run(trained.declaration, tmp_path / "run", trained.policy)
 
 
-def go_to(url: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the hub's library talk to this address, with a cache of its own."""
-    monkeypatch.setattr(constants, "ENDPOINT", url)
-    template = url + "/{repo_id}/resolve/{revision}/{filename}"
-    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache))
-    monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(cache / "no-token"))
-    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
-
-
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     with serve() as found:
         go_to(found.url, tmp_path / "cache", monkeypatch)
-        monkeypatch.setenv("HF_TOKEN", "good-token")
-        monkeypatch.setenv("HF_HUB_DISABLE_PROGRESS_BARS", "1")
         yield found
 
 
