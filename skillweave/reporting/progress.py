@@ -105,8 +105,8 @@ class Progress:
             fields = {"result": result, "speed": speed, "left": left}
             fields["steps"] = f"{_short(steps)}/{_short(budget)}"
             self._bars.update(self._tasks[name], completed=min(steps, budget), **fields)
-            for agent in _agents(metrics):
-                self._show_agent(name, *agent)
+            for told in _agents(metrics):
+                self._show_agent(name, *told)
             self._bars.refresh()
 
     def _show_agent(

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from skillweave.messages import short, shortened
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub_errors import asking, status_of
 from skillweave.types import MissingExtra, SkillweaveError
 
 KINDS = (".safetensors", ".json", ".jsonl", ".md", ".gif", ".mp4", ".png")
@@ -92,11 +92,13 @@ def run_files(run: RunDirectory) -> tuple[dict[str, Path], list[str]]:
     What stays are copies of policies that are neither safetensors nor JSON.
     """
     found = {name: run.path / name for name in LINES if (run.path / name).exists()}
-    kept, stays = [], []
+    stays = []
     for path in sorted((run.path / "policies").glob("[!.]*")):
-        (kept if path.suffix == ".safetensors" else stays).append(path)
-    found |= {f"policies/{path.name}": path for path in kept}
-    return found, [f"policies/{path.name}" for path in stays]
+        if path.suffix == ".safetensors":
+            found[f"policies/{path.name}"] = path
+        else:
+            stays.append(f"policies/{path.name}")
+    return found, stays
 
 
 def run_films(run: RunDirectory) -> list[Path]:
@@ -120,7 +122,7 @@ def upload(name: str, files: Mapping[str, Path | bytes], private: bool = False) 
         MissingExtra: the extra 'hub' is not installed.
     """
     library, api = hub(), hub_api()
-    with _asking(api, name, writes=True):
+    with asking(api, name, writes=True):
         api.create_repo(name, private=private or None, exist_ok=True)
         info = api.model_info(name, timeout=SECONDS)
         there = [file.rfilename for file in info.siblings or ()]
@@ -145,10 +147,10 @@ def _may_be_replaced(name: str, there: Sequence[str]) -> None:
             f"{name} holds {others}, which is no part of a run, so nobody could load one from "
             "there. Delete it on the hub, or choose another name; nothing was pushed"
         )
-    others = [f for f in there if f not in ("README.md", MADE_BY_THE_HUB)]
-    if others and "run.json" not in there:
+    found = [f for f in there if f not in ("README.md", MADE_BY_THE_HUB)]
+    if found and "run.json" not in there:
         raise SkillweaveError(
-            f"{name} holds something else ({shortened(', '.join(others), 200)}); choose another "
+            f"{name} holds something else ({shortened(', '.join(found), 200)}); choose another "
             "name. Nothing was pushed"
         )
 
@@ -183,7 +185,7 @@ def download(name: str, revision: str | None = None) -> Path:
         raise SkillweaveError(
             f"revision is {short(revision)}; it must be a branch, a tag or a commit"
         )
-    with _asking(api, name, revision=revision):
+    with asking(api, name, revision=revision):
         info = _info(api, name, revision)
         how = {"revision": revision, "allow_patterns": list(WANTED)}
         if isinstance(info, Exception):  # no answer
@@ -202,7 +204,7 @@ def _info(api: Any, name: str, revision: str | None) -> Any:
     try:
         return api.model_info(name, revision=revision, timeout=SECONDS)
     except Exception as error:
-        if _status(error) is None or _status(error) >= 500:
+        if status_of(error) is None or status_of(error) >= 500:
             return error
         raise
 
@@ -237,62 +239,3 @@ def _is_data(file: str) -> bool:
     path = PurePosixPath(file)
     inside = not path.is_absolute() and ".." not in path.parts and "\\" not in file
     return file == MADE_BY_THE_HUB or (inside and path.suffix in KINDS)
-
-
-# Errors
-
-
-def _status(error: BaseException | None) -> Any:
-    """The number of the hub's answer; None: there was no answer."""
-    while error is not None:
-        if (response := getattr(error, "response", None)) is not None:
-            return response.status_code
-        error = error.__cause__
-    return None
-
-
-@contextmanager
-def _asking(
-    api: Any, name: str, *, writes: bool = False, revision: str | None = None
-) -> Iterator[None]:
-    """Errors of the hub's library as sentences for people."""
-    try:
-        yield
-    except SkillweaveError:
-        raise
-    except Exception as error:  # of any of the libraries that it stands on
-        raise SkillweaveError(_sentence(error, api.endpoint, name, writes, revision)) from error
-
-
-def _sentence(
-    error: Exception, endpoint: str, name: str, writes: bool, revision: str | None
-) -> str:
-    errors = importlib.import_module("huggingface_hub.errors")
-    status = _status(error)
-    login = "log in (hf auth login), or set HF_TOKEN"
-    if isinstance(error, errors.GatedRepoError):
-        return f"{name} is gated: ask for access on {endpoint}/{name}, then {login}"
-    if isinstance(error, errors.RevisionNotFoundError):
-        return f"{name} has no revision {short(revision)}; look at {endpoint}/{name}/commits/main"
-    if status == 401 and writes:
-        return f"{endpoint} does not know you: {login} to a token that may write"
-    if status == 403 and writes:
-        return (
-            f"you may not write to {name}: its owner must be you or an organisation of yours, and "
-            "your token one that may write"
-        )
-    if status in (401, 403, 404) or isinstance(error, errors.RepositoryNotFoundError):
-        return (
-            f"{endpoint} has no {name}, or it is private and you may not read it. Check the name; "
-            f"if it is private, {login}"
-        )
-    what = shortened(f"{type(error).__name__}: {error}".replace("\n", " "), 300)
-    if status is not None:
-        return f"{endpoint} refused {name} with the answer {status}; try again later. {what}"
-    if isinstance(error, errors.HFValidationError) or type(error) is ValueError:  # it was not asked
-        return f"{name} is refused: {what}"
-    after = "Nothing was pushed" if writes else f"There is no copy of {name} on this machine"
-    return (
-        f"{endpoint} cannot be reached. {after}. Check the network, HF_ENDPOINT and "
-        f"HF_HUB_OFFLINE, then try again. {what}"
-    )

@@ -6,7 +6,7 @@ import hashlib
 import importlib.util
 import os
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -135,8 +135,7 @@ class WandB:
         """Log the film; Weights & Biases keeps a copy."""
         import wandb
 
-        film = wandb.Video(str(path), format=path.suffix[1:])
-        self._run.log({f"film/{path.stem}": film, "film/steps": steps})
+        self._run.log({f"film/{path.stem}": wandb.Video(str(path)), "film/steps": steps})
 
     def close(self) -> None:
         """Finish the run."""
@@ -154,7 +153,11 @@ def make_mlflow(run: RunDirectory) -> Tracker:
     return MLflow(run, identifier(run))
 
 
-MAKE = {"tensorboard": TensorBoard, "wandb": WandB, "mlflow": make_mlflow}
+MAKE: dict[str, Callable[[RunDirectory], Tracker]] = {
+    "tensorboard": TensorBoard,
+    "wandb": WandB,
+    "mlflow": make_mlflow,
+}
 TRACKERS = tuple(MAKE)
 """Their names, and those of their modules and extras."""
 
