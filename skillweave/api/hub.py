@@ -9,7 +9,7 @@ from typing import Any
 
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.declared import declared_by
-from skillweave.messages import as_path
+from skillweave.messages import as_path, short
 from skillweave.reporting.card import write_card
 from skillweave.reporting.plots import plot_run
 from skillweave.runs import hub
@@ -72,6 +72,10 @@ def from_hub(
             needs code that was not given, or the hub does not answer.
         MissingExtra: the extra 'hub' is not installed.
     """
+    if hierarchy is not None and not isinstance(hierarchy, Hierarchy | Agent):
+        raise SkillweaveError(
+            f"hierarchy is {short(hierarchy)}; it must be the Hierarchy or Agent that was trained"
+        )
     path = hub.download(hub.check_name(name), revision)
     declared = hierarchy or declared_by(RunDirectory.open(path), ask=ASK)
     return declared.load(path)
@@ -86,8 +90,9 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
     RunDirectory.open(found)
     part = path.with_name(f".{path.name}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copytree(found, part)
+        (part / "policies").mkdir(parents=True)
+        for file in (f for pattern in hub.WANTED for f in found.glob(pattern)):
+            shutil.copy(file, part / file.relative_to(found))
         part.rename(path)
     except OSError as error:
         raise SkillweaveError(f"could not write {path}: {error.strerror or error}") from error

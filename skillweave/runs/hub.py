@@ -195,7 +195,6 @@ def download(name: str, revision: str | None = None) -> Path:
             path = Path(api.snapshot_download(name, **how))
             if path.name != info.sha:
                 raise SkillweaveError(f"{name} was changed while it was downloaded; try again")
-    _check_kinds(name, [p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()])
     return path
 
 

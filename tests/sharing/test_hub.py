@@ -102,6 +102,8 @@ def test_a_run_that_was_pushed_acts_the_same_where_it_is_loaded(run: sw.Run, hub
     assert same_actions(run, loaded)
     assert loaded.evaluate(episodes=2).returns == run.evaluate(episodes=2).returns
     assert loaded.info()["evaluation"] == run.info()["evaluation"]
+    (loaded.path / "report.html").write_text("made here, of what was loaded")
+    assert same_actions(run, sw.from_hub(NAME))
 
 
 def test_all_goes_up_in_one_commit_and_nothing_but_data(
@@ -155,6 +157,8 @@ def test_a_hierarchy_that_needs_code_is_given_it(hub: Hub, tmp_path: Path) -> No
     with pytest.raises(SkillweaveError, match=r"declared in Python.*from_hub\(name, hierarchy\)"):
         sw.from_hub(NAME)
     assert same_actions(sw.from_hub(NAME, declare(Careful())), run)
+    with pytest.raises(SkillweaveError, match="hierarchy is 'lunar-lander'; it must be the Hi"):
+        sw.from_hub(NAME, "lunar-lander")
     with pytest.raises(SkillweaveError, match="trained with the skills careful"):
         sw.from_hub(NAME, declare(Left()))
 
