@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from skillweave.algorithms.parameters import ParameterGroup
     from skillweave.algorithms.registry import register_algorithm
     from skillweave.api import Agent, Hierarchy, Run, train_agent
+    from skillweave.api.hub import from_hub
     from skillweave.api.options import make_options_env
     from skillweave.api.player import Player
     from skillweave.collecting.lengths import Lengths
@@ -93,6 +94,7 @@ _HOME = {
     "envpool": "envs.pool",
     "evaluate": "training.evaluation",
     "from_function": "skills",
+    "from_hub": "api.hub",
     "from_onnx": "skills",
     "from_sb3": "skills",
     "from_torch": "skills",
@@ -160,6 +162,7 @@ __all__ = [
     "envpool",
     "evaluate",
     "from_function",
+    "from_hub",
     "from_onnx",
     "from_sb3",
     "from_torch",

@@ -58,3 +58,10 @@ def whole_number(value: object, name: str, least: int) -> int:
     if value > MOST:
         raise SkillweaveError(f"{name} is {short(value)}; it must be at most {MOST:,}")
     return int(value)
+
+
+def as_path(path: str | Path, name: str) -> Path:
+    """``path`` as one; an error names the argument where it is none."""
+    if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
+        raise SkillweaveError(f"{name} is {short(path)}; it must be a path")
+    return Path(path)

@@ -33,6 +33,16 @@ def unprefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
     return {k[cut:]: v for k, v in named.items() if k.startswith(f"{prefix}.")}
 
 
+def flat(prefix: str, value: Any) -> dict[str, Any]:
+    """Nested dicts as one, with dotted names."""
+    if not isinstance(value, dict):
+        return {prefix: value}
+    found: dict[str, Any] = {}
+    for k, v in value.items():
+        found |= flat(f"{prefix}.{k}", v)
+    return found
+
+
 class SkillweaveError(Exception):
     """An error made for people: it says what was wrong, where, and what to do about it."""
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from hub_server import go_to, serve
 from pages import BLOCK, INCLUDED, ROOT, run_page, train_briefly
 
 import skillweave as sw
@@ -15,6 +17,7 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 NEEDS = {
     "docs/tutorials/first-hierarchy.md": ("Box2D",),
     "docs/tutorials/foreign-skills.md": ("stable_baselines3", "onnx", "onnxruntime"),
+    "docs/tutorials/sharing.md": ("huggingface_hub",),
     "docs/tutorials/other-libraries.md": ("stable_baselines3",),
 }
 """What a page's code needs beside the core."""
@@ -32,7 +35,11 @@ def test_the_code_of_a_page_runs(
         pytest.importorskip(module)
     train_briefly(monkeypatch)
     monkeypatch.chdir(tmp_path)
-    run_page(page, monkeypatch)
+    with ExitStack() as stack:
+        if "huggingface_hub" in NEEDS.get(name(page), ()):
+            hub = stack.enter_context(serve())
+            go_to(hub.url, tmp_path / "cache", monkeypatch)
+        run_page(page, monkeypatch)
 
 
 def test_pages_show_whole_files_that_exist() -> None:

@@ -155,6 +155,7 @@ def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
     alone.train(path, seed=0, quiet=True)
     found = lines(path)[-1]
     assert found["right.samples"] == 64
+    assert (found["right.usage"], found["selector.call_length"]) == (1.0, 1.0)
     assert found["length"] > 15
 
 

@@ -13,7 +13,7 @@ from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopt, check_run, spec_of
-from skillweave.api.run import Run, as_path
+from skillweave.api.run import Run
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
@@ -21,7 +21,7 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import below
 from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
-from skillweave.messages import short, whole_number
+from skillweave.messages import as_path, short, whole_number
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import make_trackers
@@ -127,7 +127,7 @@ class Hierarchy(Declaration):
             seed: the root of every random stream.
             flat: train one plain agent on the same number of steps instead: the baseline.
             quiet: no progress.
-            track: "tensorboard", "wandb".
+            track: any of "tensorboard", "wandb" and "mlflow".
             evolve: a population for every stage, or for some by name (a skill's, "selector",
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
 
@@ -222,7 +222,7 @@ def train_agent(
         run_dir: a new directory; an existing run is never overwritten.
         seed: the root of every random stream.
         quiet: no progress.
-        track: "tensorboard", "wandb".
+        track: any of "tensorboard", "wandb" and "mlflow".
         evolve: an ``Evolution``: a population in place of one agent.
 
     Returns:

@@ -7,20 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skillweave.api.labels import labels_of
 from skillweave.api.player import Player
 from skillweave.export.write import Export, write_export
-from skillweave.hierarchy.nesting import every_skill
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
-from skillweave.messages import short, whole_number
+from skillweave.messages import as_path, whole_number
 from skillweave.reporting.report.single import write_report
-from skillweave.reporting.video import color_of, render_policy
+from skillweave.reporting.video import render_policy
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import track_film
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
-from skillweave.training.plain_agent import AGENT, PlainAgent
-from skillweave.types import Memory, Policy, SkillweaveError
+from skillweave.training.plain_agent import PlainAgent
+from skillweave.types import Policy, SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy
@@ -106,7 +107,7 @@ class Run:
         skill: str | None = None,
         max_steps: int | None = None,
     ) -> dict[str, Any]:
-        """Write a captioned film.
+        """Write a captioned film; one in the run's own folder goes to its trackers, too.
 
         Args:
             path: the file; its ending says which, ``.gif`` or ``.mp4``.
@@ -119,34 +120,24 @@ class Run:
         Returns:
             ``path``, and what was filmed, as plain JSON.
         """
-        plain = isinstance(self.declaration, PlainAgent)
-        skills = {} if plain else dict(every_skill(self.hierarchy.skills))
-        colors = {name: color_of(i, s.color) for i, (name, s) in enumerate(skills.items())}
-
-        def label(memory: Memory) -> tuple[str, tuple[int, int, int]]:
-            if plain:
-                return AGENT, color_of(len(colors), None)
-            acting = policy.policy if isinstance(policy, SkillAlone) else policy
-            below = acting.acts(memory) if isinstance(acting, HierarchyPolicy) else None
-            name = "/".join(filter(None, (skill, below)))
-            known = name
-            while known not in colors:  # a run that is a ready skill has skills of its own
-                known = known.rpartition("/")[0]
-            return name, colors[known]
-
         policy, path = self._policy(skill), as_path(path, "path")
         seed = whole_number(seed, "seed", 0)
-        return render_policy(
+        plain = isinstance(self.declaration, PlainAgent)
+        skills = () if plain else self.hierarchy.skills
+        told = render_policy(
             self.declaration.spec,
             policy,
             path,
             episodes=episodes,
             seed=seed,
             deterministic=deterministic,
-            label=label,
+            label=labels_of(policy, skills, skill),
             max_steps=max_steps,
             rng=np.random.default_rng(seed),
         )
+        if path.parent.resolve() == self.path.resolve():
+            track_film(RunDirectory.open(self.path), path)
+        return told
 
     def act(self, obs: Any, **told: Any) -> Any:
         """The greedy action for one observation.
@@ -247,6 +238,28 @@ class Run:
         write_weights(path, self.declaration, self.policy)
         return path
 
+    def push(self, name: str, *, private: bool = False) -> dict[str, Any]:
+        """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
+
+        Up go weights, metrics, the saved evaluation, films that lie in the run's folder, figures,
+        and a page about all that: safetensors, JSON and pictures, in one commit. Log in first:
+        ``hf auth login``, or set ``HF_TOKEN``.
+
+        Args:
+            name: ``owner/name``; made if it is not there. An older run there is replaced.
+            private: others may not read it.
+
+        Returns:
+            ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
+
+        Raises:
+            SkillweaveError: the run is not finished or damaged, ``name`` may not be written or
+                holds something else, or the hub does not answer.
+        """
+        from skillweave.api.hub import push_run
+
+        return push_run(self.path, name, private)
+
     def as_skill(self, name: str, **attributes: Any) -> Skill:
         """All of it as one skill of another hierarchy.
 
@@ -280,10 +293,3 @@ class Run:
             assert isinstance(below, HierarchyPolicy)
             policy = below
         return SkillAlone(policy.skills, name)
-
-
-def as_path(path: str | Path, name: str) -> Path:
-    """``path`` as one; an error names the argument where it is none."""
-    if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
-        raise SkillweaveError(f"{name} is {short(path)}; it must be a path")
-    return Path(path)

@@ -42,7 +42,7 @@ class Train(Output):
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
     evolve: UseAppendAction[tuple[str, ...]] = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
-    track: UseAppendAction[tuple[Literal["tensorboard", "wandb"], ...]] = ()
+    track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()
     """Send metrics to a tracker as well."""
     scale: float = 1.0
     """Multiply every training budget: 0.1 for a quick look."""
@@ -182,6 +182,30 @@ class Export(Output):
 
 
 @dataclass(frozen=True)
+class Push(Output):
+    """Put a finished run on the Hugging Face Hub, with a page about it."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+    name: Positional[str] = tyro.MISSING
+    """OWNER/NAME on the hub; made if it is not there. An older run there is replaced."""
+    private: bool = False
+    """Others may not read it."""
+
+
+@dataclass(frozen=True)
+class Pull(Output):
+    """Copy a run from the Hugging Face Hub into a new folder."""
+
+    name: Positional[str] = tyro.MISSING
+    """OWNER/NAME on the hub."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """A new directory for the run; default: runs/NAME, numbered if taken."""
+    revision: str | None = None
+    """A branch, a tag or a commit; default: the latest."""
+
+
+@dataclass(frozen=True)
 class ImportAgilerl(Output):
     """Convert a checkpoint of AgileRL 0.1 or 1.0, which is a pickle."""
 
@@ -205,6 +229,8 @@ COMMANDS = (
     Info,
     Weights,
     Export,
+    Push,
+    Pull,
     ImportAgilerl,
 )
 Command = (
@@ -219,6 +245,8 @@ Command = (
     | Info
     | Weights
     | Export
+    | Push
+    | Pull
     | ImportAgilerl
 )
 

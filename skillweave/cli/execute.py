@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
-from skillweave.cli import commands
+from skillweave.cli import commands, share
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.run_lines import run_lines
 from skillweave.cli.targets import declared_by_run, target
@@ -47,6 +47,10 @@ def run(command: commands.Command) -> int:
             _weights(command)
         case commands.Export():
             _export(command)
+        case commands.Push():
+            tell(command, *share.push(command))
+        case commands.Pull():
+            tell(command, *share.pull(command))
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from skillweave import recipes
 from skillweave.api import Agent, Hierarchy, Run
+from skillweave.api.declared import declared_by, declared_in
 from skillweave.cli import commands
 from skillweave.hierarchy.weights import open_weights
 from skillweave.runs.directory import RunDirectory
@@ -28,7 +29,7 @@ def target(command: commands.Watched | commands.Export) -> Run:
         if header.get("kind") == "agent" and "env" in header:
             return Agent.from_weights(path)
         recipe = command.recipe or header.get("recipe")
-        return _declared(recipe, command.recipe, path).load_weights(path)
+        return declared_in(recipe, command.recipe, str(path)).load_weights(path)
     hint = (
         " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
     )
@@ -38,23 +39,14 @@ def target(command: commands.Watched | commands.Export) -> Run:
 def declared_by_run(
     path: Path, recipe: str | None, needs: str = "needs_recipe"
 ) -> Hierarchy | Agent:
-    """What a run was trained from; code never comes from inside the run.
-
-    Raises:
-        SkillweaveError: it needs code that was not given.
-    """
-    manifest = RunDirectory.open(path).manifest
-    if recipe is None and not manifest.get(needs, True):
-        kind = Agent if manifest["kind"] == "agent" else Hierarchy
-        return kind.from_manifest(manifest)
-    return _declared(recipe or manifest.get("recipe"), recipe, path)
+    """What the run at ``path`` was trained from; see ``declared_by``."""
+    return declared_by(RunDirectory.open(path), recipe, needs)
 
 
-def _declared(recipe: str | None, given: str | None, path: Path) -> Hierarchy:
-    if recipe is not None and (given is not None or recipe in recipes.names()):
-        return recipes.load(recipe)
-    made = f"in {recipe}" if recipe else "in Python"
-    raise SkillweaveError(
-        f"{path} was declared {made}, and needs that code. Point to the file that "
-        "defines it, if you trust it: --recipe FILE.py"
-    )
+def free(path: Path) -> Path:
+    """``path``, or the first of path-2, path-3, … that does not exist."""
+    number, candidate = 1, path
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}-{number}")
+    return candidate

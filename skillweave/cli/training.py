@@ -10,7 +10,7 @@ from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
-from skillweave.cli.targets import declared_by_run
+from skillweave.cli.targets import declared_by_run, free
 from skillweave.cli.telling import save_score, tell
 from skillweave.evolution.config import Evolution
 from skillweave.runs.directory import RunDirectory
@@ -63,7 +63,7 @@ def _trained(
     evolve: dict[str, Evolution | None] | None = None,
 ) -> Run:
     name = Path(command.recipe).stem + ("-flat" if flat else "")
-    path = out or _free(Path("runs") / f"{name}-s{command.seed}")
+    path = out or free(Path("runs") / f"{name}-s{command.seed}")
     try:
         return hierarchy.train(
             path,
@@ -130,12 +130,3 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
     except SkillweaveError:
         saved = "saved at the start"
     return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}{hint}")
-
-
-def _free(path: Path) -> Path:
-    """``path``, or the first of path-2, path-3, … that does not exist."""
-    number, candidate = 1, path
-    while candidate.exists():
-        number += 1
-        candidate = path.with_name(f"{path.name}-{number}")
-    return candidate

@@ -8,7 +8,7 @@ from typing import Any
 
 from skillweave.reporting.lineage import Born, Lineage, read_lineage
 from skillweave.reporting.palette import color_of
-from skillweave.runs.directory import RunDirectory
+from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.types import MissingExtra, SkillweaveError
 
 FAINT, TEXT = "#c9c9cf", "#4a4a52"
@@ -45,7 +45,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
             figure = _draw_curve(Figure, curve, name, color)
         folder.mkdir(parents=True, exist_ok=True)
         for suffix in (".png", ".svg"):
-            written.append(folder / f"{name}{suffix}")
+            written.append(folder / f"{file_name(name)}{suffix}")
             figure.savefig(written[-1], dpi=120)
     if not written:
         raise SkillweaveError(f"{run.path} holds nothing to draw yet: no episode has ended")

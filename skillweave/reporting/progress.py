@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from collections import deque
+from collections.abc import Iterator
 from typing import Any, Self
 
 REFRESH = 0.25  # seconds between two drawings of the bars
@@ -20,6 +21,8 @@ RECENT = 10.0  # seconds of training over which the speed is taken
 
 class Progress:
     """Shows each stage's steps, return (mean of the last 100 episodes), speed and time left.
+
+    Where several learn in a stage, each has a line below it: how much it acts, and its own reward.
 
     A context manager and a listener of the training loops. Without a terminal, in CI, and with
     NO_COLOR or TERM=dumb, it writes a line when a stage begins, one about every 5 s, and one when
@@ -96,15 +99,41 @@ class Progress:
         if self._bars is None:
             part = f"{steps:,} of {budget:,} steps ({min(steps / budget, 1):.0%})"
             self._line(f"{name}: " + ", ".join(filter(None, (part, result, speed, left))))
+            for agent, _, acts, reward in _agents(metrics):
+                self._line(f"  {agent}: " + ", ".join(filter(None, (acts, reward))))
         else:
             fields = {"result": result, "speed": speed, "left": left}
             fields["steps"] = f"{_short(steps)}/{_short(budget)}"
             self._bars.update(self._tasks[name], completed=min(steps, budget), **fields)
+            for told in _agents(metrics):
+                self._show_agent(name, *told)
             self._bars.refresh()
+
+    def _show_agent(
+        self, stage: str, name: str, usage: float | None, acts: str, reward: str
+    ) -> None:
+        """The bar of one who learns in a stage: how much it acts, of all steps."""
+        path = f"{stage}/{name}"
+        if path not in self._tasks:
+            fields = {"steps": "", "result": "", "speed": "", "left": ""}
+            self._tasks[path] = self._bars.add_task(f"  {name}", total=1.0, **fields)
+        self._bars.update(self._tasks[path], completed=usage or 0.0, steps=acts, result=reward)
 
     def _line(self, text: str) -> None:
         if not self._quiet:
             print(text, file=sys.stderr, flush=True)
+
+
+def _agents(metrics: dict[str, float]) -> Iterator[tuple[str, float | None, str, str]]:
+    """Who learns side by side: name, share of the steps in which it acts, and both in words."""
+    for key, value in metrics.items():
+        name, _, what = key.rpartition(".")
+        if what == "usage":
+            reward = metrics.get(f"{name}.reward")
+            words = "" if reward is None else f"reward {reward:.3g} a step"
+            yield name, value, f"{value:.0%} of steps", words
+        elif what == "call_length":
+            yield name, None, f"calls of {value:.1f} steps", ""
 
 
 def _may_draw() -> bool:

@@ -1,17 +1,47 @@
-"""Sends metrics to TensorBoard or Weights & Biases, besides ``metrics.jsonl``."""
+"""Sends metrics and films to TensorBoard, Weights & Biases or MLflow, besides ``metrics.jsonl``."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
 import os
-from collections.abc import Sequence
-from typing import Any
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Protocol
 
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.mlflow_tracker import MLflow
 from skillweave.types import MissingExtra, SkillweaveError
 
-TRACKERS = ("tensorboard", "wandb")
+
+class Tracker(Protocol):
+    """A listener of training that sends what it is told to somewhere else."""
+
+    def stage(self, name: str, budget: int) -> None:
+        """A stage begins, or goes on."""
+        ...
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """An update was made."""
+        ...
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """A stage is over."""
+        ...
+
+    def message(self, text: str) -> None:
+        """Something that people should know."""
+        ...
+
+    def film(self, path: Path, steps: int) -> None:
+        """A film was made, a GIF or an MP4, after so many steps of training."""
+        ...
+
+    def close(self) -> None:
+        """Nothing more will be told."""
+        ...
 
 
 class TensorBoard:
@@ -47,6 +77,20 @@ class TensorBoard:
     def message(self, text: str) -> None:
         """Messages are not tracked."""
 
+    def film(self, path: Path, steps: int) -> None:
+        """Write a GIF as it is; of an MP4 TensorBoard shows nothing."""
+        if path.suffix != ".gif":
+            return
+        from tensorboard.compat.proto.summary_pb2 import Summary
+        from torch.utils.tensorboard import FileWriter
+
+        data = path.read_bytes()
+        width, height = struct.unpack("<HH", data[6:10])
+        image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=data)
+        writer = FileWriter(str(self._path / "film"))
+        writer.add_summary(Summary(value=[Summary.Value(tag=path.stem, image=image)]), steps)
+        writer.close()
+
     def close(self) -> None:
         """Close the files."""
         for writer in self._writers.values():
@@ -65,7 +109,7 @@ class WandB:
         self._run: Any = wandb.init(
             project="skillweave",
             name=run.path.name,
-            id=_identifier(run),
+            id=identifier(run),
             resume="allow",
             dir=str(run.path),
             config=run.manifest,
@@ -87,24 +131,42 @@ class WandB:
     def message(self, text: str) -> None:
         """Messages are not tracked."""
 
+    def film(self, path: Path, steps: int) -> None:
+        """Log the film; Weights & Biases keeps a copy."""
+        import wandb
+
+        self._run.log({f"film/{path.stem}": wandb.Video(str(path)), "film/steps": steps})
+
     def close(self) -> None:
         """Finish the run."""
         self._run.finish()
 
 
-def _identifier(run: RunDirectory) -> str:
+def identifier(run: RunDirectory) -> str:
     """The same for a run and for what resumes it, and for no other."""
     told = (str(run.path.resolve()), run.manifest["created"], run.manifest.get("id"))
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
-def make_trackers(
-    names: Sequence[str], run: RunDirectory | None
-) -> tuple[TensorBoard | WandB, ...]:
+def make_mlflow(run: RunDirectory) -> Tracker:
+    """A run of MLflow's."""
+    return MLflow(run, identifier(run))
+
+
+MAKE: dict[str, Callable[[RunDirectory], Tracker]] = {
+    "tensorboard": TensorBoard,
+    "wandb": WandB,
+    "mlflow": make_mlflow,
+}
+TRACKERS = tuple(MAKE)
+"""Their names, and those of their modules and extras."""
+
+
+def make_trackers(names: Sequence[str], run: RunDirectory | None) -> tuple[Tracker, ...]:
     """The trackers with these names; if ``run`` is None, only check that they can be made.
 
     Raises:
-        SkillweaveError: no such tracker.
+        SkillweaveError: no such tracker, or it does not answer.
         MissingExtra: its package is not installed.
     """
     for name in names:
@@ -112,9 +174,35 @@ def make_trackers(
             raise SkillweaveError(f"no tracker {name!r}; there are: {', '.join(TRACKERS)}")
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(f"tracking with {name}", name)
-    if run is None:
-        return ()
-    return tuple(TensorBoard(run) if name == "tensorboard" else WandB(run) for name in names)
+    return () if run is None else tuple(MAKE[name](run) for name in names)
+
+
+@contextmanager
+def trackers_of(run: RunDirectory) -> Iterator[tuple[Tracker, ...]]:
+    """The trackers that a run was trained with, to tell what was found out since.
+
+    None where they are not installed: the run was trained on another machine.
+    """
+    with ExitStack() as stack:
+        try:
+            trackers = make_trackers(run.manifest.get("track", ()), run)
+        except MissingExtra:
+            trackers = ()
+        for tracker in trackers:
+            stack.callback(tracker.close)
+        yield trackers
+
+
+def track_film(run: RunDirectory, path: Path) -> None:
+    """Send a film to the run's trackers."""
+    with trackers_of(run) as trackers:
+        for tracker in trackers:
+            tracker.film(path, steps_of(run))
+
+
+def steps_of(run: RunDirectory) -> int:
+    """Environment steps of all stages."""
+    return sum(stage.get("steps", 0) for stage in run.manifest["stages"])
 
 
 def wandb_mode() -> Any:

@@ -9,9 +9,9 @@ from typing import Any, NotRequired, TypedDict
 from skillweave.reading import Count, fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
-from skillweave.runs.trackers import make_trackers
+from skillweave.runs.trackers import steps_of, trackers_of
 from skillweave.training.evaluation import Evaluation
-from skillweave.types import MissingExtra, SkillweaveError
+from skillweave.types import SkillweaveError
 
 CHARTS = {"usage": "share", "call_length": "length_mean", "success": "success_rate"}
 """What trackers are sent of each skill, and where it stands in its report."""
@@ -65,19 +65,14 @@ def save_evaluation(
 
 def _track(run: RunDirectory, evaluation: Evaluation) -> None:
     """Charts of the whole policy: its return, and of each skill usage, call length and success."""
-    steps = sum(stage.get("steps", 0) for stage in run.manifest["stages"])
     scores = {"return_mean": evaluation.mean}
     told = evaluation.to_json()["skills"]
     for kind, key in CHARTS.items():
         scores |= {f"{kind}/{k}": v[key] for k, v in told.items() if v[key] is not None}
-    try:
-        trackers = make_trackers(run.manifest.get("track", ()), run)
-    except MissingExtra:  # the run was trained on another machine
-        return
-    for tracker in trackers:
-        tracker.stage("evaluation", 0)
-        tracker.tick("evaluation", steps, 0.0, scores)
-        tracker.close()
+    with trackers_of(run) as trackers:
+        for tracker in trackers:
+            tracker.stage("evaluation", 0)
+            tracker.tick("evaluation", steps_of(run), 0.0, scores)
 
 
 def load_evaluation(run: RunDirectory) -> SavedEvaluation | None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from skillweave.buffers.rollout import RolloutStore
@@ -30,6 +31,7 @@ class WovenLearner:
         self._selector, self._critic = node + SELECTOR, node + CRITIC
         self.counts = {name: [0, 0] for name in parts}
         """By path, in how many rows each has acted, and how often it has learnt from them."""
+        self._acted: dict[str, Tensor] = {}
         self.stacks: Sequence[Stack] = [s for part in parts.values() for s in part.stacks]
         self.overlap = all(part.overlap for part in parts.values())
         self.report_every = max(part.report_every for part in parts.values())
@@ -62,6 +64,7 @@ class WovenLearner:
             self.counts[name][0] += int(
                 rows.reward.size if rows.valid is None else rows.valid.sum()
             )
+            self._acted |= prefixed(name, how_it_acted(name, rows))
             self.parts[name].take(rows)
 
     def _task_advantage(self, rows: Experience) -> Array:
@@ -77,7 +80,7 @@ class WovenLearner:
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """Let those learn that have enough rows; metrics under ``<name>.``."""
-        found: dict[str, Tensor] = {}
+        found, self._acted = self._acted, {}
         for name, part in self.parts.items():
             metrics = part.learn(update, steps, progress)
             self.counts[name][1] += bool(metrics)
@@ -100,6 +103,29 @@ class WovenLearner:
         """The inverse of ``kept``."""
         for name, part in self.parts.items():
             part.load(unprefixed(name, kept))
+
+
+def how_it_acted(name: str, rows: Experience) -> dict[str, Tensor]:
+    """Of a selector the mean steps of its calls; of a skill how much it acted, and its reward.
+
+    Args:
+        name: its path; of a critic there is nothing to say.
+        rows: its own.
+
+    Returns:
+        ``call_length``, or ``usage`` (a share of all steps) and ``reward`` (mean of a step, where
+        it acted), each (1,).
+    """
+    valid = np.ones(rows.reward.shape, bool) if rows.valid is None else rows.valid
+    found: dict[str, float] = {}
+    if name.rpartition("/")[2] == SELECTOR:
+        if valid.any():
+            found["call_length"] = rows.steps[valid].mean()
+    elif not decides(name):
+        found["usage"] = valid.mean()
+        if valid.any():
+            found["reward"] = rows.reward[valid].mean()
+    return {key: torch.tensor([float(value)]) for key, value in found.items()}
 
 
 def decides(path: str) -> bool:

@@ -144,6 +144,15 @@ def test_a_run_without_populations_shows_how_its_agents_learnt(tmp_path):
     assert [p.name for p in plot_run(RunDirectory.open(out))] == ["agent.png", "agent.svg"]
 
 
+def test_who_is_below_a_skill_is_drawn_as_well(tmp_path):
+    stage = {"name": "inner/hop", "kind": "skill", "learns": ["inner/hop"], "status": "done"}
+    directory = RunDirectory.create(tmp_path / "run", {"kind": "hierarchy", "stages": [stage]})
+    for steps in (100, 200):
+        directory.log({"stage": "inner/hop", "steps": steps, "return": 1.0})
+    directory.close()
+    assert [p.name for p in plot_run(directory)] == ["inner.hop.png", "inner.hop.svg"]
+
+
 def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):
     manifest: dict[str, Any] = dict(RunDirectory.open(run).manifest)
     empty = RunDirectory.create(tmp_path / "empty", manifest)

@@ -88,6 +88,28 @@ def test_speed_is_the_recent_one(clock: Clock, capsys: pytest.CaptureFixture[str
     assert lines[-1] == "landing: 72,000 of 100,000 steps (72%), 500 steps/s, 0:56 left"
 
 
+TOGETHER = {
+    "return": 22.84, "selector.call_length": 5.25, "selector.entropy": 0.7, "left.usage": 0.25,
+    "left.reward": 0.031, "inner/right.usage": 0.75, "inner/right.reward": -1.5, "idle.usage": 0.0,
+}  # fmt: skip
+
+
+def test_everyone_who_learns_in_a_stage_has_a_line(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Progress() as progress:
+        progress.stage("together", 10_000)
+        clock.now += 6
+        progress.tick("together", 5_000, 5.0, TOGETHER)
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        "together: 5,000 of 10,000 steps (50%), return 22.8, 1,000 steps/s, 0:05 left",
+        "  selector: calls of 5.2 steps",
+        "  left: 25% of steps, reward 0.031 a step",
+        "  inner/right: 75% of steps, reward -1.5 a step",
+        "  idle: 0% of steps",
+    ]
+
+
 def test_a_stage_done_without_a_start(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress() as progress:
         progress.done("landing", 5_000, 7322.0, {"return": -1.25})
@@ -133,6 +155,24 @@ def test_bars_keep_finished_stages(
         r"selector ━+[╸╺]?━+ 500k/2M +return 12.0 10,000 steps/s +2:30 left", lines[-1]
     )
     assert capsys.readouterr().out == ""
+
+
+def test_everyone_who_learns_in_a_stage_has_a_bar_of_how_much_it_acts(
+    clock: Clock, terminal: Terminal
+) -> None:
+    with redirect_stderr(terminal), Progress() as progress:
+        progress.stage("together", 10_000)
+        for i in range(1, 4):
+            clock.now += 1
+            progress.tick("together", 1_000 * i, 1.0 * i, TOGETHER | {"left.usage": i / 10})
+        progress.done("together", 10_000, 5.0, TOGETHER)
+    *_, together, selector, left, right, idle = (" ".join(x.split()) for x in screen(terminal))
+    bar = "━+[╸╺]?━*"
+    assert re.fullmatch(f"together {bar} 10k/10k return 22.8 2,000 steps/s done in 0:05", together)
+    assert re.fullmatch(f"selector {bar} calls of 5.2 steps", selector)
+    assert re.fullmatch(f"left {bar} 25% of steps reward 0.031 a step", left)
+    assert re.fullmatch(f"inner/right {bar} 75% of steps reward -1.5 a step", right)
+    assert re.fullmatch(f"idle {bar} 0% of steps", idle)
 
 
 def test_bars_are_drawn_a_few_times_a_second(clock: Clock, terminal: Terminal) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.trackers import TRACKERS, make_trackers
+from skillweave.runs.trackers import TRACKERS, make_trackers, track_film, trackers_of
 from skillweave.types import MissingExtra, SkillweaveError
 
 
@@ -26,18 +26,26 @@ def test_no_trackers_are_made_where_none_are_named(run: RunDirectory) -> None:
 
 
 def test_an_unknown_tracker_is_answered_with_those_there_are(run: RunDirectory) -> None:
-    with pytest.raises(SkillweaveError, match="'tensorbored'; there are: tensorboard, wandb"):
+    with pytest.raises(
+        SkillweaveError, match="'tensorbored'; there are: tensorboard, wandb, mlflow"
+    ):
         make_trackers(("tensorbored",), run)
 
 
-@pytest.mark.parametrize("name", TRACKERS)
-def test_a_missing_package_names_its_extra(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def uninstall(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let a package be missing; what finds packages in truth."""
     real = importlib.util.find_spec
 
     def without(wanted: str, package: str | None = None) -> Any:
         return None if wanted == name else real(wanted, package)
 
     monkeypatch.setattr(importlib.util, "find_spec", without)
+    return real
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_a_missing_package_names_its_extra(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = uninstall(name, monkeypatch)
     with pytest.raises(MissingExtra, match=rf"pip install 'skillweave\[{name}\]'"):
         make_trackers((name,), None)
     for other in set(TRACKERS) - {name}:
@@ -53,7 +61,7 @@ def test_a_missing_package_is_said_before_anything_is_written(
     class Balance(Skill):
         pass
 
-    monkeypatch.setattr(importlib.util, "find_spec", lambda *_: None)
+    uninstall("wandb", monkeypatch)
     with pytest.raises(MissingExtra):
         Hierarchy("CartPole-v1", [Balance()]).train(tmp_path / "run", track=["wandb"])
     assert not (tmp_path / "run").exists()
@@ -144,6 +152,45 @@ def test_a_saved_evaluation_draws_what_each_skill_did(run: RunDirectory) -> None
     }  # fmt: skip
 
 
+def gif(path: Path) -> Path:
+    """A GIF of one frame of 3 by 2 pixels, as far as its header says."""
+    path.write_bytes(b"GIF89a\x03\x00\x02\x00\xf0\x00\x00;")
+    return path
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_tensorboard_shows_a_film(run: RunDirectory) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run.manifest["track"] = ["tensorboard"]
+    run.manifest["stages"] = [{"name": "land", "steps": 500}, {"name": "selector", "steps": 200}]
+    film = gif(run.path / "hierarchy.gif")
+    track_film(run, film)
+    track_film(run, run.path / "other.mp4")  # it cannot show those, and says nothing
+    events = EventAccumulator(str(run.path / "tensorboard/film")).Reload()
+    assert events.Tags()["images"] == ["hierarchy"]
+    (image,) = events.Images("hierarchy")
+    assert (image.step, image.width, image.height) == (700, 3, 2)
+    assert image.encoded_image_string == film.read_bytes()
+
+
+def test_a_film_in_the_run_itself_goes_to_its_trackers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from skillweave import PPO, Network, train_agent
+    from skillweave.api import run as module
+
+    small = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)))
+    trained = train_agent("CartPole-v1", small, 16, tmp_path / "run", quiet=True)
+    monkeypatch.setattr(module, "render_policy", lambda spec, policy, path, **_: {"path": path})
+    sent: list[Path] = []
+    monkeypatch.setattr(module, "track_film", lambda run, path: sent.append(path))
+    trained.render(tmp_path / "elsewhere.gif")
+    trained.render(tmp_path / "run" / "agent.gif")
+    assert sent == [tmp_path / "run" / "agent.gif"]
+
+
 OFFLINE = """
 import socket, sys
 from pathlib import Path
@@ -155,6 +202,9 @@ run = RunDirectory.create(Path(sys.argv[1]), {"env": "CartPole-v1", "seed": 0, "
 tracker.stage("landing", 1000)
 tracker.tick("landing", 128, 0.5, {"return": 1.5})
 tracker.done("landing", 128, 0.5, {"return": 1.5})
+film = run.path / "agent.gif"
+film.write_bytes(b"GIF89a\\x03\\x00\\x02\\x00\\xf0\\x00\\x00;")
+tracker.film(film, 128)
 tracker.close()
 """
 
@@ -183,3 +233,54 @@ def test_wandb_without_a_login_works_offline_and_asks_for_nothing(tmp_path: Path
     written = list((tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb"))
     assert len(written) == 1
     assert b"landing/return" in written[0].read_bytes()
+    (film,) = (tmp_path / "run" / "wandb").glob("offline-run-*/files/media/videos/**/*.gif")
+    assert film.read_bytes().startswith(b"GIF89a")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
+    run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mlflow = pytest.importorskip("mlflow")
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+    monkeypatch.chdir(tmp_path)
+    run.manifest["track"] = ["mlflow"]
+    stage = {"name": "landing", "kind": "skill", "algorithm": {"gamma": 0.9}, "steps": 300}
+    run.manifest["stages"] = [stage | {"status": "training"}]
+    (killed,) = make_trackers(("mlflow",), run)
+    for steps in (100, 200, 300):
+        killed.tick("landing", steps, 1.0, {"return": steps / 100})
+    killed.close()
+    client = mlflow.MlflowClient(uri)
+    experiment = client.get_experiment_by_name("skillweave").experiment_id
+    assert [r.info.status for r in client.search_runs([experiment])] == ["KILLED"]
+    run.manifest["stages"][0]["status"] = "done"
+    (resumed,) = make_trackers(("mlflow",), run)
+    for steps in (200, 300, 400):  # the latest checkpoint was of step 100
+        resumed.tick("landing", steps, 1.0, {"return": steps / 100})
+    resumed.close()
+    with trackers_of(run) as (later,):
+        later.tick("evaluation", 400, 0.0, {"usage/land": 0.5})
+        later.film(gif(run.path / "agent.gif"), 400)
+    (found,) = client.search_runs([experiment])
+    points = client.get_metric_history(found.info.run_id, "landing/return")
+    assert [(p.step, p.value) for p in points] == [(100, 1), (200, 2), (300, 3), (400, 4)]
+    assert found.data.metrics["evaluation/usage/land"] == 0.5
+    assert found.data.params["landing.gamma"] == "0.9"
+    assert (found.info.run_name, found.info.status) == ("run", "FINISHED")
+    (film,) = client.list_artifacts(found.info.run_id, "films/400")
+    assert film.path == "films/400/agent.gif"
+    content = {"env": "CartPole-v1", "seed": 0, "stages": []}
+    make_trackers(("mlflow",), RunDirectory.create(tmp_path / "other", content))[0].close()
+    assert len(client.search_runs([experiment])) == 2
+
+
+def test_where_mlflow_does_not_answer_it_is_said_before_training(
+    run: RunDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mlflow")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    with pytest.raises(SkillweaveError, match=r"http://127.0.0.1:9 does not answer.*TRACKING_URI"):
+        make_trackers(("mlflow",), run)

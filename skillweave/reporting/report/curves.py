@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,6 +53,13 @@ def read_curves(run: RunDirectory) -> list[Curves]:
             curves.points.setdefault(metric, []).append((int(line["steps"]), float(value)))
     order = list(stages)
     return sorted(found.values(), key=lambda c: (order.index(c.stage), c.agent != c.stage, c.agent))
+
+
+def reached_steps(all_curves: Sequence[Curves]) -> dict[str, int]:
+    """By stage, the steps of the last line of its metrics."""
+    return {
+        c.stage: max(points[-1][0] for points in c.points.values()) for c in all_curves if c.points
+    }
 
 
 def metrics_of(all_curves: list[Curves]) -> list[str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from skillweave.reporting.report.skills_table import number
 from skillweave.runs.directory import RunDirectory
+from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {"steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers"}
@@ -114,16 +115,6 @@ def settings(run: RunDirectory) -> dict[str, Any]:
     for entry in m["stages"]:
         own = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name"}}
         found |= flat(entry["name"], own)
-    return found
-
-
-def flat(prefix: str, value: Any) -> dict[str, Any]:
-    """Nested dicts as one, with dotted names."""
-    if not isinstance(value, dict):
-        return {prefix: value}
-    found: dict[str, Any] = {}
-    for k, v in value.items():
-        found |= flat(f"{prefix}.{k}", v)
     return found
 
 

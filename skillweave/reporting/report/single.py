@@ -19,7 +19,13 @@ from skillweave.reporting.report.calls import (
     decision_data,
     episode_data,
 )
-from skillweave.reporting.report.curves import Curves, metrics_of, read_curves, thinned
+from skillweave.reporting.report.curves import (
+    Curves,
+    metrics_of,
+    reached_steps,
+    read_curves,
+    thinned,
+)
 from skillweave.reporting.report.film import Film, make_film
 from skillweave.reporting.report.page import library, write_page
 from skillweave.reporting.report.skills_table import (
@@ -116,7 +122,7 @@ def write_report(
     filmed = whole_number(filmed, "films", 0)
     library()  # a missing extra is said before anything is played
     all_curves = read_curves(run)
-    reached = _reached(all_curves)
+    reached = reached_steps(all_curves)
     missing = facts.missing_stages(run, reached)
     missing += [why_not] if why_not and run.finished else []
     played = None
@@ -144,13 +150,6 @@ def write_report(
 
 def _sentence(error: SkillweaveError) -> str:
     return f"{str(error).rstrip('.')}."
-
-
-def _reached(all_curves: Sequence[Curves]) -> dict[str, int]:
-    """By stage, the steps of the last line of its metrics."""
-    return {
-        c.stage: max(points[-1][0] for points in c.points.values()) for c in all_curves if c.points
-    }
 
 
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:

@@ -1,0 +1,101 @@
+"""Sharing runs by the Hugging Face Hub: push one, and load one that somebody has pushed."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from skillweave.api import Agent, Hierarchy, Run
+from skillweave.api.declared import declared_by
+from skillweave.messages import as_path, short
+from skillweave.reporting.card import write_card
+from skillweave.reporting.plots import plot_run
+from skillweave.runs import hub
+from skillweave.runs.directory import RunDirectory
+from skillweave.training.evaluation_file import load_evaluation
+from skillweave.types import SkillweaveError
+
+ASK = (
+    "Pass the hierarchy that was trained, if you have its code and trust it: "
+    "from_hub(name, hierarchy)"
+)
+
+
+def push_run(path: Path, name: str, private: bool = False) -> dict[str, Any]:
+    """Put the run at ``path`` on the hub; see ``Run.push``."""
+    hub.hub()  # a missing extra is said first
+    run, name = RunDirectory.open(path), hub.check_name(name)
+    hub.check_whole(run)
+    files: dict[str, Path | bytes] = {}
+    own, stays = hub.run_files(run)
+    films, missing = hub.run_films(run), [f"{f} is no safetensors file: it stays" for f in stays]
+    if not films:
+        missing.append(f"no film: skillweave render {path} --out {path / 'film.gif'}")
+    if load_evaluation(run) is None:
+        missing.append(f"no evaluation: skillweave evaluate {path}")
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            drawn = [p for p in plot_run(run, Path(folder)) if p.suffix == ".png"]
+        except SkillweaveError as error:
+            drawn = []
+            missing.append(f"no figures: {error}")
+        figures = {f"{hub.FIGURES}/{p.name}": p for p in drawn}
+        shown = {"films": [p.name for p in films], "figures": list(figures)}
+        files["README.md"] = write_card(run, name, **shown).encode()
+        files |= own | {p.name: p for p in films} | figures
+        told = hub.upload(name, files, private)
+    return {**told, "files": list(files), "missing": missing}
+
+
+def from_hub(
+    name: str, hierarchy: Hierarchy | Agent | None = None, *, revision: str | None = None
+) -> Run:
+    """Load a run from the Hugging Face Hub, as ``hierarchy.load`` loads one from a folder.
+
+    Only data comes from there: safetensors and JSON, checked like any run's files. It needs the
+    extra ``hub``. The files are kept where ``huggingface_hub`` keeps its own (``HF_HOME``), and
+    without a network a run is loaded from there.
+
+    Args:
+        name: ``owner/name``.
+        hierarchy: what was trained, where acting needs its Python code; None: not needed, or a
+            recipe that is shipped.
+        revision: a branch, a tag or a commit; None: the latest.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        SkillweaveError: there is no such run, it holds a file that is not data, it is damaged, it
+            needs code that was not given, or the hub does not answer.
+        MissingExtra: the extra 'hub' is not installed.
+    """
+    if hierarchy is not None and not isinstance(hierarchy, Hierarchy | Agent):
+        raise SkillweaveError(
+            f"hierarchy is {short(hierarchy)}; it must be the Hierarchy or Agent that was trained"
+        )
+    path = hub.download(hub.check_name(name), revision)
+    declared = hierarchy or declared_by(RunDirectory.open(path), ask=ASK)
+    return declared.load(path)
+
+
+def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
+    """Copy a run from the hub into a new folder; errors are those of ``from_hub``."""
+    path = as_path(path, "path")
+    if path.exists():
+        raise SkillweaveError(f"{path} is there already; choose another folder")
+    found = hub.download(hub.check_name(name), revision)
+    RunDirectory.open(found)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        (part / "policies").mkdir(parents=True)
+        for file in (f for pattern in hub.WANTED for f in found.glob(pattern)):
+            shutil.copy(file, part / file.relative_to(found))
+        part.rename(path)
+    except OSError as error:
+        raise SkillweaveError(f"could not write {path}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return path

@@ -1,0 +1,35 @@
+"""The commands that talk to the Hugging Face Hub: ``push`` and ``pull``."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+from skillweave.api.hub import pull_run, push_run
+from skillweave.cli import commands
+from skillweave.cli.targets import free
+from skillweave.runs.hub import check_name, hub
+
+
+def push(command: commands.Push) -> tuple[dict[str, Any], str]:
+    """Put a run on the hub; what happened, as JSON and for people."""
+    _no_bars()
+    told = push_run(command.run, command.name, command.private)
+    lines = [f"{told['url']}: {len(told['files'])} files", *told["missing"]]
+    lines.append(f"load it: skillweave.from_hub({command.name!r})")
+    return told, "\n".join(lines)
+
+
+def pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
+    """Copy a run from the hub; where it is now, as JSON and for people."""
+    _no_bars()
+    name = check_name(command.name).partition("/")[2]
+    path = pull_run(command.name, command.out or free(Path("runs") / name), command.revision)
+    return {"path": str(path)}, f"run     {path}  (skillweave info|evaluate|render {path})"
+
+
+def _no_bars() -> None:
+    """Keep the hub's library from drawing a bar for each file."""
+    hub()  # a missing extra is said
+    importlib.import_module("huggingface_hub.utils").disable_progress_bars()

@@ -1,0 +1,153 @@
+"""The page of a run on the hub: a model card, written from what the run's files say."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any
+from urllib.parse import quote
+
+from skillweave.reporting.report.curves import reached_steps, read_curves
+from skillweave.reporting.report.facts import facts, plain, settings, stage_rows
+from skillweave.reporting.report.skills_table import WHY, percent, skill_rows
+from skillweave.runs.directory import RunDirectory
+from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
+
+
+def write_card(
+    run: RunDirectory, name: str, *, films: Sequence[str], figures: Sequence[str]
+) -> str:
+    """The card as Markdown, with a header that the hub reads.
+
+    Args:
+        name: ``owner/name`` on the hub.
+        films, figures: files that lie there beside the card.
+
+    Raises:
+        SkillweaveError: a file of the run is damaged.
+    """
+    saved = load_evaluation(run)
+    parts = [
+        _header(run, name, saved),
+        f"# {name.partition('/')[2]}",
+        _about(run),
+        *(_shown(path) for path in films),
+        _use(run, name),
+        _measured(saved),
+        _training(run),
+        *(_shown(path) for path in figures),
+        _folded("All settings", ("setting", "value"), settings(run)),
+        _folded("Versions", ("of", "version"), run.manifest["versions"]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
+    """The YAML that the hub reads; every value is written as JSON, which is YAML too."""
+    env = run.manifest["env"]
+    kind = "hierarchical-" if run.manifest["kind"] == "hierarchy" else ""
+    told: dict[str, Any] = {
+        "library_name": "skillweave",
+        "pipeline_tag": "reinforcement-learning",
+        "tags": [f"{kind}reinforcement-learning", "skillweave", env],
+    }
+    if saved is not None:
+        score = saved.evaluation.to_json()
+        value = f"{score['mean']:.2f} +/- {score['std']:.2f}"
+        task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
+        metric = {"type": "mean_reward", "name": "mean_reward", "value": value, "verified": False}
+        result = {"task": task, "dataset": {"name": env, "type": env}, "metrics": [metric]}
+        told["model-index"] = [{"name": name.partition("/")[2], "results": [result]}]
+    lines = [f"{key}: {json.dumps(value)}" for key, value in told.items()]
+    return "\n".join(["---", *lines, "---"])
+
+
+def _about(run: RunDirectory) -> str:
+    what = "hierarchy of skills" if run.manifest["kind"] == "hierarchy" else "plain agent"
+    rows = [f"| {text(k)} | {text(v)} |" for k, v in facts(run)]
+    rows = [row if not row.startswith("| Recipe ") else _recipe(run) for row in rows]
+    return "\n".join([f"A {what}, trained with Skillweave.", "", "| | |", "|---|---|", *rows])
+
+
+def _recipe(run: RunDirectory) -> str:
+    """A recipe by its name alone: where it lies on somebody's machine is nobody's business."""
+    recipe = run.manifest.get("recipe")
+    return f"| Recipe | {text(PurePosixPath(recipe).name if recipe else 'declared in Python')} |"
+
+
+def _shown(path: str) -> str:
+    """A picture, or a link where pages show no such picture."""
+    link = f"[{text(PurePosixPath(path).stem)}](./{quote(path)})"
+    return link if path.endswith(".mp4") else f"!{link}"
+
+
+def _use(run: RunDirectory, name: str) -> str:
+    code = run.manifest.get("needs_recipe", True)
+    given = ", hierarchy" if code else ""
+    lines = ["## Use", ""]
+    if code:
+        lines += [
+            "It needs the Python code in which its hierarchy was declared, which is not here: pass "
+            "that `hierarchy`, unless it is a recipe that Skillweave ships.",
+            "",
+        ]
+    lines += [
+        "```python", "import skillweave as sw", "", f'run = sw.from_hub("{name}"{given})',
+        "print(run.evaluate(episodes=10))", "```", "",
+        "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
+        "comes with them.",
+    ]  # fmt: skip
+    if stays := [s for s in run.manifest.get("skills", ()) if _is_onnx(s)]:
+        names = ", ".join(text(s["name"]) for s in stays)
+        lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
+    return "\n".join(lines)
+
+
+def _is_onnx(skill: Mapping[str, Any]) -> bool:
+    return bool(skill.get("policy", {}).get("kind") == "onnx")
+
+
+def _measured(saved: SavedEvaluation | None) -> str:
+    """What the whole policy scored, and what each skill did."""
+    if saved is None:
+        return "## Measured\n\nIt was not evaluated."
+    score = saved.evaluation
+    how = "greedy" if saved.deterministic else "sampled"
+    whole = str(score).partition("; skills:")[0]
+    lines = ["## Measured", "", f"Return {text(whole)} ({how}, seed {saved.seed})."]
+    if score.skills:
+        head = ("skill", "of all steps", "calls", "steps of a call", *(f"ends {w}" for w in
+                WHY.values()), "success", "own return of a call")  # fmt: skip
+        lines += ["", "What each skill did:", "", _row(head), _row(["---"] * len(head))]
+        for row in skill_rows(score.skills):
+            cells = [row["name"], percent(row["share"]), row["calls"], row["length"], *row["ends"]]
+            lines.append(_row([*cells, row["success"], row["return"]]))
+    return "\n".join(lines)
+
+
+def _training(run: RunDirectory) -> str:
+    keys = ("name", "algorithm", "steps", "seconds", "return", "notes")
+    head = ("stage", "algorithm", "steps", "seconds", "return at its end", "")
+    lines = ["## Training", "", _row(head), _row(["---"] * len(head))]
+    for row in stage_rows(run, reached_steps(read_curves(run))):
+        lines.append(_row([row[key] for key in keys]))
+    return "\n".join(lines)
+
+
+def _folded(title: str, head: tuple[str, str], rows: Mapping[str, Any]) -> str:
+    """A table that people open where they want to see it."""
+    lines = [f"<details><summary>{title}</summary>", "", _row(head), _row(["---"] * 2)]
+    return "\n".join([*lines, *(_row([k, plain(v)]) for k, v in rows.items()), "", "</details>"])
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(c if c == "---" else text(c) for c in cells) + " |"
+
+
+def text(value: str) -> str:
+    """A value in Markdown as it is: nothing in it is read as Markdown or HTML."""
+    plain_text = re.sub(r"([\\`*_{}\[\]()#|~!$])", r"\\\1", " ".join(value.split()))
+    return html.escape(plain_text, quote=False)

@@ -1,0 +1,326 @@
+"""Runs pushed to a hub on this machine, and loaded from there."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hub_server import Hub, go_to, serve
+
+import skillweave as sw
+from skillweave.cli import main
+from skillweave.runs.directory import RunDirectory
+from skillweave.types import MissingExtra, SkillweaveError
+
+pytest.importorskip("huggingface_hub")
+
+NAME = "ada/cart"
+SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
+NOWHERE = "http://127.0.0.1:9"
+"""A port at which nothing listens: no network."""
+
+
+class Left(sw.Skill):
+    max_steps = 10
+
+    def reward(self, step):
+        return -step.next_obs[:, 0]
+
+    def success(self, step):
+        return step.next_obs[:, 0] < 0
+
+
+class Right(sw.Skill):
+    max_steps = 10
+
+
+class Careful(sw.Skill):
+    """Needs its Python code to act."""
+
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 0]) > 0.5
+
+
+def declare(*skills: sw.Skill) -> sw.Hierarchy:
+    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
+    how: dict[str, Any] = {"call_steps": 5, "algorithm": SMALL, "selector": SMALL}
+    return sw.Hierarchy(env, skills, skill_steps=100, selector_steps=100, **how)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> sw.Run:
+    """A run with an evaluation and a film."""
+    path = tmp_path_factory.mktemp("trained") / "run"
+    run = declare(Left(), Right()).train(path, quiet=True)
+    run.evaluate(episodes=4, save=True)
+    (path / "hierarchy.gif").write_bytes(b"GIF89a, as far as the hub knows")
+    return run
+
+
+@pytest.fixture
+def run(trained: sw.Run, tmp_path: Path) -> sw.Run:
+    """A copy of it, which a test may change; without curves, which take long to draw."""
+    shutil.copytree(trained.path, tmp_path / "run")
+    (tmp_path / "run/metrics.jsonl").unlink()
+    return sw.Run(trained.declaration, tmp_path / "run", trained.policy)
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    with serve() as found:
+        go_to(found.url, tmp_path / "cache", monkeypatch)
+        yield found
+
+
+def files_of(path: Path) -> dict[str, bytes]:
+    """A run's files as they are on the hub."""
+    names = ("run.json", "metrics.jsonl", "evaluation.json")
+    found = {name: (path / name).read_bytes() for name in names if (path / name).exists()}
+    return found | {f"policies/{p.name}": p.read_bytes() for p in (path / "policies").iterdir()}
+
+
+def same_actions(a: sw.Run, b: sw.Run) -> bool:
+    obs = np.random.default_rng(0).normal(size=(200, 4)).astype(np.float32)
+    acts = [run.policy.act(run.policy.start(200), obs)[0] for run in (a, b)]
+    return bool((acts[0] == acts[1]).all())
+
+
+# There and back
+
+
+def test_a_run_that_was_pushed_acts_the_same_where_it_is_loaded(run: sw.Run, hub: Hub) -> None:
+    told = run.push(NAME)
+    assert told["url"] == f"{hub.url}/{NAME}"
+    assert told["commit"] == hub.repos[NAME].commits[-1].sha
+    loaded = sw.from_hub(NAME)
+    assert same_actions(run, loaded)
+    assert loaded.evaluate(episodes=2).returns == run.evaluate(episodes=2).returns
+    assert loaded.info()["evaluation"] == run.info()["evaluation"]
+    (loaded.path / "report.html").write_text("made here, of what was loaded")
+    assert same_actions(run, sw.from_hub(NAME))
+
+
+def test_all_goes_up_in_one_commit_and_nothing_but_data(
+    run: sw.Run, trained: sw.Run, hub: Hub
+) -> None:
+    pytest.importorskip("matplotlib")
+    shutil.copy(trained.path / "metrics.jsonl", run.path)
+    for name in ("notes.txt", "train.py", "checkpoint.safetensors", "report.html"):
+        (run.path / name).write_text("mine")
+    told = run.push(NAME)
+    figures = {f"figures/{name}.png" for name in ("left", "right", "selector")}
+    own = {"README.md", "hierarchy.gif", *files_of(run.path), *figures}
+    assert set(hub.files(NAME)) == own == set(told["files"])
+    assert len(hub.repos[NAME].commits) == 2  # the hub's own first one, and this
+    assert {k: hub.files(NAME)[k] for k in files_of(run.path)} == files_of(run.path)
+    assert told["missing"] == []
+
+
+def test_what_a_run_has_not_is_said(run: sw.Run, hub: Hub) -> None:
+    (run.path / "hierarchy.gif").unlink()
+    (run.path / "evaluation.json").unlink()
+    (run.path / "policies/hop.onnx").write_bytes(b"a graph")
+    hop, film, evaluation, figures = run.push(NAME)["missing"]
+    assert hop == "policies/hop.onnx is no safetensors file: it stays"
+    assert film.startswith("no film: skillweave render")
+    assert evaluation.startswith("no evaluation: skillweave evaluate")
+    assert figures.startswith("no figures: ")
+    assert not [name for name in hub.files(NAME) if name.endswith((".onnx", ".gif", ".png"))]
+
+
+def test_a_later_run_takes_the_place_of_an_older_one_which_its_commit_still_has(
+    run: sw.Run, hub: Hub, tmp_path: Path
+) -> None:
+    first = run.push(NAME)
+    (run.path / "hierarchy.gif").rename(run.path / "film.mp4")
+    other = declare(Right()).train(tmp_path / "other", quiet=True)
+    hub.repos[NAME].commits[-1].files["notes.md"] = b"written on the hub"
+    other.push(NAME)
+    assert "policies/left.safetensors" not in hub.files(NAME)
+    assert "hierarchy.gif" not in hub.files(NAME)
+    assert hub.files(NAME)["notes.md"] == b"written on the hub"
+    assert same_actions(sw.from_hub(NAME), other)
+    assert same_actions(sw.from_hub(NAME, revision=first["commit"]), run)
+
+
+def test_a_hierarchy_that_needs_code_is_given_it(hub: Hub, tmp_path: Path) -> None:
+    hierarchy = declare(Careful())
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run.push(NAME)
+    assert f'sw.from_hub("{NAME}", hierarchy)' in hub.files(NAME)["README.md"].decode()
+    with pytest.raises(SkillweaveError, match=r"declared in Python.*from_hub\(name, hierarchy\)"):
+        sw.from_hub(NAME)
+    assert same_actions(sw.from_hub(NAME, declare(Careful())), run)
+    with pytest.raises(SkillweaveError, match="hierarchy is 'lunar-lander'; it must be the Hi"):
+        sw.from_hub(NAME, "lunar-lander")
+    with pytest.raises(SkillweaveError, match="trained with the skills careful"):
+        sw.from_hub(NAME, declare(Left()))
+
+
+def test_a_plain_agent_is_shared_as_well(hub: Hub, tmp_path: Path) -> None:
+    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
+    run = sw.train_agent(env, SMALL, 100, tmp_path / "run", quiet=True)
+    run.push(NAME)
+    assert same_actions(sw.from_hub(NAME), run)
+
+
+def test_without_a_network_a_run_is_loaded_as_it_was_downloaded(
+    run: sw.Run, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.push(NAME)
+    sw.from_hub(NAME)
+    go_to(NOWHERE, tmp_path / "cache", monkeypatch)
+    assert same_actions(sw.from_hub(NAME), run)
+    go_to(NOWHERE, tmp_path / "empty", monkeypatch)
+    with pytest.raises(
+        SkillweaveError, match=r"cannot be reached.*no copy of ada/cart.*ConnectError"
+    ):
+        sw.from_hub(NAME)
+
+
+# What is not loaded
+
+
+@pytest.mark.parametrize("name", ["train.py", "policies/x.pkl", "model.bin", "a/../../b.json"])
+def test_a_file_that_is_not_data_is_refused_before_anything_is_downloaded(
+    name: str, run: sw.Run, hub: Hub
+) -> None:
+    hub.make(NAME, {**files_of(run.path), name: b"import os"})
+    with pytest.raises(SkillweaveError, match=f"{NAME} holds '{name}'.*nothing of it is used"):
+        sw.from_hub(NAME)
+    assert [line for line in hub.asked if "/resolve/" in line] == []
+
+
+def test_files_of_the_hub_are_checked_like_those_of_any_run(run: sw.Run, hub: Hub) -> None:
+    files = files_of(run.path)
+    altered = files["run.json"].replace(b'"call_steps": 5', b'"call_steps": 6')
+    hub.make(NAME, files | {"run.json": altered})
+    with pytest.raises(SkillweaveError, match=r"run\.json is damaged.*checksum"):
+        sw.from_hub(NAME)
+    swapped = {"policies/left.safetensors": files["policies/right.safetensors"]}
+    hub.make("ada/swapped", files | swapped)
+    with pytest.raises(SkillweaveError, match="holds the policy of stage 'right'"):
+        sw.from_hub("ada/swapped")
+    hub.make("ada/cut", files | {"policies/left.safetensors": b"\0" * 20})
+    with pytest.raises(SkillweaveError, match="damaged"):
+        sw.from_hub("ada/cut")
+
+
+def test_what_is_no_run_is_said(hub: Hub) -> None:
+    hub.make(NAME, {"config.json": b"{}", "model.safetensors": b""})
+    with pytest.raises(SkillweaveError, match="ada/cart holds no run of Skillweave"):
+        sw.from_hub(NAME)
+
+
+def test_wrong_names_private_runs_and_revisions_are_told_with_what_to_do(
+    run: sw.Run, hub: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub.make("eve/secret", files_of(run.path), private=True)
+    for token in ("good-token", ""):
+        monkeypatch.setenv("HF_TOKEN", token)
+        for name in ("ada/nothing", "eve/secret"):
+            with pytest.raises(SkillweaveError, match=f"has no {name}, or it is private.*log in"):
+                sw.from_hub(name)
+    hub.make(NAME, files_of(run.path))
+    with pytest.raises(SkillweaveError, match="ada/cart has no revision 'v2'"):
+        sw.from_hub(NAME, revision="v2")
+    for wrong in ("cart", "ada/cart/x", "../cart", "ada/", 3, "ada/c art"):
+        with pytest.raises(SkillweaveError, match="write owner/name"):
+            sw.from_hub(wrong)
+
+
+# What is not pushed
+
+
+def test_an_unfinished_or_damaged_run_is_refused_before_the_hub_hears_of_it(
+    run: sw.Run, hub: Hub
+) -> None:
+    path = run.path / "policies/left.safetensors"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(SkillweaveError, match=r"left\.safetensors is damaged"):
+        run.push(NAME)
+    directory = RunDirectory.open(run.path)
+    directory.stage("selector")["status"] = "training"
+    directory.save()
+    with pytest.raises(SkillweaveError, match=r"'selector' is not done.*skillweave resume"):
+        run.push(NAME)
+    assert hub.asked == []
+
+
+def test_who_may_not_write_is_told_what_to_do(
+    run: sw.Run, hub: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("eve/new", "eve/old"):
+        hub.make("eve/old", files_of(run.path))
+        with pytest.raises(SkillweaveError, match=f"you may not write to {name}"):
+            run.push(name)
+    monkeypatch.setenv("HF_TOKEN", "")
+    with pytest.raises(SkillweaveError, match=r"does not know you: log in \(hf auth login\)"):
+        run.push(NAME)
+
+
+def test_what_is_something_else_or_public_is_left_alone(run: sw.Run, hub: Hub) -> None:
+    hub.make("ada/else", {"config.json": b"{}"})
+    hub.make("ada/code", {**files_of(run.path), "train.py": b""})
+    for name, why in (("ada/else", "something else"), ("ada/code", "'train.py'")):
+        before = hub.files(name)
+        with pytest.raises(SkillweaveError, match=f"{name} holds {why}"):
+            run.push(name)
+        assert hub.files(name) == before
+    run.push("ada/open")
+    with pytest.raises(SkillweaveError, match="ada/open is public already"):
+        run.push("ada/open", private=True)
+    run.push("ada/closed", private=True)
+    assert hub.repos["ada/closed"].private
+
+
+def test_where_the_hub_fails_nothing_is_half_pushed(run: sw.Run, hub: Hub) -> None:
+    for path, answer in (("/commit/", 500), ("/large/", 501), ("/large/", 403)):
+        hub.breaks_at, hub.answer = path, answer
+        why = "you may not write" if answer == 403 else f"the answer {answer}; try again later"
+        with pytest.raises(SkillweaveError, match=why):
+            run.push(NAME)
+        assert hub.files(NAME) == {}
+    hub.breaks_at = ""
+    run.push(NAME)
+    assert same_actions(sw.from_hub(NAME), run)
+
+
+def test_no_network_is_told(run: sw.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_to(NOWHERE, tmp_path / "cache", monkeypatch)
+    with pytest.raises(SkillweaveError, match=r"cannot be reached\. Nothing was pushed"):
+        run.push(NAME)
+
+
+def test_a_missing_library_names_its_extra(run: sw.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    for share in (lambda: run.push(NAME), lambda: sw.from_hub(NAME)):
+        with pytest.raises(MissingExtra, match=r"pip install 'skillweave\[hub\]'"):
+            share()
+
+
+# On the command line
+
+
+def test_push_and_pull_on_the_command_line(
+    run: sw.Run, hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["push", str(run.path), NAME, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["url"] == f"{hub.url}/{NAME}"
+    out = tmp_path / "pulled"
+    assert main(["pull", NAME, "--out", str(out), "--quiet"]) == 0
+    assert str(out) in capsys.readouterr().out
+    assert {k: (out / k).read_bytes() for k in files_of(run.path)} == files_of(run.path)
+    assert main(["evaluate", str(out), "--episodes", "2"]) == 0
+    capsys.readouterr()
+    assert main(["pull", NAME, "--out", str(out)]) == 1
+    assert "is there already" in capsys.readouterr().err
+    assert main(["pull", "ada/nothing"]) == 1
+    assert "has no ada/nothing" in capsys.readouterr().err
