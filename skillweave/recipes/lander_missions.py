@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from skillweave import PPO, Array, Hierarchy, Network, Skill, SkillweaveError, Step
-from skillweave.recipes._missions import KINDS, PAD, POINTS, spec
+from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
 
 X, Y, VX, VY, ANGLE, SPIN, LEGS = 0, 1, 2, 3, 4, 5, slice(6, 8)
 LEG = slice(8, 12)
@@ -60,14 +60,18 @@ class Flight(Skill):
     """Fly at the speed that is wanted where it is, upright."""
 
     max_steps = 300
-    prize = 0.0
-    """For being at the point, where a call ends there: what else it could be paid ends, too."""
+    prize = 300.0
+    """For being at the point, where a call ends there. Going on for ever is worth up to 100, as a
+    step pays up to 1 and γ is 0.99: with a prize of 100 a skill puts its end off."""
     point: Array
+    half: Array
+    """Half the width and height of the box around the point: the leg's own, as a call that ended
+    outside it would be called again, and end again, for ever."""
 
     def wanted(self, obs: Array) -> Array:
         """Speeds, (n, 2): towards the point, the slower the nearer."""
         way = (self.point - obs[:, [X, Y]]) * (2.5, 1.0)
-        speed: Array = np.clip(way, (-0.8, -0.4), (0.8, 0.4))
+        speed: Array = np.clip(way, (-1.0, -0.5), (1.0, 0.5))
         return speed
 
     def deviation(self, obs: Array) -> Array:
@@ -81,11 +85,11 @@ class Flight(Skill):
         return np.where(step.terminated, CRASH, reward)
 
     def success(self, step: Step) -> Array:
-        """It is at the point, slow and upright."""
+        """It is in the box around the point, slow and upright."""
         obs = step.next_obs
-        far = np.hypot(*(obs[:, [X, Y]] - self.point).T)
+        inside = (np.abs(obs[:, [X, Y]] - self.point) <= self.half).all(axis=1)
         moving = np.hypot(obs[:, VX], obs[:, VY]) + np.abs(obs[:, ANGLE])
-        there: Array = (far + 0.5 * moving < 0.25) & ~step.terminated
+        there: Array = inside & (moving < 0.5) & ~step.terminated
         return there
 
 
@@ -93,14 +97,14 @@ class Hover(Flight):
     """Fly to the point above the pad, and stay there."""
 
     call_steps = 50
-    point = POINTS[KINDS.index("hover")]
+    prize = 0.0
+    point, half = POINTS[KINDS.index("hover")], HALF[KINDS.index("hover")]
 
 
 class GoLeft(Flight):
     """Fly to the point on the left, until it is reached."""
 
-    prize = 100.0
-    point = POINTS[KINDS.index("left")]
+    point, half = POINTS[KINDS.index("left")], HALF[KINDS.index("left")]
 
     def termination(self, step: Step) -> Array:
         """It is there."""
@@ -110,14 +114,13 @@ class GoLeft(Flight):
 class GoRight(GoLeft):
     """Fly to the point on the right, until it is reached."""
 
-    point = POINTS[KINDS.index("right")]
+    point, half = POINTS[KINDS.index("right")], HALF[KINDS.index("right")]
 
 
 class Land(Flight):
     """Come to rest on the pad, from wherever it is."""
 
     max_steps = 400
-    prize = 100.0
     point = np.zeros(2)
 
     def wanted(self, obs: Array) -> Array:

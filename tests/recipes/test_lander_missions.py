@@ -175,16 +175,31 @@ def test_skills_are_paid_for_the_speed_that_is_wanted_where_they_are():
     going = step_of(lander(SKY), lander((0.3, 0.75), speed=(0.6, 0.0)))
     assert missions.GoRight().reward(going) == pytest.approx(0.9, abs=1e-6)
     assert not missions.GoRight().termination(going)
-    # Far away no more than 0.8 is wanted, and 0.4 downwards.
+    # Far away no more than 1 is wanted, and 0.5 downwards.
     far = step_of(lander(SKY), lander((0.5, 1.75)))
-    assert missions.GoLeft().reward(far) == pytest.approx(1.0 - np.hypot(0.8, 0.4), abs=1e-6)
+    assert missions.GoLeft().reward(far) == pytest.approx(1.0 - np.hypot(1.0, 0.5), abs=1e-6)
     there = step_of(lander(SKY), lander(LEFT, speed=(0.1, 0.0)))
     assert missions.GoLeft().termination(there)
-    # 0.1 too fast, as 0 is wanted at the point; the prize is 100.
-    assert missions.GoLeft().reward(there) == pytest.approx(100.9, abs=1e-5)
+    # 0.1 too fast, as 0 is wanted at the point; the prize is 300.
+    assert missions.GoLeft().reward(there) == pytest.approx(300.9, abs=1e-4)
     crashed = step_of(lander(SKY), lander(LEFT, speed=(0.1, 0.0)), terminated=True)
     assert missions.GoLeft().reward(crashed) == missions.CRASH
     assert not missions.GoLeft().success(crashed)
+
+
+@pytest.mark.parametrize("skill", [missions.GoLeft(), missions.GoRight(), missions.Hover()])
+def test_a_skill_has_arrived_only_where_the_missions_leg_is_done(skill):
+    # Else the selector would call it again, and it would end at once, for ever.
+    rng = np.random.default_rng(0)
+    for place in skill.point + rng.uniform(-0.3, 0.3, (200, 2)):
+        inside = (np.abs(place - skill.point) <= skill.half).all()
+        assert skill.success(step_of(lander(SKY), lander(place)))[0] == inside
+
+
+@pytest.mark.parametrize("skill", [missions.GoLeft(), missions.GoRight(), missions.Land()])
+def test_going_on_is_never_worth_as_much_as_arriving(skill):
+    best = 1.0 / (1 - missions.PILOT.gamma)  # flown without any deviation, for ever
+    assert missions.CRASH < 0 < best < skill.prize / 2
 
 
 def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_ground():
@@ -196,7 +211,7 @@ def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_ground():
     beside = step_of(lander(SKY), lander((0.4, 1.0), speed=(-0.8, 0.0)))  # it must not sink yet
     assert land.reward(beside) == pytest.approx(1.0, abs=1e-6)
     rest = step_of(ground, lander(PAD, legs=(1.0, 1.0)), terminated=True)
-    assert land.reward(rest) == 100.0
+    assert land.reward(rest) == missions.Land.prize
     assert land.success(rest)
     off = step_of(ground, lander((0.3, 0.0), legs=(1.0, 1.0)), terminated=True)
     assert land.reward(off) == missions.CRASH
