@@ -180,16 +180,14 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
     settings: dict[str, Any] = {
         "call_steps": None,
         "start_calls": 2,
-        # A greedy one may stand still beside its point for ever.
-        "greedy_skills": False,
         "algorithm": PILOT,
         "selector": SELECTOR,
-        "skill_steps": 300_000,
+        "skill_steps": 600_000,
         "selector_steps": 250_000,
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
-    found.skill("go_right").steps = 400_000  # it begins on the left, too
-    found.skill("land").steps = 600_000
+    found.skill("go_right").steps = 800_000  # it begins on the left, too
+    found.skill("land").steps = 1_200_000
     return found
 
 
