@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from functools import partial
 from typing import Any
 
@@ -87,3 +88,57 @@ def spec(maze: str = "large") -> EnvSpec:
 
     ball.__name__ = f"Maze({maze})"
     return EnvSpec(ball, pool=partial(many, maze))
+
+
+WAYS = {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}
+"""By skill, rows and columns by which the next cell is further."""
+NEAR = 0.9
+"""Metres from the goal at which it is in the same cell, or the next."""
+
+
+class ShortestPath:
+    """The selector of one who knows the maze: the skill that leads to the next cell.
+
+    Args:
+        maze: its name.
+
+    Raises:
+        MissingExtra: Gymnasium-Robotics is missing.
+    """
+
+    def __init__(self, maze: str) -> None:
+        env = make(maze)
+        told: Any = env.unwrapped
+        self.walls = np.array([[cell == 1 for cell in row] for row in told.maze.maze_map])
+        env.close()
+        self._next = {tuple(c): ways_to(self.walls, tuple(c)) for c in np.argwhere(~self.walls)}
+
+    def cell(self, place: Array) -> tuple[int, int]:
+        """Row and column of a place (2,)."""
+        rows, columns = self.walls.shape
+        row, column = np.floor((rows / 2 - place[1], place[0] + columns / 2)).astype(int)
+        return int(row), int(column)
+
+    def __call__(self, obs: Array) -> Array:
+        """The skill for each observation, (n,) by name."""
+        return np.array([self._skill(one) for one in obs])
+
+    def _skill(self, one: Array) -> str:
+        if np.hypot(*(one[GOAL] - one[PLACE])) < NEAR:
+            return "approach"
+        way = self._next[self.cell(one[GOAL])]
+        return way.get(self.cell(one[PLACE]), "approach")
+
+
+def ways_to(walls: Array, goal: tuple[int, ...]) -> dict[tuple[int, ...], str]:
+    """By cell, the direction in which the way to ``goal`` is shortest (breadth first)."""
+    found: dict[tuple[int, ...], str] = {goal: "approach"}
+    queue = deque([goal])
+    while queue:
+        row, column = queue.popleft()
+        for name, (down, right) in WAYS.items():
+            before = (row - down, column - right)
+            if not walls[before] and before not in found:
+                found[before] = name
+                queue.append(before)
+    return found

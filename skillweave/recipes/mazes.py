@@ -24,8 +24,12 @@ from skillweave import PPO, Array, Hierarchy, Network, Skill, Step, register_enc
 from skillweave.recipes._mazes import GOAL, PLACE, SPEED, spec
 
 
+SLOW, GAIN = 0.3, 0.1
+"""Metres a second, and by how many a free ball gains more than that in each step."""
+
+
 class North(Skill):
-    """Roll north, as fast as the ball can, and not sideways."""
+    """Roll north, as fast as the ball can, and not sideways; until a wall is in the way."""
 
     way = np.array([0.0, 1.0])
     max_steps = 100
@@ -37,6 +41,12 @@ class North(Skill):
         across = np.abs(speed @ self.way[::-1])
         found: Array = along - across
         return found
+
+    def termination(self, step: Step) -> Array:
+        """It does not get on: slow, and no faster than before."""
+        before, after = step.obs[:, SPEED] @ self.way, step.next_obs[:, SPEED] @ self.way
+        blocked: Array = (after < SLOW) & (after - before < GAIN)
+        return blocked
 
 
 class East(North):
@@ -136,6 +146,7 @@ class Map:
 register_encoder("motion in a maze", Motion)
 register_encoder("map of a maze", Map)
 
+MAP = Network(hidden=(128, 128), activation="relu", encoder="map of a maze")
 BALL = PPO(
     num_envs=32,
     n_steps=32,
@@ -156,7 +167,7 @@ SELECTOR = PPO(
     gae_lambda=0.95,
     ent_coef=0.02,
     normalize_obs=False,
-    network=Network(hidden=(128, 128), activation="relu", encoder="map of a maze"),
+    network=MAP,
 )
 SKILLS = (North, East, South, West, Approach)
 
