@@ -15,14 +15,12 @@ times as fast.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from skillweave import PPO, Array, Hierarchy, Network, Skill, Step, register_encoder
 from skillweave.recipes._mazes import GOAL, PLACE, SPEED, spec
-
 
 SLOW, GAIN = 0.3, 0.1
 """Metres a second, and by how many a free ball gains more than that in each step."""
