@@ -3,10 +3,10 @@
     python -m benchmarks.lengths [--seeds 0 1 2] [--steps 300000] [--out runs/lengths]
         [--only 5 10 25 50 chosen]
 
-The recipe ``mazes``: skills are learnt once for each seed, in the large maze; then a selector learns
-over them from equally many steps: with calls of 5, 10, 25 and 50 steps at most, and with lengths
-that it chooses and calls that it cuts. A score is the share of 100 episodes that reach the goal,
-where the selector samples. A result that is in the folder is not made again.
+The recipe ``mazes``: skills are learnt once for each seed, in the large maze; then a selector
+learns over them from equally many steps: with calls of 5, 10, 25 and 50 steps at most, and with
+lengths that it chooses and calls that it cuts. A score is the share of 100 episodes that reach the
+goal, where the selector samples. A result that is in the folder is not made again.
 """
 
 from __future__ import annotations
