@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
-from skillweave.types import MissingExtra
 
 MAZES = {
     "large": "PointMaze_Large-v3",
@@ -59,12 +58,15 @@ def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, An
     """One ball in a maze; 1 is paid where it reaches its goal, and the episode ends.
 
     Raises:
-        MissingExtra: Gymnasium-Robotics is missing.
+        SkillweaveError: gymnasium-robotics is missing.
     """
     try:
         import gymnasium_robotics
+        import mujoco  # noqa: F401
     except ImportError as error:
-        raise MissingExtra("PointMaze", "robotics") from error
+        raise SkillweaveError(
+            "PointMaze needs the extra 'robotics': pip install 'skillweave[robotics]'"
+        ) from error
     gym.register_envs(gymnasium_robotics)
     return Maze(gym.make(MAZES[maze], render_mode=render_mode, disable_env_checker=True, **ENDS))
 
@@ -103,7 +105,7 @@ class ShortestPath:
         maze: its name.
 
     Raises:
-        MissingExtra: Gymnasium-Robotics is missing.
+        SkillweaveError: gymnasium-robotics is missing.
     """
 
     def __init__(self, maze: str) -> None:
