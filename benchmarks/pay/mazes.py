@@ -11,7 +11,6 @@ from skillweave import Array, Hierarchy
 from skillweave.recipes import _mazes, mazes
 
 SOLVED = 0.9
-FURTHER_STEPS = 200_000
 
 
 def source(task: Task) -> Hierarchy:
@@ -21,7 +20,7 @@ def source(task: Task) -> Hierarchy:
 
 def further(task: Task, skills: Policies) -> Hierarchy:
     """A selector over skills that are there already."""
-    return mazes.with_skills(task.name, skills, selector_steps=FURTHER_STEPS)
+    return mazes.with_skills(task.name, skills)
 
 
 def shortest_path(task: Task, skills: Policies) -> Hierarchy:
@@ -36,7 +35,7 @@ def cells(obs: Array) -> Array:
 
 
 def suite() -> Suite:
-    """Four mazes; a score is the share of episodes that reach the goal."""
+    """Five mazes; a score is the share of episodes that reach the goal."""
     return Suite(
         name="mazes",
         tasks=[Task(name, _mazes.spec(name), SOLVED) for name in _mazes.MAZES],
@@ -53,8 +52,8 @@ def suite() -> Suite:
         cells=cells,
         bonus=0.01,
         fixed={"shortest-path": shortest_path},
-        episodes=100,
+        episodes=60,
         greedy=False,
-        evaluations=8,
+        evaluations=5,
         evaluated=20,
     )

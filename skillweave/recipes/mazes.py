@@ -15,6 +15,7 @@ times as fast.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -175,6 +176,8 @@ SELECTOR = PPO(
     normalize_obs=False,
     network=MAP,
 )
+FURTHER_SELECTOR = replace(SELECTOR, num_envs=16, batch_size=64, update_epochs=8)
+"""For fewer steps: fewer environments, so that it learns as often."""
 SKILLS = (North, East, South, West, Approach)
 
 
@@ -192,7 +195,8 @@ def declare(maze: str = "large", **how: Any) -> Hierarchy:
 
 def with_skills(maze: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """The hierarchy on a maze with skills that are there already, by name."""
-    found = declare(maze, **how)
+    settings = {"selector": FURTHER_SELECTOR, "selector_steps": 200_000} | how
+    found = declare(maze, **settings)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found
