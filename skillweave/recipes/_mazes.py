@@ -129,8 +129,8 @@ class ShortestPath:
     def _skill(self, one: Array) -> str:
         if np.hypot(*(one[GOAL] - one[PLACE])) < NEAR:
             return "approach"
-        way = self._next[self.cell(one[GOAL])]
-        return way.get(self.cell(one[PLACE]), "approach")
+        ways = self._next.get(self.cell(one[GOAL]), {})  # none where a wall is
+        return ways.get(self.cell(one[PLACE]), "approach")
 
 
 def ways_to(walls: Array, goal: tuple[int, ...]) -> dict[tuple[int, ...], str]:

@@ -93,6 +93,15 @@ def test_the_shortest_way_through_a_corner():
     assert len(ways) == 7
 
 
+def test_the_way_out_of_a_wall_or_to_one_is_the_goals_own():
+    pytest.importorskip("gymnasium_robotics")
+    selector = world.ShortestPath("umaze")
+    obs = np.concatenate([ball(place=(9.0, 9.0)), ball(place=(-1.0, 1.0), goal=(0.0, 0.0))])
+    assert selector(obs).tolist() == ["approach", "approach"]
+    # From the end of one arm to that of the other: first along the arm.
+    assert selector(ball(place=(-1.0, 1.0), goal=(-1.0, -1.0))).tolist() == ["east"]
+
+
 def test_a_maze_that_there_is_not_is_refused():
     with pytest.raises(SkillweaveError, match=r"no maze 'moon'; there are: large.*diverse"):
         mazes.declare("moon")
