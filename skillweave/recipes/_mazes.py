@@ -21,6 +21,11 @@ MAZES = {
 """Mazes by name, and what Gymnasium-Robotics and EnvPool call them."""
 PLACE, SPEED, GOAL = slice(0, 2), slice(2, 4), slice(4, 6)
 """Where these stand in an observation: metres east and north, metres a second, metres."""
+REACH, BALL = 0.45, 0.1
+"""Metres from the goal at which it is reached; the ball's radius."""
+PIXELS = 32
+"""Of a metre in a picture."""
+WALL, FLOOR, GREEN, ORANGE = (60, 66, 80), (235, 235, 230), (120, 190, 130), (230, 110, 40)
 SPACE = gym.spaces.Box(-np.inf, np.inf, (6,), np.float32)
 ENDS: Any = {"continuing_task": False}
 """The episode ends at the goal; else PointMaze goes on until its time is up."""
@@ -32,15 +37,48 @@ def flat(obs: Any) -> Array:
 
 
 class Maze(gym.ObservationWrapper[Any, Any, Any]):
-    """One ball in a maze."""
+    """One ball in a maze, seen from above: drawn here, so films need no OpenGL.
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    Args:
+        env: PointMaze.
+        render_mode: "rgb_array" for films.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], render_mode: str | None = None) -> None:
         super().__init__(env)
         self.observation_space = SPACE
+        self._render_mode, self._seen = render_mode, np.zeros(SPACE.shape, np.float32)
+
+    @property
+    def render_mode(self) -> str | None:
+        """As it was made."""
+        return self._render_mode
 
     def observation(self, observation: Any) -> Array:
         """Place, speed and goal, (6,)."""
-        return flat(observation)
+        self._seen = flat(observation)
+        return self._seen
+
+    def render(self) -> Any:
+        """Walls, the goal as wide as it counts, and the ball, (H, W, 3) uint8."""
+        if self._render_mode is None:
+            return None
+        walls = walls_of(self)
+        frame = np.where(walls[:, :, None], WALL, FLOOR).astype(np.uint8)
+        frame = frame.repeat(PIXELS, axis=0).repeat(PIXELS, axis=1)
+        height, width = frame.shape[:2]
+        east = (np.arange(width) + 0.5 - width / 2) / PIXELS
+        north = (height / 2 - np.arange(height) - 0.5) / PIXELS
+        for where, radius, color in ((GOAL, REACH, GREEN), (PLACE, BALL, ORANGE)):
+            x, y = self._seen[where]
+            frame[np.hypot(east - x, north[:, None] - y) <= radius] = color
+        return frame
+
+
+def walls_of(env: gym.Env[Any, Any]) -> Array:
+    """Which cells of a maze are walls, rows from the north, (rows, columns) bool."""
+    told: Any = env.unwrapped
+    return np.array([[cell == 1 for cell in row] for row in told.maze.maze_map])
 
 
 class MazePool(PoolWrapper):
@@ -69,7 +107,7 @@ def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, An
             "PointMaze needs the extra 'robotics': pip install 'skillweave[robotics]'"
         ) from error
     gym.register_envs(gymnasium_robotics)
-    return Maze(gym.make(MAZES[maze], render_mode=render_mode, disable_env_checker=True, **ENDS))
+    return Maze(gym.make(MAZES[maze], disable_env_checker=True, **ENDS), render_mode)
 
 
 def many(maze: str, num_envs: int, threads: int, seed: int) -> MazePool:
@@ -111,8 +149,7 @@ class ShortestPath:
 
     def __init__(self, maze: str) -> None:
         env = make(maze)
-        told: Any = env.unwrapped
-        self.walls = np.array([[cell == 1 for cell in row] for row in told.maze.maze_map])
+        self.walls = walls_of(env)
         env.close()
         self._next = {tuple(c): ways_to(self.walls, tuple(c)) for c in np.argwhere(~self.walls)}
 

@@ -102,6 +102,25 @@ def test_the_way_out_of_a_wall_or_to_one_is_the_goals_own():
     assert selector(ball(place=(-1.0, 1.0), goal=(-1.0, -1.0))).tolist() == ["east"]
 
 
+def test_the_picture_shows_walls_the_goal_and_the_ball_where_they_are():
+    pytest.importorskip("gymnasium_robotics")
+    env = world.spec("umaze").make(render_mode="rgb_array")
+    obs, _ = env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (5 * world.PIXELS, 5 * world.PIXELS, 3)
+    assert tuple(picture[0, 0]) == world.WALL
+
+    def at(place):  # the middle of the maze is that of the picture
+        east, south = 2.5 + place[0], 2.5 - place[1]
+        return tuple(picture[int(south * world.PIXELS), int(east * world.PIXELS)])
+
+    assert at(obs[world.PLACE]) == world.ORANGE
+    assert at(obs[world.GOAL]) == world.GREEN
+    assert at(obs[world.GOAL] + [0.0, 0.4]) == world.GREEN
+    assert at(obs[world.GOAL] + [0.0, -0.49]) != world.GREEN
+    assert env.render_mode == "rgb_array"
+
+
 def test_a_maze_that_there_is_not_is_refused():
     with pytest.raises(SkillweaveError, match=r"no maze 'moon'; there are: large.*diverse"):
         mazes.declare("moon")
