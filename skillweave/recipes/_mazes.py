@@ -50,7 +50,7 @@ class Maze(gym.ObservationWrapper[Any, Any, Any]):
         self._render_mode, self._seen = render_mode, np.zeros(SPACE.shape, np.float32)
 
     @property
-    def render_mode(self) -> str | None:
+    def render_mode(self) -> str | None:  # type: ignore[override]  # Gymnasium has it so, too
         """As it was made."""
         return self._render_mode
 
