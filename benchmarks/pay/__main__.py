@@ -3,8 +3,9 @@
     python -m benchmarks.pay [SUITE[/TASK] …] [--seeds 0 1 2 3 4] [--processes 2] [--quick]
         [--agents hierarchy flat shaped bonus] [--out runs/pay] [--only-figures]
 
-Suites: shuttle, pick-and-place, lander-missions. A result that is in the folder is not made again,
-and a training that was killed goes on where it stood, so the same command finishes what it began.
+Suites: shuttle, pick-and-place, lander-missions, mazes. A result that is in the folder is not made
+again, and a training that was killed goes on where it stood, so the same command finishes what it
+began.
 
 Agents, each with at least the hierarchy's steps, what learnt its skills included: F0 flat; F1 flat,
 on the task's reward and the weighted sum of the skills' rewards (weights chosen on seed 100); F2
@@ -21,7 +22,7 @@ from concurrent.futures import Future
 from pathlib import Path
 
 from benchmarks.common import workers
-from benchmarks.pay import lander_missions, pick_and_place, shuttle
+from benchmarks.pay import lander_missions, mazes, pick_and_place, shuttle
 from benchmarks.pay.agents import CHAINS, Bench
 from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.results import Results
@@ -32,6 +33,7 @@ SUITES: dict[str, Callable[[], Suite]] = {
     "shuttle": shuttle.suite,
     "pick-and-place": pick_and_place.suite,
     "lander-missions": lander_missions.suite,
+    "mazes": mazes.suite,
 }
 
 

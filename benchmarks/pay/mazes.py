@@ -1,0 +1,59 @@
+"""Mazes: a ball finds its goal, with skills that serve every maze (``skillweave train mazes``)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.pay.suite import Policies, Suite, Task
+from skillweave import Array, Hierarchy
+from skillweave.recipes import _mazes, mazes
+
+SOLVED = 0.9
+
+
+def source(task: Task) -> Hierarchy:
+    """Skills, each by itself, then a selector."""
+    return mazes.declare(task.name)
+
+
+def further(task: Task, skills: Policies) -> Hierarchy:
+    """A selector over skills that are there already."""
+    return mazes.with_skills(task.name, skills)
+
+
+def shortest_path(task: Task, skills: Policies) -> Hierarchy:
+    """The same skills, chosen by who knows the maze: tells what bounds a result."""
+    chooses = _mazes.ShortestPath(task.name)
+    return mazes.with_skills(task.name, skills, selector=chooses, call_steps=10)
+
+
+def cells(obs: Array) -> Array:
+    """Where the ball is, and where the goal, in metres, (n, 4)."""
+    return np.floor(obs[:, [0, 1, 4, 5]])
+
+
+def suite() -> Suite:
+    """Five mazes; a score is the share of episodes that reach the goal."""
+    return Suite(
+        name="mazes",
+        tasks=[Task(name, _mazes.spec(name), SOLVED) for name in _mazes.MAZES],
+        unit=1.0,
+        source=source,
+        further=further,
+        skills=lambda: [skill() for skill in mazes.SKILLS],
+        # The selector's network, which sees the same; the goal is hundreds of steps away.
+        flat=replace(mazes.BALL, gamma=0.997, gae_lambda=0.95, ent_coef=0.003, network=mazes.MAP),
+        weights=(
+            {"approach": 0.001},
+            {s.name: 0.001 for s in mazes.SKILLS},
+        ),
+        cells=cells,
+        bonus=0.01,
+        fixed={"shortest-path": shortest_path},
+        episodes=60,
+        greedy=False,
+        evaluations=5,
+        evaluated=20,
+    )
