@@ -19,8 +19,9 @@ from typing import Any
 
 from gymnasium.vector.utils import CloudpickleWrapper
 
+from skillweave.collecting.group import MakeCollector
 from skillweave.collecting.shared_columns import ColumnWriter, SharedColumns
-from skillweave.collecting.workers import MakeCollector, Station, WorkerCollectors, WorkerLost
+from skillweave.collecting.workers import Station, WorkerCollectors, WorkerLost
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
 

@@ -7,13 +7,13 @@ finds the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
 from skillweave.collecting.acting import Request
-from skillweave.collecting.collector import Collected, Collector
-from skillweave.collecting.group import Collectors, joined_states, split_states
+from skillweave.collecting.collector import Collected
+from skillweave.collecting.group import Collectors, MakeCollector, joined_states, split_states
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError
 
@@ -21,9 +21,6 @@ SNAPSHOT_EVERY = 16
 """Requests after which workers say where they stand, so that less need be done again."""
 TRIES = 2
 """How often a worker is made again before a request fails."""
-
-MakeCollector = Callable[[int, int], Collector]
-"""Given how many environments and the number of the first one, makes a collector."""
 
 
 class WorkerLost(Exception):

@@ -1,0 +1,301 @@
+"""Collectors as actors of Ray: on this machine, or on any node of a cluster.
+
+Parameters go into Ray's object store once for each request, whoever reads them; experience comes
+back through it. An actor that dies, alone or with its node, is made again (``workers``), wherever
+there is room.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from copy import deepcopy
+from time import monotonic
+from typing import Any
+
+import numpy as np
+import ray
+from ray import exceptions
+
+from skillweave.collecting.collector import Collected
+from skillweave.collecting.group import MakeCollector
+from skillweave.collecting.shipping import packed, unpacked
+from skillweave.collecting.workers import Station, WorkerCollectors, WorkerLost
+from skillweave.messages import told
+from skillweave.types import SkillweaveError
+
+PATIENCE = 1.0
+"""Seconds that actors have to close their environments."""
+LOOK = 3.0
+"""Seconds between looks at whether there is room for an actor that has not begun."""
+LOST = (
+    exceptions.RayActorError, exceptions.ObjectLostError, exceptions.NodeDiedError,
+    exceptions.WorkerCrashedError, exceptions.OutOfMemoryError,
+)  # fmt: skip
+FULL = exceptions.ObjectStoreFullError, exceptions.OutOfDiskError
+
+
+class RayCollectors(WorkerCollectors):
+    """W collectors, each an actor.
+
+    Args:
+        make: makes one; it is sent to the nodes with the user's code that it needs.
+        each: environments of a collector.
+        count: W.
+        members: P.
+        name: what messages call the environment.
+        cpus: of each actor.
+        patience: seconds to wait while the cluster has no room for an actor.
+        tell: is told what people should know.
+
+    Raises:
+        SkillweaveError: a node has another version of Skillweave or Python, or there is no room.
+    """
+
+    _workers: list[ActorWorker]  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        make: MakeCollector,
+        each: int,
+        count: int,
+        members: int,
+        name: str,
+        *,
+        cpus: float = 1.0,
+        patience: float = 300.0,
+        tell: Callable[[str], None] = print,
+    ) -> None:
+        room = Room(cpus, count, patience, tell)
+        code = _put(packed(make, f"what collectors of {name} are made of"))
+        kind = ray.remote(num_cpus=cpus, max_restarts=0)(_actor_class())
+        workers = [ActorWorker(kind, code, each, i, room) for i in range(count)]
+        super().__init__(workers, each, members, name)
+
+    def close(self) -> None:
+        """Let the actors close their environments, and end them."""
+        actors = [w.actor for w in self._workers if w.actor is not None]
+        with suppress(Exception):  # perhaps there is no cluster any more
+            closed = [actor.close.remote() for actor in actors]
+            ray.wait(closed, num_returns=len(closed), timeout=PATIENCE)
+        for worker in self._workers:
+            worker.release()
+
+    def _shared(self, task: Any) -> Sequence[Any]:
+        return [_put(task)] * len(self._workers)
+
+    def _joined(self, found: Sequence[Collected]) -> Collected:
+        # Arrays of the object store cannot be written to; joining several copies them.
+        return super()._joined(found if len(found) > 1 else deepcopy(found))
+
+
+class Room:
+    """What actors need, and how long to wait while the cluster does not have it."""
+
+    def __init__(
+        self, cpus: float, count: int, patience: float, tell: Callable[[str], None]
+    ) -> None:
+        self.cpus, self.count, self.patience, self.tell = cpus, count, patience, tell
+        self._waited, self._told = 0.0, False
+
+    def wait_for(self, ref: Any) -> None:
+        """Until an actor has begun.
+
+        Raises:
+            SkillweaveError: there was no room for too long.
+        """
+        began = monotonic()
+        while not ray.wait([ref], timeout=LOOK)[0]:
+            now = monotonic()
+            free = ray.available_resources().get("CPU", 0.0)
+            if free >= self.cpus:  # it is only slow to begin
+                began = now
+                continue
+            self._waited, began = self._waited + now - began, now
+            total = ray.cluster_resources().get("CPU", 0.0)
+            says = (
+                f"{self.count} collectors need {self.count * self.cpus:g} CPUs of the Ray cluster; "
+                f"it has {total:g}, of which {free:g} are free"
+            )
+            if self._waited > self.patience:
+                raise SkillweaveError(
+                    f"{says}, and waiting {self.patience:g} s for more was in vain. Ask for fewer "
+                    "collectors, give each less (cpus), or add nodes"
+                )
+            if not self._told:
+                self._told = True
+                self.tell(f"{says}: waiting up to {self.patience:g} s for more (Ctrl-C stops)")
+
+
+class ActorWorker:
+    """A collector in an actor.
+
+    Args:
+        kind: the actor's class.
+        code: what makes the collector, packed, in the object store.
+        each: its environments.
+        number: of the worker.
+        room: what an actor needs.
+    """
+
+    def __init__(self, kind: Any, code: Any, each: int, number: int, room: Room) -> None:
+        self._kind, self._code, self._each, self._number = kind, code, each, number
+        self._room, self._due, self._lost = room, deque[Any](), ""
+        self.actor: Any = None
+        self.place: dict[str, Any] = {}
+        """Its node and process, and what runs there."""
+        self._versions: Any = None
+
+    def begin(self) -> None:
+        """Ask the cluster for an actor, which makes the collector."""
+        if self._lost:
+            self._room.tell(f"worker {self._number} {self._lost}; it is made again")
+        self.actor = self._kind.remote()
+        self._versions = self.actor.versions.remote()
+        self._due = deque([self.actor.make.remote(self._code, self._each, self._number)])
+
+    def send(self, what: str, task: Any) -> None:
+        """Ask for something."""
+        self._due.append(self.actor.answer.remote(what, task))
+
+    def receive(self) -> Any:
+        """The next answer."""
+        ref = self._due.popleft()
+        try:
+            if self._versions is not None:
+                self._room.wait_for(self._versions)
+                self.place = ray.get(self._versions)
+                _check_versions(self.place)
+                self._versions = None
+            error, answer = ray.get(ref)
+        except LOST as lost:
+            self._lost = _how(lost)
+            raise WorkerLost(self._lost) from None
+        except FULL as full:
+            raise _full(full) from full
+        if error is not None:
+            raise SkillweaveError(error)
+        return answer
+
+    def release(self) -> None:
+        """End the actor."""
+        actor, self.actor = self.actor, None
+        self._due.clear()
+        if actor is not None:
+            with suppress(Exception):
+                ray.kill(actor)
+
+
+def _actor_class() -> type:
+    """The class of actors.
+
+    It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
+    """
+
+    class CollectorActor:
+        def versions(self) -> dict[str, Any]:
+            """What runs here, and where that is."""
+            found = {"node": ray.util.get_node_ip_address(), "process": os.getpid()}
+            try:
+                from skillweave import __version__
+            except ImportError:
+                __version__ = None
+            return found | {"Python": platform.python_version(), "Skillweave": __version__}
+
+        def make(self, code: bytes, each: int, number: int) -> Any:
+            """Make the collector: (error, None)."""
+            try:
+                from skillweave.collecting.actors import Stationed
+            except ImportError as error:
+                return str(error), None
+            self.stationed = Stationed()
+            return self.stationed.make(code, each, number)
+
+        def answer(self, what: str, task: Any) -> Any:
+            """Do something: (error, answer)."""
+            return self.stationed.answer(what, task)
+
+        def close(self) -> None:
+            """Close the environments."""
+            self.stationed.close()
+
+    return CollectorActor
+
+
+class Stationed:
+    """A station whose errors are answers."""
+
+    def make(self, code: bytes, each: int, number: int) -> tuple[str | None, None]:
+        """Make the collector."""
+        import torch
+
+        torch.set_num_threads(1)
+
+        def made() -> None:
+            self.station = Station(unpacked(code), each, number)
+
+        return _tried(made)
+
+    def answer(self, what: str, task: Any) -> tuple[str | None, Any]:
+        """What the station answers."""
+        if isinstance(task, dict):  # a state; arrays of the object store cannot be written to
+            task = {k: np.array(v) for k, v in task.items()}
+        return _tried(lambda: self.station.answer(what, task))
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.station.collector.close()
+
+
+def _tried(do: Callable[[], Any]) -> tuple[str | None, Any]:
+    try:
+        return None, do()
+    except SkillweaveError as error:
+        return str(error), None
+    except BaseException as error:
+        return told(error), None
+
+
+def _put(thing: Any) -> Any:
+    try:
+        return ray.put(thing)
+    except FULL as full:
+        raise _full(full) from full
+
+
+def _full(error: Exception) -> SkillweaveError:
+    return SkillweaveError(
+        f"the object store of the Ray cluster is full ({told(error)}). Experience goes through it: "
+        "give it more memory (ray start --object-store-memory=BYTES), or ask for less at once "
+        "(num_envs, n_steps)"
+    )
+
+
+def _check_versions(there: dict[str, Any]) -> None:
+    """Raise a SkillweaveError where a node runs something else."""
+    import skillweave
+
+    here = {"Skillweave": skillweave.__version__, "Python": platform.python_version()}
+    for name, mine in here.items():
+        theirs = there[name]
+        if theirs is None:
+            raise SkillweaveError(
+                f"node {there['node']} of the Ray cluster has no {name}: install the same version "
+                f"on all nodes, {mine}"
+            )
+        digits = 2 if name == "Python" else None
+        if theirs.split(".")[:digits] != mine.split(".")[:digits]:
+            raise SkillweaveError(
+                f"node {there['node']} of the Ray cluster has {name} {theirs}, but here is {mine}: "
+                "all nodes need the same"
+            )
+
+
+def _how(lost: Exception) -> str:
+    """What became of an actor, as people say it."""
+    if isinstance(lost, exceptions.OutOfMemoryError):
+        return "was ended by Ray, as its node was short of memory"
+    return "was lost with its node" if "its node has died" in str(lost) else "died"
