@@ -298,4 +298,6 @@ def _how(lost: Exception) -> str:
     """What became of an actor, as people say it."""
     if isinstance(lost, exceptions.OutOfMemoryError):
         return "was ended by Ray, as its node was short of memory"
+    if isinstance(lost, exceptions.ActorUnavailableError):
+        return "is out of reach"
     return "was lost with its node" if "its node has died" in str(lost) else "died"

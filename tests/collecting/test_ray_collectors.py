@@ -1,10 +1,13 @@
 """Actors of Ray find what collectors in this thread find, whatever happens to them."""
 
+import importlib.util
 import itertools
 import os
+import platform
+import re
 import signal
 import sys
-import types
+import threading
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +15,7 @@ import pytest
 from reference_calls import Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, requests
 
+import skillweave
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.decisions import DecisionCollector
@@ -34,11 +38,10 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::Futu
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Two nodes with two CPUs each, on this machine."""
+    """Nodes on this machine: the head has two CPUs."""
     made = cluster_utils.Cluster(
         initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False}
     )
-    made.add_node(num_cpus=2)
     with Ray(address=made.address).connected(0, print):
         yield made
     made.shutdown()
@@ -92,61 +95,63 @@ def kill(worker):
     os.kill(worker.place["process"], signal.SIGKILL)
 
 
-def test_killed_actors_are_made_again_and_find_the_same(on_ray):
+def test_actors_find_what_this_thread_finds_though_they_are_killed(on_ray):
     plain, apart = here(deciding()), on_ray(deciding())
     for collectors in (plain, apart):
         collectors.start(Seeds(3))
-    for at, request in enumerate(itertools.islice(requests(15), 40)):  # with snapshots in between
-        if at in (7, 21):
-            kill(apart._workers[1])
-        if at in (0, 21):  # then both at once
-            kill(apart._workers[0])
+    asked = requests(15)
+    for at, request in enumerate(itertools.islice(asked, 40)):  # with snapshots in between
+        for number, killed in enumerate([(0, 21), (21,)]):
+            if at in killed:
+                kill(apart._workers[number])
         equal(plain.collect(request), apart.collect(request))
         if at % 13 == 12:
             np.testing.assert_array_equal(plain.cut(Seeds(5) / at), apart.cut(Seeds(5) / at))
     assert plain.steps_made == apart.steps_made
-    assert "worker 0 died; it is made again" in on_ray.told
+    assert on_ray.told[0] == "worker 0 died; it is made again"
+    assert sorted(on_ray.told[1:]) == [f"worker {i} died; it is made again" for i in (0, 1)]
 
-
-def test_one_actor_alone_finds_what_this_thread_finds_and_it_can_be_written_to(on_ray):
-    plain, apart = here(stepping(), 1), on_ray(stepping(), 1)
-    for collectors in (plain, apart):
-        collectors.start(Seeds(3))
-    for request in itertools.islice(requests(200), 3):  # more than Ray sends without its store
-        found = apart.collect(request)
-        equal(plain.collect(request), found)
-        found.experience.reward[:] = 0.0
-
-
-def test_a_state_goes_from_actors_to_this_thread_and_back(on_ray):
-    plain, apart = here(deciding()), on_ray(deciding())
-    apart.start(Seeds(3))
-    asked = requests(9)
-    for request in itertools.islice(asked, 5):
-        apart.collect(request)
     apart.cut(Seeds(1))
     state = apart.state()
-    assert not len(plain.restore({k: np.array(v) for k, v in state.items()}))
-    again = on_ray(deciding())
-    assert not len(again.restore(state))
-    for request in itertools.islice(asked, 5):
-        found = apart.collect(request)
-        equal(plain.collect(request), found)
-        equal(again.collect(request), found)
+    request = next(asked)
+    found = apart.collect(request)
+    for collectors in (plain, apart):  # a state goes to this thread, and back
+        assert not len(collectors.restore(state))
+        equal(collectors.collect(request), found)
 
 
-def test_collectors_of_a_lost_node_are_made_again_on_others(on_ray, cluster):
-    extra = cluster.add_node(num_cpus=2)
-    plain, apart = here(stepping(), 3), on_ray(stepping(), 3, cpus=2.0)  # one on each node
+@pytest.fixture
+def only_here(tmp_path):
+    """A module that no node can import, and an environment that it registers."""
+    file = tmp_path / "only_here.py"
+    file.write_text(
+        "import gymnasium as gym\nfrom toy_acting import Again\nclass Own(Again):\n"
+        "    def __init__(self, render_mode=None):\n        super().__init__()\n"
+        "gym.register('OnlyHere-v0', Own, disable_env_checker=True, order_enforce=False)\n"
+    )
+    spec = importlib.util.spec_from_file_location("only_here", file)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["only_here"] = module
+    spec.loader.exec_module(module)
+    yield "OnlyHere-v0"
+    del sys.modules["only_here"], gym.registry["OnlyHere-v0"]
+
+
+def test_collectors_of_a_lost_node_are_made_again_on_others(on_ray, cluster, only_here):
+    extra = cluster.add_node(num_cpus=3)
+    make = stepping(only_here)
+    plain, apart = here(make, 1), on_ray(make, 1, cpus=3.0)
     for collectors in (plain, apart):
         collectors.start(Seeds(3))
-    asked = requests(15)
-    for at, request in enumerate(itertools.islice(asked, 5)):
+    for at, request in enumerate(itertools.islice(requests(200), 5)):  # too much for a message
         if at == 3:
             cluster.remove_node(extra, allow_graceful=False)
-            cluster.add_node(num_cpus=2)  # nodes may join
-        equal(plain.collect(request), apart.collect(request))
-    assert any("was lost with its node; it is made again" in line for line in on_ray.told)
+            cluster.add_node(num_cpus=3)  # nodes may join
+        found = apart.collect(request)
+        equal(plain.collect(request), found)
+        found.experience.reward[:] = 0.0  # it can be written to
+    (line,) = on_ray.told
+    assert re.fullmatch("worker 0 (was lost with its node|is out of reach); it is made again", line)
 
 
 class Failing(Again):
@@ -156,23 +161,14 @@ class Failing(Again):
         return super().step(action)
 
 
-class Always(Again):
-    def step(self, action):
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-@pytest.mark.parametrize(
-    ("env", "says"),
-    [
-        (Failing, r"environment [0-5], step 3.*the arm is stuck.*worker [01]"),
-        (Always, r"worker 0 \(environments 0 to 2\) died, and again when it was made anew"),
-    ],
-)
-def test_what_goes_wrong_in_an_actor_is_told_with_who_it_was(on_ray, env, says):
-    collectors = on_ray(stepping(env))
-    collectors.start(Seeds(0))
-    with pytest.raises(SkillweaveError, match=f"(?s){says}"):
-        collectors.collect(next(requests(5)))
+def test_what_goes_wrong_in_an_actor_is_an_answer():
+    stationed = actors.Stationed()
+    assert stationed.make(actors.packed(stepping(Failing), "it"), 3, 1) == (None, None)
+    assert stationed.answer("start", Seeds(0)) == (None, None)
+    error, answer = stationed.answer("collect", next(requests(5)))
+    assert answer is None
+    assert re.search("environment [3-5], step 3.*the arm is stuck", error)
+    stationed.close()
 
 
 def test_no_room_is_told_while_it_waits_and_when_it_stops(on_ray, monkeypatch):
@@ -182,55 +178,35 @@ def test_no_room_is_told_while_it_waits_and_when_it_stops(on_ray, monkeypatch):
     assert any("waiting up to 0.5 s for more" in line for line in on_ray.told)
 
 
-@pytest.mark.parametrize("what", ["Python", "Skillweave"])
-def test_a_node_with_another_version_is_refused(on_ray, monkeypatch, what):
-    if what == "Python":
-        monkeypatch.setattr(actors.platform, "python_version", lambda: "3.99.1")
-    else:
-        monkeypatch.setattr("skillweave.__version__", "9.9")
-    with pytest.raises(SkillweaveError, match=rf"has {what} .*, but here is (3\.99\.1|9\.9)"):
-        on_ray(stepping())
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        ({"Python": "3.99.1"}, r"node 10.0.0.7 .* has Python 3\.99\.1, but here is"),
+        ({"Skillweave": "9.9"}, r"node 10.0.0.7 .* has Skillweave 9\.9, but here is"),
+        ({"Skillweave": None}, "node 10.0.0.7 .* has no Skillweave: install"),
+    ],
+)
+def test_a_node_with_another_version_is_refused(other, says):
+    there = {"node": "10.0.0.7", "Python": platform.python_version()}
+    there |= {"Skillweave": skillweave.__version__}
+    actors._check_versions(there)
+    with pytest.raises(SkillweaveError, match=says):
+        actors._check_versions(there | other)
 
 
-def test_code_and_environments_that_no_node_has_travel_with_the_job(on_ray, tmp_path):
-    file = tmp_path / "only_here.py"
-    file.write_text(
-        "import gymnasium as gym\nfrom reference_calls import Walk\n"
-        "class Own(Walk):\n    pass\ngym.register('OnlyHere-v0', Own)\n"
-    )
-    module = types.ModuleType("only_here")
-    module.__file__ = str(file)
-    sys.modules["only_here"] = module
-    try:
-        exec(compile(file.read_text(), file, "exec"), vars(module))
-        for env in (module.Own, "OnlyHere-v0"):
-            plain, apart = here(stepping(env), 1), on_ray(stepping(env), 1)
-            for collectors in (plain, apart):
-                collectors.start(Seeds(3))
-            request = next(requests(15))
-            equal(plain.collect(request), apart.collect(request))
-    finally:
-        del sys.modules["only_here"], gym.registry["OnlyHere-v0"]
+def test_what_cannot_be_sent_is_told(cluster):
+    lock = threading.Lock()
+    with pytest.raises(SkillweaveError, match=r"(?s)collectors of Walk.*cannot be sent.*lock"):
+        actors.RayCollectors(lambda *_: lock, 3, 2, 1, "Walk")
 
 
-def test_what_cannot_be_sent_is_told(on_ray):
-    lock = open(os.devnull)  # noqa: SIM115
-
-    def make(num_envs, first):
-        return lock
-
-    with lock, pytest.raises(SkillweaveError, match=r"collectors of Walk.*cannot be sent"):
-        on_ray(make)
-
-
-def test_a_full_object_store_is_told(on_ray, monkeypatch):
+def test_a_full_object_store_is_told(cluster, monkeypatch):
     def full(_):
         raise ray.exceptions.ObjectStoreFullError("no room for 3 GB")
 
-    collectors = on_ray(stepping())
     monkeypatch.setattr(actors.ray, "put", full)
     with pytest.raises(SkillweaveError, match="object store of the Ray cluster is full"):
-        collectors.start(Seeds(0))
+        actors.RayCollectors(stepping(), 3, 2, 1, "Walk")
 
 
 @pytest.mark.parametrize(
