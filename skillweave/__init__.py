@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy, Run, train_agent
     from skillweave.api.options import make_options_env
     from skillweave.api.player import Player
+    from skillweave.collecting.cluster import Ray
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
     from skillweave.envs.pool import PoolWrapper, envpool
@@ -73,6 +74,7 @@ _HOME = {
     "PoolWrapper": "envs.pool",
     "RNN": "networks.config",
     "Range": "evolution.config",
+    "Ray": "collecting.cluster",
     "Reflex": "skills",
     "Report": "experience",
     "Rollout": "experience",
@@ -142,6 +144,7 @@ __all__ = [
     "Policy",
     "PoolWrapper",
     "Range",
+    "Ray",
     "Reflex",
     "Report",
     "Rollout",

@@ -19,6 +19,12 @@ from typing import Any
 import numpy as np
 import ray
 from ray import exceptions
+from ray.util.placement_group import (
+    placement_group,
+    placement_group_table,
+    remove_placement_group,
+)
+from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from skillweave.collecting.collector import Collected
 from skillweave.collecting.group import MakeCollector
@@ -38,84 +44,60 @@ LOST = (
 FULL = exceptions.ObjectStoreFullError, exceptions.OutOfDiskError
 
 
-class RayCollectors(WorkerCollectors):
-    """W collectors, each an actor.
+class Actors:
+    """The actors of a run, kept from stage to stage; in each stands one collector.
 
     Args:
-        make: makes one; it is sent to the nodes with the user's code that it needs.
-        each: environments of a collector.
-        count: W.
-        members: P.
-        name: what messages call the environment.
-        cpus: of each actor.
-        patience: seconds to wait while the cluster has no room for an actor.
+        count: how many there may be at once; the cluster keeps room for them.
+        cpus: of each.
+        patience: seconds to wait while the cluster has no room for them.
         tell: is told what people should know.
-
-    Raises:
-        SkillweaveError: a node has another version of Skillweave or Python, or there is no room.
     """
 
-    _workers: list[ActorWorker]  # type: ignore[assignment]
-
     def __init__(
-        self,
-        make: MakeCollector,
-        each: int,
-        count: int,
-        members: int,
-        name: str,
-        *,
-        cpus: float = 1.0,
-        patience: float = 300.0,
-        tell: Callable[[str], None] = print,
+        self, count: int, cpus: float, patience: float, tell: Callable[[str], None]
     ) -> None:
-        room = Room(cpus, count, patience, tell)
-        code = _put(packed(make, f"what collectors of {name} are made of"))
-        kind = ray.remote(num_cpus=cpus, max_restarts=0)(_actor_class())
-        workers = [ActorWorker(kind, code, each, i, room) for i in range(count)]
-        super().__init__(workers, each, members, name)
-
-    def close(self) -> None:
-        """Let the actors close their environments, and end them."""
-        actors = [w.actor for w in self._workers if w.actor is not None]
-        with suppress(Exception):  # perhaps there is no cluster any more
-            closed = [actor.close.remote() for actor in actors]
-            ray.wait(closed, num_returns=len(closed), timeout=PATIENCE)
-        for worker in self._workers:
-            worker.release()
-
-    def _shared(self, task: Any) -> Sequence[Any]:
-        return [_put(task)] * len(self._workers)
-
-    def _joined(self, found: Sequence[Collected]) -> Collected:
-        # Arrays of the object store cannot be written to; joining several copies them.
-        return super()._joined(found if len(found) > 1 else deepcopy(found))
-
-
-class Room:
-    """What actors need, and how long to wait while the cluster does not have it."""
-
-    def __init__(
-        self, cpus: float, count: int, patience: float, tell: Callable[[str], None]
-    ) -> None:
-        self.cpus, self.count, self.patience, self.tell = cpus, count, patience, tell
+        self.count, self.cpus, self.patience, self.tell = count, cpus, patience, tell
+        self._kind: Any = ray.remote(num_cpus=cpus, max_restarts=0)(_actor_class())
+        self._group = placement_group([{"CPU": cpus}] * count)
+        self._actors: dict[int, Any] = {}
         self._waited, self._told = 0.0, False
 
+    def get(self, number: int) -> Any:
+        """An actor; it is made where it does not exist."""
+        if number not in self._actors:
+            where = PlacementGroupSchedulingStrategy(self._group, number)  # type: ignore[no-untyped-call]
+            self._actors[number] = self._kind.options(scheduling_strategy=where).remote()
+        return self._actors[number]
+
+    def end(self, number: int) -> None:
+        """End an actor, if it exists."""
+        if number in self._actors:
+            with suppress(Exception):  # perhaps there is no cluster any more
+                ray.kill(self._actors.pop(number))
+
+    def close(self) -> None:
+        """End them all."""
+        for number in list(self._actors):
+            self.end(number)
+        with suppress(Exception):
+            remove_placement_group(self._group)
+
     def wait_for(self, ref: Any) -> None:
-        """Until an actor has begun.
+        """Until an actor has answered.
 
         Raises:
-            SkillweaveError: there was no room for too long.
+            SkillweaveError: there was no room for it for too long.
         """
         began = monotonic()
         while not ray.wait([ref], timeout=LOOK)[0]:
             now = monotonic()
-            free = ray.available_resources().get("CPU", 0.0)
-            if free >= self.cpus:  # it is only slow to begin
+            if placement_group_table(self._group)["state"] == "CREATED":  # it is only slow
                 began = now
                 continue
             self._waited, began = self._waited + now - began, now
             total = ray.cluster_resources().get("CPU", 0.0)
+            free = ray.available_resources().get("CPU", 0.0)
             says = (
                 f"{self.count} collectors need {self.count * self.cpus:g} CPUs of the Ray cluster; "
                 f"it has {total:g}, of which {free:g} are free"
@@ -130,43 +112,80 @@ class Room:
                 self.tell(f"{says}: waiting up to {self.patience:g} s for more (Ctrl-C stops)")
 
 
+class RayCollectors(WorkerCollectors):
+    """W collectors, each in an actor.
+
+    Args:
+        actors: where.
+        make: makes one; it is sent to the nodes with the user's code that it needs.
+        each: environments of a collector.
+        count: W.
+        members: P.
+        name: what messages call the environment.
+
+    Raises:
+        SkillweaveError: a node has another version of Skillweave or Python, or there is no room.
+    """
+
+    def __init__(
+        self, actors: Actors, make: MakeCollector, each: int, count: int, members: int, name: str
+    ) -> None:
+        code = _put(packed(make, f"what collectors of {name} are made of"))
+        self._actors = actors
+        workers = [ActorWorker(actors, code, each, i) for i in range(count)]
+        super().__init__(workers, each, members, name)
+
+    def close(self) -> None:
+        """Let the actors close their environments; end those that do not."""
+        numbers = range(len(self._workers))
+        closed = {self._actors.get(i).close.remote(): i for i in numbers}
+        late = ray.wait(list(closed), num_returns=len(closed), timeout=PATIENCE)[1]
+        for ref in late:
+            self._actors.end(closed[ref])
+
+    def _shared(self, task: Any) -> Sequence[Any]:
+        return [_put(task)] * len(self._workers)
+
+    def _joined(self, found: Sequence[Collected]) -> Collected:
+        # Arrays of the object store cannot be written to; joining several copies them.
+        return super()._joined(found if len(found) > 1 else deepcopy(found))
+
+
 class ActorWorker:
     """A collector in an actor.
 
     Args:
-        kind: the actor's class.
+        actors: where.
         code: what makes the collector, packed, in the object store.
         each: its environments.
-        number: of the worker.
-        room: what an actor needs.
+        number: of the worker, and of its actor.
     """
 
-    def __init__(self, kind: Any, code: Any, each: int, number: int, room: Room) -> None:
-        self._kind, self._code, self._each, self._number = kind, code, each, number
-        self._room, self._due, self._lost = room, deque[Any](), ""
-        self.actor: Any = None
+    def __init__(self, actors: Actors, code: Any, each: int, number: int) -> None:
+        self._actors, self._code, self._each, self._number = actors, code, each, number
+        self._due, self._lost = deque[Any](), ""
         self.place: dict[str, Any] = {}
         """Its node and process, and what runs there."""
         self._versions: Any = None
 
     def begin(self) -> None:
-        """Ask the cluster for an actor, which makes the collector."""
+        """Ask for an actor, which makes the collector."""
         if self._lost:
-            self._room.tell(f"worker {self._number} {self._lost}; it is made again")
-        self.actor = self._kind.remote()
-        self._versions = self.actor.versions.remote()
-        self._due = deque([self.actor.make.remote(self._code, self._each, self._number)])
+            self._actors.tell(f"worker {self._number} {self._lost}; it is made again")
+        actor = self._actors.get(self._number)
+        self._versions = actor.versions.remote()
+        self._due = deque([actor.make.remote(self._code, self._each, self._number)])
 
     def send(self, what: str, task: Any) -> None:
         """Ask for something."""
-        self._due.append(self.actor.answer.remote(what, task))
+        self._due.append(self._actors.get(self._number).answer.remote(what, task))
 
     def receive(self) -> Any:
         """The next answer."""
         ref = self._due.popleft()
         try:
             if self._versions is not None:
-                self._room.wait_for(self._versions)
+                self._actors.wait_for(self._versions)
                 self.place = ray.get(self._versions)
                 _check_versions(self.place)
                 self._versions = None
@@ -182,11 +201,8 @@ class ActorWorker:
 
     def release(self) -> None:
         """End the actor."""
-        actor, self.actor = self.actor, None
         self._due.clear()
-        if actor is not None:
-            with suppress(Exception):
-                ray.kill(actor)
+        self._actors.end(self._number)
 
 
 def _actor_class() -> type:
@@ -219,14 +235,17 @@ def _actor_class() -> type:
             return self.stationed.answer(what, task)
 
         def close(self) -> None:
-            """Close the environments."""
-            self.stationed.close()
+            """Close the environments, if there are any."""
+            if hasattr(self, "stationed"):
+                self.stationed.close()
 
     return CollectorActor
 
 
 class Stationed:
     """A station whose errors are answers."""
+
+    station: Station | None = None
 
     def make(self, code: bytes, each: int, number: int) -> tuple[str | None, None]:
         """Make the collector."""
@@ -243,11 +262,15 @@ class Stationed:
         """What the station answers."""
         if isinstance(task, dict):  # a state; arrays of the object store cannot be written to
             task = {k: np.array(v) for k, v in task.items()}
-        return _tried(lambda: self.station.answer(what, task))
+        station: Any = self.station
+        return _tried(lambda: station.answer(what, task))
 
     def close(self) -> None:
-        """Close the environments."""
-        self.station.collector.close()
+        """Close the environments, if there are any."""
+        station, self.station = self.station, None
+        if station is not None:
+            with suppress(Exception):
+                station.collector.close()
 
 
 def _tried(do: Callable[[], Any]) -> tuple[str | None, Any]:

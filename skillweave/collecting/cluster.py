@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,11 +76,21 @@ class Ray:
         begun = not ray.is_initialized()
         if begun:
             self._connect(ray, most)
-        try:
-            yield functools.partial(_make, self, tell)
-        finally:
+        with ExitStack() as stack:
             if begun:
-                ray.shutdown()
+                stack.callback(ray.shutdown)
+            from skillweave.collecting.actors import Actors, RayCollectors
+
+            actors = Actors(most, self.cpus, self.patience, tell)
+            stack.callback(actors.close)
+
+            def make_collectors(
+                make: MakeCollector, num_envs: int, workers: int, members: int, name: str
+            ) -> Collectors:
+                each = share_of(num_envs, workers, members, name)
+                return RayCollectors(actors, make, each, workers, members, name)
+
+            yield make_collectors
 
     def _connect(self, ray: Any, most: int) -> None:
         address = self.address or os.environ.get("RAY_ADDRESS") or "local"
@@ -119,24 +128,6 @@ def imported() -> Any:
     except ImportError as error:
         raise MissingExtra("Ray, for collectors on a cluster,", "ray") from error
     return ray
-
-
-def _make(
-    cluster: Ray,
-    tell: Callable[[str], None],
-    make: MakeCollector,
-    num_envs: int,
-    workers: int,
-    members: int,
-    name: str,
-) -> Collectors:
-    """As ``make_collectors``, on a cluster."""
-    from skillweave.collecting.actors import RayCollectors
-
-    return RayCollectors(
-        make, share_of(num_envs, workers, members, name), workers, members, name,
-        cpus=cluster.cpus, patience=cluster.patience, tell=tell,
-    )  # fmt: skip
 
 
 def _must_listen(address: str) -> None:

@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import threading
+from contextlib import ExitStack
 
 import gymnasium as gym
 import numpy as np
@@ -42,24 +43,26 @@ def cluster():
     made = cluster_utils.Cluster(
         initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False}
     )
-    with Ray(address=made.address).connected(0, print):
-        yield made
+    ray.init(made.address, logging_level="ERROR", log_to_driver=False)
+    yield made
+    ray.shutdown()
     made.shutdown()
 
 
 @pytest.fixture
 def on_ray(cluster):
-    told, made = [], []
+    told, open_ = [], ExitStack()
 
     def of(make, count=2, each=3, **how):
-        how = {"patience": 60.0} | how
-        made.append(actors.RayCollectors(make, each, count, 1, "Walk", tell=told.append, **how))
-        return made[-1]
+        settings = Ray(**{"patience": 60.0} | how)
+        make_collectors = open_.enter_context(settings.connected(count, told.append))
+        made = make_collectors(make, each * count, count, 1, "Walk")
+        open_.callback(made.close)
+        return made
 
     of.told = told
-    yield of
-    for collectors in made:
-        collectors.close()
+    with open_:
+        yield of
 
 
 def deciding(env=Again):
@@ -194,19 +197,19 @@ def test_a_node_with_another_version_is_refused(other, says):
         actors._check_versions(there | other)
 
 
-def test_what_cannot_be_sent_is_told(cluster):
+def test_what_cannot_be_sent_is_told(on_ray):
     lock = threading.Lock()
     with pytest.raises(SkillweaveError, match=r"(?s)collectors of Walk.*cannot be sent.*lock"):
-        actors.RayCollectors(lambda *_: lock, 3, 2, 1, "Walk")
+        on_ray(lambda *_: lock)
 
 
-def test_a_full_object_store_is_told(cluster, monkeypatch):
+def test_a_full_object_store_is_told(on_ray, monkeypatch):
     def full(_):
         raise ray.exceptions.ObjectStoreFullError("no room for 3 GB")
 
     monkeypatch.setattr(actors.ray, "put", full)
     with pytest.raises(SkillweaveError, match="object store of the Ray cluster is full"):
-        actors.RayCollectors(stepping(), 3, 2, 1, "Walk")
+        on_ray(stepping())
 
 
 @pytest.mark.parametrize(
