@@ -40,7 +40,8 @@ def begin(
     plan(content["stages"], evolve)
     check_stages(content["stages"], content["eval_every"])
     spec = declared.spec
-    if _checked(cluster) is not None and cluster.collectors is not None:
+    _check(cluster)
+    if cluster is not None and cluster.collectors is not None:
         spec = replace(spec, workers=cluster.collectors)
     assign_workers(content["stages"], spec)
     for stage in content["stages"]:
@@ -97,7 +98,8 @@ def _where(
     Raises:
         SkillweaveError: the run was begun with another number of collectors.
     """
-    if _checked(cluster) is None or run.finished:
+    _check(cluster)
+    if cluster is None or run.finished:
         return make_collectors
     left = [s for s in run.manifest["stages"] if s["status"] != "done"]
     counts = [s.get("workers", 1) for s in left if s.get("evolution") is None]
@@ -110,7 +112,6 @@ def _where(
     return stack.enter_context(cluster.connected(max(counts, default=1), progress.message))
 
 
-def _checked(cluster: Ray | None) -> Any:
-    if cluster is not None and not isinstance(cluster, Ray):
+def _check(cluster: Any) -> None:
+    if not isinstance(cluster, Ray | None):
         raise SkillweaveError(f"cluster is {short(cluster)}; write cluster=Ray(collectors=8)")
-    return cluster

@@ -66,7 +66,7 @@ class Actors:
     def get(self, number: int) -> Any:
         """An actor; it is made where it does not exist."""
         if number not in self._actors:
-            where = PlacementGroupSchedulingStrategy(self._group, number)  # type: ignore[no-untyped-call]
+            where = PlacementGroupSchedulingStrategy(self._group, number)
             self._actors[number] = self._kind.options(scheduling_strategy=where).remote()
         return self._actors[number]
 
@@ -126,6 +126,8 @@ class RayCollectors(WorkerCollectors):
     Raises:
         SkillweaveError: a node has another version of Skillweave or Python, or there is no room.
     """
+
+    tries = 5  # one may be made again on a node of which Ray does not know yet that it is lost
 
     def __init__(
         self, actors: Actors, make: MakeCollector, each: int, count: int, members: int, name: str
@@ -214,12 +216,13 @@ def _actor_class() -> type:
     class CollectorActor:
         def versions(self) -> dict[str, Any]:
             """What runs here, and where that is."""
-            found = {"node": ray.util.get_node_ip_address(), "process": os.getpid()}
+            found: dict[str, Any] = {"node": ray.util.get_node_ip_address()}
+            found |= {"process": os.getpid(), "Python": platform.python_version()}
             try:
-                from skillweave import __version__
+                import skillweave
             except ImportError:
-                __version__ = None
-            return found | {"Python": platform.python_version(), "Skillweave": __version__}
+                return found | {"Skillweave": None}
+            return found | {"Skillweave": skillweave.__version__}
 
         def make(self, code: bytes, each: int, number: int) -> Any:
             """Make the collector: (error, None)."""

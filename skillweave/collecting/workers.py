@@ -19,8 +19,6 @@ from skillweave.types import Array, SkillweaveError
 
 SNAPSHOT_EVERY = 16
 """Requests after which workers say where they stand, so that less need be done again."""
-TRIES = 2
-"""How often a worker is made again before a request fails."""
 
 
 class WorkerLost(Exception):
@@ -95,6 +93,9 @@ class WorkerCollectors(Collectors):
             place; the message names it.
     """
 
+    tries = 1
+    """How often lost workers are made again before a request fails."""
+
     def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
         self.members, self.num_envs, self.steps_made = members, each * len(workers), 0
         self.parts = []
@@ -160,9 +161,9 @@ class WorkerCollectors(Collectors):
         if kept:
             self._past = path
         found = self._asked(range(len(self._workers)), what, tasks)
-        for tried in range(TRIES):
+        for tried in range(self.tries):
             if lost := [i for i in range(len(self._workers)) if i not in found]:
-                found |= self._again(lost, path, must=tried == TRIES - 1)
+                found |= self._again(lost, path, must=tried == self.tries - 1)
         return [found[i] for i in range(len(self._workers))]
 
     def _again(
