@@ -17,6 +17,7 @@ from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import short
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import identity
 from skillweave.runs.trackers import make_trackers
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
 from skillweave.types import SkillweaveError
@@ -36,6 +37,39 @@ def begin(
 ) -> Run:
     """Check everything, begin a run of this manifest, and train it."""
     run_dir = as_path(run_dir, "run_dir")
+    _plan(declared, content, evolve, cluster)
+    if isinstance(track, str) or not isinstance(track, Sequence):
+        raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
+    track = tuple(track)
+    make_trackers(track, None)  # a missing extra is said before anything is written
+    if cluster is not None:
+        cluster.check()
+    run = RunDirectory.create(run_dir, content | {"recipe": declared.recipe, "track": track})
+    return go_on(declared, run, quiet, evolve, cluster)
+
+
+def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
+    """The finished run of this manifest in ``run_dir``: begun, or gone on with, where it is not.
+
+    Raises:
+        SkillweaveError: there is a run, but of another manifest.
+    """
+    if not (run_dir / "run.json").exists():
+        return begin(declared, content, run_dir, True, (), None, None)
+    run = RunDirectory.open(run_dir)
+    _plan(declared, content, None, None)
+    if run.manifest.get("id") != identity(content):
+        raise SkillweaveError(
+            f"{run_dir} holds a run of other settings (or of another recipe, budget or version); "
+            "choose another directory"
+        )
+    return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
+
+
+def _plan(
+    declared: Hierarchy | Agent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
+) -> None:
+    """Check everything, and write into a manifest's stages how they are trained."""
     observation_space, action_space = declared.check_spaces()
     plan(content["stages"], evolve)
     check_stages(content["stages"], content["eval_every"])
@@ -54,12 +88,6 @@ def begin(
                 assert isinstance(declared, Declaration)
                 acts = declared.chooses_from(name, action_space)
                 check_replay(stage | {"algorithm": config}, observation_space, acts)
-    if isinstance(track, str) or not isinstance(track, Sequence):
-        raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
-    track = tuple(track)
-    make_trackers(track, None)  # a missing extra is said before anything is written
-    run = RunDirectory.create(run_dir, content | {"recipe": declared.recipe, "track": track})
-    return go_on(declared, run, quiet, evolve, cluster)
 
 
 def go_on(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import json
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,9 @@ from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.cli.run_lines import run_lines
+from skillweave.cli.sweep import sweep
 from skillweave.cli.targets import declared_by_run, target
+from skillweave.collecting.cluster import Ray
 from skillweave.compat.agilerl_files import convert
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -28,32 +32,7 @@ from skillweave.types import SkillweaveError
 
 def run(command: commands.Command) -> int:
     """Carry a command out and print its result."""
-    match command:
-        case commands.Train():
-            _train(command)
-        case commands.Resume():
-            _resume(command)
-        case commands.Evaluate():
-            _evaluate(command)
-        case commands.Render():
-            _render(command)
-        case commands.Plot():
-            _plot(command)
-        case commands.Report():
-            _report(command)
-        case commands.Compare():
-            _compare(command)
-        case commands.List():
-            _list(command)
-        case commands.Info():
-            _info(command)
-        case commands.Weights():
-            _weights(command)
-        case commands.Export():
-            _export(command)
-        case commands.ImportAgilerl():
-            _import_agilerl(command)
-    return 0
+    return HANDLERS[type(command)](command) or 0
 
 
 def _train(command: commands.Train) -> None:
@@ -62,6 +41,9 @@ def _train(command: commands.Train) -> None:
     hierarchy = recipes.load(command.recipe)
     apply_overrides(hierarchy, command.set)
     hierarchy.scale(command.scale)
+    cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
+    if command.collectors is not None:
+        hierarchy.env = replace(hierarchy.spec, workers=command.collectors)
     evolve = parse_evolve(command.evolve, hierarchy, command.flat)
     name = Path(command.recipe).stem + ("-flat" if command.flat else "")
     path = command.out or _free(Path("runs") / f"{name}-s{command.seed}")
@@ -73,6 +55,7 @@ def _train(command: commands.Train) -> None:
             quiet=command.quiet,
             track=command.track,
             evolve=evolve,
+            cluster=cluster,
         )
     except KeyboardInterrupt:
         raise _interrupted(path) from None
@@ -81,11 +64,18 @@ def _train(command: commands.Train) -> None:
 
 def _resume(command: commands.Resume) -> None:
     declared = declared_by_run(command.run, command.recipe, "resume_needs_recipe")
+    cluster = None if command.ray is None else Ray(address=command.ray or None)
     try:
-        trained = declared.resume(command.run, quiet=command.quiet)
+        trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
     except KeyboardInterrupt:
         raise _interrupted(command.run) from None
     _tell_trained(command, trained, command.evaluate)
+
+
+def _sweep(command: commands.Sweep) -> int:
+    result, text = sweep(command)
+    _tell(command, result, text)
+    return 1 if result["failed"] else 0
 
 
 def _evaluate(command: commands.Evaluate) -> None:
@@ -289,3 +279,20 @@ def _free(path: Path) -> Path:
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
+
+
+HANDLERS: dict[type, Callable[[Any], int | None]] = {
+    commands.Train: _train,
+    commands.Resume: _resume,
+    commands.Sweep: _sweep,
+    commands.Evaluate: _evaluate,
+    commands.Render: _render,
+    commands.Plot: _plot,
+    commands.Report: _report,
+    commands.Compare: _compare,
+    commands.List: _list,
+    commands.Info: _info,
+    commands.Weights: _weights,
+    commands.Export: _export,
+    commands.ImportAgilerl: _import_agilerl,
+}

@@ -6,7 +6,7 @@ import math
 import os
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,6 +60,37 @@ class Ray:
             if not number or not 0 <= value < math.inf or (name == "cpus" and value == 0):
                 raise SkillweaveError(f"Ray: {name} is {short(value)}; it must be {least}")
 
+    def check(self) -> None:
+        """Raise a SkillweaveError where Ray is not installed, or nobody listens at the address."""
+        if not imported().is_initialized() and self._where not in ("local", "auto"):
+            _must_listen(self._where)
+
+    @property
+    def _where(self) -> str:
+        return self.address or os.environ.get("RAY_ADDRESS") or "local"
+
+    @contextmanager
+    def joined(self, most: int) -> Iterator[Any]:
+        """Be connected to the cluster; the module ``ray``.
+
+        Args:
+            most: what will run at once.
+
+        Raises:
+            MissingExtra: the extra 'ray' is not installed.
+            SkillweaveError: nobody listens at the address, or another version of Ray or Python.
+        """
+        self.check()
+        ray = imported()
+        begun = not ray.is_initialized()
+        if begun:
+            self._connect(ray, most)
+        try:
+            yield ray
+        finally:
+            if begun:
+                ray.shutdown()
+
     @contextmanager
     def connected(self, most: int, tell: Callable[[str], None]) -> Iterator[MakeCollectors]:
         """Be connected to the cluster; what makes collectors on it.
@@ -69,20 +100,12 @@ class Ray:
             tell: is told what people should know.
 
         Raises:
-            MissingExtra: the extra 'ray' is not installed.
-            SkillweaveError: nobody listens at the address, or another version of Ray or Python.
+            SkillweaveError: as of ``joined``.
         """
-        ray = imported()
-        begun = not ray.is_initialized()
-        if begun:
-            self._connect(ray, most)
-        with ExitStack() as stack:
-            if begun:
-                stack.callback(ray.shutdown)
+        with self.joined(most):
             from skillweave.collecting.actors import Actors, RayCollectors
 
             actors = Actors(most, self.cpus, self.patience, tell)
-            stack.callback(actors.close)
 
             def make_collectors(
                 make: MakeCollector, num_envs: int, workers: int, members: int, name: str
@@ -90,16 +113,17 @@ class Ray:
                 each = share_of(num_envs, workers, members, name)
                 return RayCollectors(actors, make, each, workers, members, name)
 
-            yield make_collectors
+            try:
+                yield make_collectors
+            finally:
+                actors.close()
 
     def _connect(self, ray: Any, most: int) -> None:
-        address = self.address or os.environ.get("RAY_ADDRESS") or "local"
+        address = self._where
         how: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
         if address == "local":  # as many as were asked for, be there cores or not
             room = max(cores(), math.ceil(most * self.cpus))
             how |= {"num_cpus": room, "include_dashboard": False}
-        elif address != "auto":
-            _must_listen(address)
         try:
             ray.init(address, **how)
         except ConnectionError as error:
