@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -54,16 +55,28 @@ def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
     Raises:
         SkillweaveError: there is a run, but of another manifest.
     """
-    if not (run_dir / "run.json").exists():
+    run = begun(declared, content, run_dir)
+    if run is None:
         return begin(declared, content, run_dir, True, (), None, None)
-    run = RunDirectory.open(run_dir)
+    return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
+
+
+def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
+    """The run of this manifest in ``run_dir``; None: it is not begun.
+
+    Raises:
+        SkillweaveError: there is a run, but of another manifest.
+    """
+    if not (run_dir / "run.json").exists():
+        return None
+    run, content = RunDirectory.open(run_dir), copy.deepcopy(content)
     _plan(declared, content, None, None)
     if run.manifest.get("id") != identity(content):
         raise SkillweaveError(
             f"{run_dir} holds a run of other settings (or of another recipe, budget or version); "
             "choose another directory"
         )
-    return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
+    return run
 
 
 def _plan(

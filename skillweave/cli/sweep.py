@@ -12,7 +12,6 @@ import os
 import platform
 import re
 import signal
-import statistics
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -23,19 +22,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from skillweave import recipes
-from skillweave.api.training import finish
+from skillweave.api import Hierarchy
+from skillweave.api.training import begun, finish
 from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
+from skillweave.cli.sweep_table import summary
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
 from skillweave.hierarchy import training
 from skillweave.messages import short, told, whole_number
-from skillweave.reporting.report.seeds import over_seeds
-from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import SkillweaveError
 
@@ -67,16 +64,28 @@ class Job:
                     "--ray on several machines, --out must be in a directory that all share"
                 )
             hierarchy = unpacked(code)
-            content = training.manifest(hierarchy, seed=self.seed, flat=self.flat)
-            trained = finish(hierarchy, content, self.path)
-            saved = load_evaluation(RunDirectory.open(self.path))
-            if saved is not None and len(saved.evaluation.returns) == self.evaluate:
-                return float(saved.evaluation.mean)
+            trained = finish(hierarchy, self._manifest(hierarchy), self.path)
             return float(trained.evaluate(self.evaluate, save=True).mean)
         except SkillweaveError as error:
             return str(error)
         except Exception as error:
             return told(error)
+
+    def known(self, hierarchy: Hierarchy) -> float | str | None:
+        """What ``run`` would give, where nothing is left to be done; else None."""
+        try:
+            run = begun(hierarchy, self._manifest(hierarchy), self.path)
+            if run is None or not run.finished:
+                return None
+            saved = load_evaluation(run)
+        except SkillweaveError as error:
+            return str(error)
+        if saved is None or len(saved.evaluation.returns) != self.evaluate:
+            return None
+        return float(saved.evaluation.mean)
+
+    def _manifest(self, hierarchy: Hierarchy) -> dict[str, Any]:
+        return training.manifest(hierarchy, seed=self.seed, flat=self.flat)
 
 
 def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
@@ -92,33 +101,36 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
         )
     name = Path(command.recipe).stem + ("-flat" if command.flat else "")
     out = (command.out or Path("runs") / f"{name}-sweep").absolute()
-    tasks = [
-        (
-            code,
-            Job(settings, seed, out / _file_name(settings, seed), command.flat, command.evaluate),
-        )
-        for settings, code in _codes(command, choices)
-        for seed in seeds
-    ]
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / MARK).touch()
     except OSError as error:
         raise SkillweaveError(f"could not write {out}: {error.strerror}") from error
     found: dict[Job, float | str] = {}
+    jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
+    for settings, hierarchy in _hierarchies(command, choices):
+        code = packed(hierarchy, command.recipe)
+        for seed in seeds:
+            path = out / _file_name(settings, seed)
+            job = Job(settings, seed, path, command.flat, command.evaluate)
+            jobs.append(job)
+            if (known := job.known(hierarchy)) is None:
+                tasks.append((code, job))
+            else:
+                found[job] = known
     run = _on_ray if command.ray is not None else _in_processes
     try:
-        for job, result in run(tasks, command):
+        for job, result in run(tasks, command) if tasks else ():
             found[job] = result
             if not command.quiet:
                 says = result if isinstance(result, str) else f"return {result:.1f}"
-                line = f"{len(found)} of {len(tasks)}: {job.path.name}: {says}"
+                line = f"{len(found)} of {len(jobs)}: {job.path.name}: {says}"
                 print(line, file=sys.stderr, flush=True)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{len(found)} of {len(tasks)} runs are finished; the same command goes on"
+            f"{len(found)} of {len(jobs)} runs are finished; the same command goes on"
         ) from None
-    return _summary([(job, found[job]) for _, job in tasks], out)
+    return summary([(j.settings, j.seed, j.path, found[j]) for j in jobs], out)
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -156,17 +168,17 @@ def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
     return list(itertools.product(*options))
 
 
-def _codes(
+def _hierarchies(
     command: commands.Sweep, choices: Sequence[tuple[str, ...]]
-) -> Iterator[tuple[str, bytes]]:
-    """For each choice its name, and the hierarchy with these settings, packed."""
+) -> Iterator[tuple[str, Hierarchy]]:
+    """For each choice its name, and the hierarchy with these settings."""
     for choice in choices:
         hierarchy = recipes.load(command.recipe)
         apply_overrides(hierarchy, [*command.set, *choice])
         hierarchy.scale(command.scale)
         # Runs share the cores, so each has one; and it is the same whichever machine it is on.
         hierarchy.env = replace(hierarchy.spec, workers=1)
-        yield ", ".join(choice), packed(hierarchy, command.recipe)
+        yield ", ".join(choice), hierarchy
 
 
 def _file_name(settings: str, seed: int) -> str:
@@ -239,48 +251,3 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
 
 def _run(job: Job, code: bytes) -> float | str:
     return job.run(code)
-
-
-def _summary(results: Sequence[tuple[Job, float | str]], out: Path) -> tuple[dict[str, Any], str]:
-    """The table: a line for each choice of settings, over its seeds."""
-    groups, failed = [], []
-    for settings, own in itertools.groupby(results, lambda result: result[0].settings):
-        returns = []
-        for job, result in own:
-            if isinstance(result, str):
-                failed.append({"run": str(job.path), "error": result})
-            else:
-                returns.append(result)
-        group: dict[str, Any] = {"settings": settings or "as declared", "runs": len(returns)}
-        if returns:
-            found = over_seeds(np.array(returns))
-            group |= {"iqm": float(found.mean), "median": statistics.median(returns)}
-            group |= {"least": min(returns), "most": max(returns)}
-            if found.low is not None and found.high is not None:
-                group |= {"low": float(found.low), "high": float(found.high)}
-        groups.append(group)
-    runs = [
-        {"run": str(j.path), "settings": j.settings, "seed": j.seed, "return": r}
-        for j, r in results
-        if not isinstance(r, str)
-    ]
-    result = {"out": str(out), "groups": groups, "runs": runs, "failed": failed}
-    return result, "\n".join([*_table(groups), *_failures(failed), f"runs    {out}"])
-
-
-def _table(groups: Sequence[dict[str, Any]]) -> list[str]:
-    wide = max(len(g["settings"]) for g in groups)
-    head = f"{'settings':<{wide}} {'runs':>5} {'return':>9} {'95 % interval':>20} {'median':>9}"
-    lines = [f"{head} {'least to most':>20}"]
-    for g in groups:
-        line = f"{g['settings']:<{wide}} {g['runs']:>5}"
-        if g["runs"]:
-            interval = f"{g['low']:.1f} to {g['high']:.1f}" if "low" in g else "one seed"
-            line += f" {g['iqm']:>9.1f} {interval:>20} {g['median']:>9.1f}"
-            line += f" {g['least']:>9.1f} to {g['most']:.1f}".rjust(21)
-        lines.append(line)
-    return [*lines, "return: the interquartile mean over seeds of the runs' mean returns"]
-
-
-def _failures(failed: Sequence[dict[str, str]]) -> list[str]:
-    return [f"failed  {f['run']}: {f['error']}" for f in failed]
