@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from contextlib import ExitStack
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -17,12 +18,15 @@ from reference_calls import Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, requests
 
 import skillweave
+from skillweave import PPO, Agent
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.group import Collectors
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 
@@ -156,6 +160,35 @@ def test_collectors_of_a_lost_node_are_made_again_on_others(on_ray, cluster, onl
     lost = "worker 0 (was lost with its node|is out of reach); it is made again"
     assert on_ray.told
     assert all(re.fullmatch(lost, line) for line in on_ray.told)
+
+
+def test_a_run_on_ray_goes_on_in_processes_and_ends_as_if_nothing_had_happened(
+    cluster, tmp_path, monkeypatch
+):
+    def learnt(path):
+        return {f.name: f.read_bytes() for f in sorted((path / "policies").iterdir())}
+
+    small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1)
+    spec = EnvSpec("CartPole-v1", engine="sync", workers=2)
+    whole = Agent(spec, small, 512, cut_every=128)
+    whole.train(tmp_path / "whole", quiet=True)
+    agent = Agent(replace(spec, workers=1), small, 512, cut_every=128)
+    save, left = RunDirectory.save_checkpoint, [2]
+
+    def stop(self, *about):
+        save(self, *about)
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunDirectory, "save_checkpoint", stop)
+    with pytest.raises(KeyboardInterrupt):
+        agent.train(tmp_path / "on", quiet=True, cluster=Ray(collectors=2))
+    assert 0 < read_tensors(tmp_path / "on" / "checkpoint.safetensors")[1]["steps"] < 512
+    with pytest.raises(SkillweaveError, match="was begun with 2 collectors, and goes on with as"):
+        agent.resume(tmp_path / "on", quiet=True, cluster=Ray(collectors=4))
+    agent.resume(tmp_path / "on", quiet=True)
+    assert learnt(tmp_path / "on") == learnt(tmp_path / "whole")
 
 
 class Failing(Again):
