@@ -1,0 +1,263 @@
+"""Collectors on Ray: how they scale, what they cost, and whether the weights stay the same.
+
+    python -m benchmarks.cluster [scale] [overhead] [equal] [costs] [saturation]
+
+``scale``: an environment whose step sleeps 2 ms, so that it waits and does not compute: steps per
+second of 1 to 16 collectors with 4 environments each, against as many times those of one.
+``overhead``: two actors of Ray against two processes, PPO on MiniGrid's DoorKey-8x8 in Python;
+rounds take turns, the median ratio counts. ``equal``: weights after ``kill -9`` of an actor at
+random moments, and of a whole node (Ray's ``Cluster``), against those of processes. ``costs``:
+microseconds and bytes of a step, here and there. ``saturation``: from these, the collectors that
+one learner can serve.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import signal
+import statistics
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from benchmarks.collecting import EPOCHS, NETWORK, grid, ours
+from benchmarks.common import report, table
+from skillweave import PPO, EnvSpec, Ray, train_agent
+from skillweave.collecting.cluster import imported
+from skillweave.types import Array
+
+SLEEP = 2e-3
+EACH, ROWS = 4, 64
+
+
+class Sleeping(gym.Env[Array, Any]):
+    """A step takes 2 ms and no computing."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (8,), np.float32)
+    action_space = gym.spaces.Discrete(4)
+
+    def reset(
+        self, *, seed: int | None = None, options: Any = None
+    ) -> tuple[Array, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.t = 0
+        return self._look(), {}
+
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        time.sleep(SLEEP)
+        self.t += 1
+        return self._look(), float(action == self.t % 4), self.t >= 50, False, {}
+
+    def _look(self) -> Array:
+        return self.np_random.uniform(-1.0, 1.0, 8).astype(np.float32)
+
+
+def small(collectors: int, each: int = EACH, rows: int = ROWS) -> PPO:
+    return PPO(
+        num_envs=each * collectors, n_steps=rows, batch_size=256, update_epochs=EPOCHS,
+        network=NETWORK, normalize_obs=False,
+    )  # fmt: skip
+
+
+def trained(env: Any, config: PPO, steps: int, workers: int, cluster: Ray | None) -> dict[str, Any]:
+    """Steps per second, and the checksum of the weights."""
+    with tempfile.TemporaryDirectory() as folder:
+        spec, path = EnvSpec(env, engine="sync", workers=workers), Path(folder) / "run"
+        run = train_agent(spec, config, steps, path, quiet=True, cluster=cluster)
+        weights = (path / "policies" / "agent.safetensors").read_bytes()
+        speed = run.info()["stages"][0]["steps_per_second"]
+        return {"speed": speed, "weights": hashlib.sha256(weights).hexdigest()}
+
+
+def scale(given: argparse.Namespace) -> dict[str, Any]:
+    found: dict[int, float] = {}
+    with Ray().joined(16):
+        for _ in range(given.rounds):
+            for count in (1, 2, 4, 8, 16):
+                steps = EACH * count * ROWS * given.updates
+                speed = trained(Sleeping, small(count), steps, count, Ray(count))["speed"]
+                found[count] = max(found.get(count, 0.0), speed)
+    share = {count: speed / (count * found[1]) for count, speed in found.items()}
+    print(table(
+        ("collectors", "steps/s", "of linear"),
+        [(n, f"{s:,.0f}", f"{share[n]:.2f}") for n, s in found.items()],
+    ))  # fmt: skip
+    return {"steps_per_second": found, "of_linear": share}
+
+
+def overhead(given: argparse.Namespace) -> dict[str, Any]:
+    ratios, steps = [], given.steps
+    with Ray().joined(2):
+        for _ in range(given.rounds):
+            plain, on_ray = ours(2, steps), ours(2, steps, Ray(2))
+            ratios.append(on_ray / plain)
+            print(
+                f"processes {plain:,.0f}, Ray {on_ray:,.0f} steps/s: {ratios[-1]:.2f}", flush=True
+            )
+    return {"ratios": ratios, "median": statistics.median(ratios)}
+
+
+def actors() -> list[int]:
+    """The processes of all actors on this machine."""
+    found = subprocess.run(["pgrep", "-f", "ray::CollectorActor"], capture_output=True, text=True)
+    return [int(pid) for pid in found.stdout.split()]
+
+
+def equal(given: argparse.Namespace) -> dict[str, Any]:
+    ray = imported()
+    from ray.cluster_utils import Cluster
+
+    rng, config, steps = random.Random(0), small(3), EACH * 3 * ROWS * 20
+    plain = trained(Sleeping, config, steps, 3, None)["weights"]
+    nodes = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+    )
+    others = [nodes.add_node(num_cpus=1) for _ in range(2)]
+    ray.init(nodes.address, logging_level="ERROR", log_to_driver=False)
+    found: dict[str, list[bool]] = {"undisturbed": [], "actor": [], "node": []}
+
+    def one(kind: str, disturb: Callable[[], None]) -> None:
+        timer = threading.Timer(rng.uniform(1.0, 12.0), disturb)
+        timer.start()
+        same = trained(Sleeping, config, steps, 3, Ray(3))["weights"] == plain
+        timer.cancel()
+        found[kind].append(same and (kind == "undisturbed" or bool(done)))
+        print(f"{kind} {len(found[kind])}: {'equal' if same else 'NOT EQUAL'} {done}", flush=True)
+        done.clear()
+
+    done: list[str] = []
+
+    def kill_actor() -> None:
+        if pids := actors():
+            os.kill(rng.choice(pids), signal.SIGKILL)
+            done.append("killed")
+
+    def kill_node() -> None:
+        nodes.remove_node(others.pop(rng.randrange(len(others))), allow_graceful=False)
+        others.append(nodes.add_node(num_cpus=1))
+        done.append("killed")
+
+    one("undisturbed", lambda: None)
+    for _ in range(given.kills):
+        one("actor", kill_actor)
+    for _ in range(given.nodes):
+        one("node", kill_node)
+    ray.shutdown()
+    nodes.shutdown()
+    counts = {kind: f"{sum(same)} of {len(same)}" for kind, same in found.items()}
+    return {"equal": counts}
+
+
+def costs(given: argparse.Namespace) -> dict[str, Any]:
+    """Of a step, in microseconds: collecting in an actor, joining here, learning; and its bytes."""
+    from skillweave.algorithms.policy import make_algorithm
+    from skillweave.collecting import actors as on_ray
+    from skillweave.seeding import Seeds
+    from skillweave.training.learner import RolloutLearner, Stack
+    from skillweave.training.scene import skill_scene
+    from skillweave.training.trainer import _collector
+
+    found: dict[str, Any] = {}
+    for name, env in (("CartPole", lambda: gym.make("CartPole-v1")), ("MiniGrid", grid)):
+        each, rows, count = 16, 128, 2
+        scene, config = skill_scene(EnvSpec(env, engine="sync")), small(count, each, rows)
+        algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+        learner = RolloutLearner(Stack(algorithm, algorithm.init([Seeds(0)])), Seeds(1))
+
+        def make(num_envs: int, first: int, scene: Any = scene, algorithm: Any = algorithm) -> Any:
+            return _collector(scene, algorithm, num_envs, first)
+
+        alone = make(each, 0)
+        alone.start(Seeds(0))
+        seconds: dict[str, list[float]] = {"collect": [], "there and back": [], "learn": []}
+        with Ray(count).connected(count, print) as make_collectors:
+            away = make_collectors(make, each * count, count, 1, name)
+            away.start(Seeds(0))
+            for update in range(given.updates):
+                request, began = learner.request(update, 0, 0.0), time.perf_counter()
+                alone.collect(request)
+                seconds["collect"].append((time.perf_counter() - began) / (each * rows))
+                empty = on_ray.ray.get([w._actors.get(i).versions.remote()
+                                        for i, w in enumerate(away._workers)])  # fmt: skip
+                assert len(empty) == count
+                refs = [
+                    away._workers[i]._actors.get(i).answer.remote("collect", request)
+                    for i in range(count)
+                ]
+                on_ray.ray.wait(refs, num_returns=count)
+                began = time.perf_counter()
+                answers = [on_ray.ray.get(ref)[1] for ref in refs]
+                collected = away._joined(answers)
+                on_ray.ray.get(on_ray.ray.put(request))
+                seconds["there and back"].append(
+                    (time.perf_counter() - began) / (each * rows * count)
+                )
+                learner.take(collected.experience)
+                began = time.perf_counter()
+                learner.learn(update, 0, 0.0)
+                seconds["learn"].append((time.perf_counter() - began) / (each * rows * count))
+            away.close()
+        import pickle
+
+        sent = len(pickle.dumps(answers[0], protocol=5)) / (each * rows)
+        params = len(pickle.dumps(request, protocol=5))
+        found[name] = {k: round(1e6 * statistics.median(v), 2) for k, v in seconds.items()}
+        found[name] |= {"bytes of a step": round(sent), "bytes of a request": params}
+        print(name, found[name], flush=True)
+    return found
+
+
+def saturation(given: argparse.Namespace) -> dict[str, Any]:
+    """Steps per second by measured costs: collecting and learning go on at the same time.
+
+    One driver joins what W collectors send and learns from it, so a step costs it what joining and
+    learning cost; a collector makes a step in what acting and its environment take.
+    """
+    told = json.loads(Path("runs/benchmarks/cluster-costs.json").read_text())
+    rows, found = [], {}
+    for name, step in (("cheap", 0.0), ("costly: 5 ms a step", 5e3)):
+        cost = told["costs"]["MiniGrid"]
+        collector = cost["collect"] + step
+        driver = cost["learn"], cost["there and back"]
+        limit = 1e6 / max(driver)  # joining goes on while the learner learns, on another core
+        for count in (10, 100, 1_000):
+            speed = min(count * 1e6 / collector, limit)
+            rows.append((name, count, f"{speed:,.0f}", f"{speed * collector / 1e6 / count:.0%}"))
+            found[f"{name}, {count}"] = speed
+        found[f"{name}, saturated at"] = limit * collector / 1e6
+        rows.append((name, f"{limit * collector / 1e6:,.0f}", f"{limit:,.0f}", "full"))
+    print(table(("environment", "collectors", "steps/s", "busy"), rows))
+    return found
+
+
+PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
+    "scale": scale, "overhead": overhead, "equal": equal, "costs": costs, "saturation": saturation,
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=list(PARTS))
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=40_000)
+    parser.add_argument("--updates", type=int, default=20)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--nodes", type=int, default=5)
+    given = parser.parse_args()
+    for name in given.parts:
+        report(f"cluster-{name}", {name: PARTS[name](given)})
+
+
+if __name__ == "__main__":
+    main()
