@@ -128,12 +128,13 @@ def equal(given: argparse.Namespace) -> dict[str, Any]:
     found: dict[str, list[bool]] = {"undisturbed": [], "actor": [], "node": []}
 
     def one(kind: str, disturb: Callable[[], None]) -> None:
-        timer = threading.Timer(rng.uniform(1.0, 12.0), disturb)
+        timer = threading.Timer(rng.uniform(0.0, 20.0), disturb)
         timer.start()
         same = trained(Sleeping, config, steps, 3, Ray(3))["weights"] == plain
         timer.cancel()
-        found[kind].append(same and (kind == "undisturbed" or bool(done)))
-        print(f"{kind} {len(found[kind])}: {'equal' if same else 'NOT EQUAL'} {done}", flush=True)
+        if not same or done or kind == "undisturbed":  # else it was over too early
+            found[kind].append(same)
+            print(f"{kind} {len(found[kind])}: {'equal' if same else 'NOT EQUAL'}", flush=True)
         done.clear()
 
     done: list[str] = []
@@ -149,9 +150,9 @@ def equal(given: argparse.Namespace) -> dict[str, Any]:
         done.append("killed")
 
     one("undisturbed", lambda: None)
-    for _ in range(given.kills):
+    while len(found["actor"]) < given.kills:
         one("actor", kill_actor)
-    for _ in range(given.nodes):
+    while len(found["node"]) < given.nodes:
         one("node", kill_node)
     ray.shutdown()
     nodes.shutdown()

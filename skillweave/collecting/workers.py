@@ -105,7 +105,7 @@ class WorkerCollectors(Collectors):
         try:
             for worker in self._workers:
                 worker.begin()
-            self._received(range(len(workers)), must=True)
+            self._completed(self._received(range(len(workers))), [])
         except BaseException:
             self.close()
             raise
@@ -160,7 +160,12 @@ class WorkerCollectors(Collectors):
         path = [*self._past, (what, tasks)]
         if kept:
             self._past = path
-        found = self._asked(range(len(self._workers)), what, tasks)
+        return self._completed(self._asked(range(len(self._workers)), what, tasks), path)
+
+    def _completed(
+        self, found: dict[int, Any], path: Sequence[tuple[str, Sequence[Any]]]
+    ) -> list[Any]:
+        """What all workers answer in the end; those that are not in ``found`` are made again."""
         for tried in range(self.tries):
             if lost := [i for i in range(len(self._workers)) if i not in found]:
                 found |= self._again(lost, path, must=tried == self.tries - 1)
@@ -189,7 +194,7 @@ class WorkerCollectors(Collectors):
                 self._workers[i].send(what, tasks[i])
         return self._received(numbers, must)
 
-    def _received(self, numbers: Iterable[int], must: bool) -> dict[int, Any]:
+    def _received(self, numbers: Iterable[int], must: bool = False) -> dict[int, Any]:
         """What some workers answer; ``must``: none may be lost."""
         found = {}
         for i in numbers:
@@ -204,8 +209,7 @@ class WorkerCollectors(Collectors):
 
     def _failed(self, number: int, lost: WorkerLost) -> SkillweaveError:
         first = number * self._each
-        again = ", and again when it was made anew" if self._past else ""
         return SkillweaveError(
             f"{self._name}: worker {number} (environments {first} to {first + self._each - 1}) "
-            f"{lost}{again}"
+            f"{lost}, and again when it was made anew"
         )
