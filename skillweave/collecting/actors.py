@@ -7,16 +7,15 @@ there is room.
 
 from __future__ import annotations
 
-import os
 import platform
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import deepcopy
+from importlib import metadata
 from time import monotonic
 from typing import Any
 
-import numpy as np
 import ray
 from ray import exceptions
 from ray.util.placement_group import (
@@ -28,8 +27,9 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from skillweave.collecting.collector import Collected
 from skillweave.collecting.group import MakeCollector
-from skillweave.collecting.shipping import packed, unpacked
-from skillweave.collecting.workers import Station, WorkerCollectors, WorkerLost
+from skillweave.collecting.shipping import packed
+from skillweave.collecting.stationed import actor_class
+from skillweave.collecting.workers import WorkerCollectors, WorkerLost
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
 
@@ -58,7 +58,7 @@ class Actors:
         self, count: int, cpus: float, patience: float, tell: Callable[[str], None]
     ) -> None:
         self.count, self.cpus, self.patience, self.tell = count, cpus, patience, tell
-        self._kind: Any = ray.remote(num_cpus=cpus, max_restarts=0)(_actor_class())
+        self._kind: Any = ray.remote(num_cpus=cpus, max_restarts=0)(actor_class())
         self._group = placement_group([{"CPU": cpus}] * count)
         self._actors: dict[int, Any] = {}
         self._waited, self._told = 0.0, False
@@ -207,84 +207,6 @@ class ActorWorker:
         self._actors.end(self._number)
 
 
-def _actor_class() -> type:
-    """The class of actors.
-
-    It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
-    """
-
-    class CollectorActor:
-        def versions(self) -> dict[str, Any]:
-            """What runs here, and where that is."""
-            found: dict[str, Any] = {"node": ray.util.get_node_ip_address()}
-            found |= {"process": os.getpid(), "Python": platform.python_version()}
-            try:
-                import skillweave
-            except ImportError:
-                return found | {"Skillweave": None}
-            return found | {"Skillweave": skillweave.__version__}
-
-        def make(self, code: bytes, each: int, number: int) -> Any:
-            """Make the collector: (error, None)."""
-            try:
-                from skillweave.collecting.actors import Stationed
-            except ImportError as error:
-                return str(error), None
-            self.stationed = Stationed()
-            return self.stationed.make(code, each, number)
-
-        def answer(self, what: str, task: Any) -> Any:
-            """Do something: (error, answer)."""
-            return self.stationed.answer(what, task)
-
-        def close(self) -> None:
-            """Close the environments, if there are any."""
-            if hasattr(self, "stationed"):
-                self.stationed.close()
-
-    return CollectorActor
-
-
-class Stationed:
-    """A station whose errors are answers."""
-
-    station: Station | None = None
-
-    def make(self, code: bytes, each: int, number: int) -> tuple[str | None, None]:
-        """Make the collector."""
-        import torch
-
-        torch.set_num_threads(1)
-
-        def made() -> None:
-            self.station = Station(unpacked(code), each, number)
-
-        return _tried(made)
-
-    def answer(self, what: str, task: Any) -> tuple[str | None, Any]:
-        """What the station answers."""
-        if isinstance(task, dict):  # a state; arrays of the object store cannot be written to
-            task = {k: np.array(v) for k, v in task.items()}
-        station: Any = self.station
-        return _tried(lambda: station.answer(what, task))
-
-    def close(self) -> None:
-        """Close the environments, if there are any."""
-        station, self.station = self.station, None
-        if station is not None:
-            with suppress(Exception):
-                station.collector.close()
-
-
-def _tried(do: Callable[[], Any]) -> tuple[str | None, Any]:
-    try:
-        return None, do()
-    except SkillweaveError as error:
-        return str(error), None
-    except BaseException as error:
-        return told(error), None
-
-
 def _put(thing: Any) -> Any:
     try:
         return ray.put(thing)
@@ -302,9 +224,7 @@ def _full(error: Exception) -> SkillweaveError:
 
 def _check_versions(there: dict[str, Any]) -> None:
     """Raise a SkillweaveError where a node runs something else."""
-    import skillweave
-
-    here = {"Skillweave": skillweave.__version__, "Python": platform.python_version()}
+    here = {"Skillweave": metadata.version("skillweave"), "Python": platform.python_version()}
     for name, mine in here.items():
         theirs = there[name]
         if theirs is None:

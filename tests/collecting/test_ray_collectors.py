@@ -10,6 +10,7 @@ import sys
 import threading
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib import metadata
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +18,6 @@ import pytest
 from reference_calls import Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, requests
 
-import skillweave
 from skillweave import PPO, Agent
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.cluster import Ray
@@ -34,6 +34,7 @@ ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
 
 from skillweave.collecting import actors  # noqa: E402
+from skillweave.collecting.stationed import Stationed  # noqa: E402
 
 NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
 
@@ -199,7 +200,7 @@ class Failing(Again):
 
 
 def test_what_goes_wrong_in_an_actor_is_an_answer():
-    stationed = actors.Stationed()
+    stationed = Stationed()
     assert stationed.make(actors.packed(stepping(Failing), "it"), 3, 1) == (None, None)
     assert stationed.answer("start", Seeds(0)) == (None, None)
     error, answer = stationed.answer("collect", next(requests(5)))
@@ -225,7 +226,7 @@ def test_no_room_is_told_while_it_waits_and_when_it_stops(on_ray, monkeypatch):
 )
 def test_a_node_with_another_version_is_refused(other, says):
     there = {"node": "10.0.0.7", "Python": platform.python_version()}
-    there |= {"Skillweave": skillweave.__version__}
+    there |= {"Skillweave": metadata.version("skillweave")}
     actors._check_versions(there)
     with pytest.raises(SkillweaveError, match=says):
         actors._check_versions(there | other)
