@@ -109,16 +109,22 @@ def overhead(given: argparse.Namespace) -> dict[str, Any]:
 
 
 def actors() -> list[int]:
-    """The processes of all actors on this machine."""
-    found = subprocess.run(["pgrep", "-f", "ray::CollectorActor"], capture_output=True, text=True)
-    return [int(pid) for pid in found.stdout.split()]
+    """The processes of all actors in nodes that this process began."""
+
+    def below(parent: int, name: str) -> list[int]:
+        asked = ["pgrep", "-P", str(parent), "-f", name]
+        found = subprocess.run(asked, capture_output=True, text=True)
+        return [int(pid) for pid in found.stdout.split()]
+
+    raylets = below(os.getpid(), "raylet")
+    return [pid for raylet in raylets for pid in below(raylet, "ray::CollectorActor")]
 
 
 def equal(given: argparse.Namespace) -> dict[str, Any]:
     ray = imported()
     from ray.cluster_utils import Cluster
 
-    rng, config, steps = random.Random(0), small(3), EACH * 3 * ROWS * 20
+    rng, config, steps = random.Random(0), small(3), EACH * 3 * ROWS * 10
     plain = trained(Sleeping, config, steps, 3, None)["weights"]
     nodes = Cluster(
         initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}

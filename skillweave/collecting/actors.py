@@ -76,6 +76,13 @@ class Actors:
             with suppress(Exception):  # perhaps there is no cluster any more
                 ray.kill(self._actors.pop(number))
 
+    def let_close(self) -> None:
+        """Let them close their environments; end those that do not."""
+        with suppress(Exception):  # perhaps there is no cluster any more
+            closed = {actor.close.remote(): number for number, actor in self._actors.items()}
+            for late in ray.wait(list(closed), num_returns=len(closed), timeout=PATIENCE)[1]:
+                self.end(closed[late])
+
     def close(self) -> None:
         """End them all."""
         for number in list(self._actors):
@@ -110,6 +117,7 @@ class Actors:
             if not self._told:
                 self._told = True
                 self.tell(f"{says}: waiting up to {self.patience:g} s for more (Ctrl-C stops)")
+        self._waited, self._told = 0.0, False
 
 
 class RayCollectors(WorkerCollectors):
@@ -139,11 +147,7 @@ class RayCollectors(WorkerCollectors):
 
     def close(self) -> None:
         """Let the actors close their environments; end those that do not."""
-        numbers = range(len(self._workers))
-        closed = {self._actors.get(i).close.remote(): i for i in numbers}
-        late = ray.wait(list(closed), num_returns=len(closed), timeout=PATIENCE)[1]
-        for ref in late:
-            self._actors.end(closed[ref])
+        self._actors.let_close()
 
     def _shared(self, task: Any) -> Sequence[Any]:
         return [_put(task)] * len(self._workers)
