@@ -127,9 +127,16 @@ class Ray:
         try:
             ray.init(address, **how)
         except ConnectionError as error:
+            if address == "auto":
+                raise SkillweaveError(
+                    "this machine is part of no Ray cluster that runs. Begin one with: ray start "
+                    "--head; or leave 'auto' out, for this machine alone"
+                ) from error
             raise SkillweaveError(
-                f"no Ray cluster at {short(address)} ({told(error)}). Begin one with: ray start "
-                "--head; or leave the address out, for this machine alone"
+                f"somebody listens at {short(address)}, but Ray could not connect "
+                f"({told(error)}). Perhaps it is no Ray cluster, or one that asks for a token, as "
+                "those of `ray start` do: then RAY_AUTH_MODE=token is needed here, too (see Ray's "
+                "page on token authentication)"
             ) from error
         except (RuntimeError, ValueError) as error:  # another version of Ray or Python
             raise SkillweaveError(
