@@ -58,7 +58,7 @@ def _train(command: commands.Train) -> None:
             cluster=cluster,
         )
     except KeyboardInterrupt:
-        raise _interrupted(path) from None
+        raise _interrupted(path, command.ray) from None
     _tell_trained(command, trained, command.evaluate, command.render)
 
 
@@ -68,7 +68,7 @@ def _resume(command: commands.Resume) -> None:
     try:
         trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
     except KeyboardInterrupt:
-        raise _interrupted(command.run) from None
+        raise _interrupted(command.run, command.ray) from None
     _tell_trained(command, trained, command.evaluate)
 
 
@@ -241,7 +241,7 @@ def _save(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = 
         print(f"the evaluation is not kept in the run: {error}", file=sys.stderr)
 
 
-def _interrupted(path: Path) -> KeyboardInterrupt:
+def _interrupted(path: Path, ray: str | None) -> KeyboardInterrupt:
     """The same interrupt, with what is saved and how to go on."""
     if not (path / "run.json").exists():
         return KeyboardInterrupt("nothing was trained yet")
@@ -249,6 +249,7 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
     recipe, hint = manifest.get("recipe"), ""
     if manifest.get("resume_needs_recipe", True) and recipe not in recipes.names():
         hint = f" --recipe {recipe or 'FILE.py'}"
+    hint += "" if ray is None else f" --ray {ray}".rstrip()
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]
         saved = f"saved at {at['steps']:,} steps of {at['stage']}"
