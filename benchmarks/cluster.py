@@ -7,8 +7,8 @@ second of 1 to 16 collectors with 4 environments each, against as many times tho
 ``overhead``: two actors of Ray against two processes, PPO on MiniGrid's DoorKey-8x8 in Python;
 rounds take turns, the median ratio counts. ``equal``: weights after ``kill -9`` of an actor at
 random moments, and of a whole node (Ray's ``Cluster``), against those of processes. ``costs``:
-microseconds and bytes of a step, here and there. ``saturation``: from these, the collectors that
-one learner can serve.
+microseconds and bytes of a step, here and there. ``saturation``: a simulation of more collectors
+than there are, by these.
 """
 
 from __future__ import annotations
@@ -223,25 +223,28 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
 
 
 def saturation(given: argparse.Namespace) -> dict[str, Any]:
-    """Steps per second by measured costs: collecting and learning go on at the same time.
+    """Steps per second of one learner and W collectors, simulated round by round.
 
-    One driver joins what W collectors send and learns from it, so a step costs it what joining and
-    learning cost; a collector makes a step in what acting and its environment take.
+    A round is over when the slowest collector has answered, its rows are joined, and the learner
+    has learnt from the round before. What a step costs is measured (``costs``); that collectors
+    differ by 10 % from round to round, and that a call takes 2 ms, is assumed.
     """
     told = json.loads(Path("runs/benchmarks/cluster-costs.json").read_text())
-    rows, found = [], {}
-    for name, step in (("cheap", 0.0), ("costly: 5 ms a step", 5e3)):
-        cost = told["costs"]["MiniGrid"]
-        collector = cost["collect"] + step
-        driver = cost["learn"], cost["there and back"]
-        limit = 1e6 / max(driver)  # joining goes on while the learner learns, on another core
-        for count in (10, 100, 1_000):
-            speed = min(count * 1e6 / collector, limit)
-            rows.append((name, count, f"{speed:,.0f}", f"{speed * collector / 1e6 / count:.0%}"))
-            found[f"{name}, {count}"] = speed
-        found[f"{name}, saturated at"] = limit * collector / 1e6
-        rows.append((name, f"{limit * collector / 1e6:,.0f}", f"{limit:,.0f}", "full"))
-    print(table(("environment", "collectors", "steps/s", "busy"), rows))
+    cost = {k: v / 1e6 for k, v in told["costs"]["MiniGrid"].items()}
+    rng, each, rows, rounds = np.random.default_rng(0), 16, 128, 200
+    lines, found = list[tuple[Any, ...]](), {}
+    for name, wait in (("MiniGrid in Python", 0.0), ("5 ms a step", 5e-3)):
+        for count in (1, 10, 100, 1_000):
+            steps, alone = each * rows * count, each * rows * (cost["collect"] + wait)
+            slowest = alone * rng.normal(1.0, 0.1, (rounds, count)).max(1)
+            round_trip = slowest + 2e-3 + steps * cost["there and back"]
+            learn = steps * cost["learn"]
+            seconds = float(np.maximum(round_trip, learn).sum())
+            speed = rounds * steps / seconds
+            busy = rounds * alone / seconds
+            lines.append((name, count, f"{speed:,.0f}", f"{busy:.0%}"))
+            found[f"{name}, {count}"] = {"steps_per_second": speed, "collectors_busy": busy}
+    print(table(("environment", "collectors", "steps/s", "collectors busy"), lines))
     return found
 
 
