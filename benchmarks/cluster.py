@@ -129,7 +129,7 @@ def equal(given: argparse.Namespace) -> dict[str, Any]:
     nodes = Cluster(
         initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
     )
-    others = [nodes.add_node(num_cpus=1) for _ in range(2)]
+    others = [nodes.add_node(num_cpus=1) for _ in range(3)]  # one more than are needed
     ray.init(nodes.address, logging_level="ERROR", log_to_driver=False)
     found: dict[str, list[bool]] = {"undisturbed": [], "actor": [], "node": []}
 
@@ -152,7 +152,6 @@ def equal(given: argparse.Namespace) -> dict[str, Any]:
 
     def kill_node() -> None:
         nodes.remove_node(others.pop(rng.randrange(len(others))), allow_graceful=False)
-        others.append(nodes.add_node(num_cpus=1))
         done.append("killed")
 
     one("undisturbed", lambda: None)
@@ -160,6 +159,8 @@ def equal(given: argparse.Namespace) -> dict[str, Any]:
         one("actor", kill_actor)
     while len(found["node"]) < given.nodes:
         one("node", kill_node)
+        while len(others) < 3:
+            others.append(nodes.add_node(num_cpus=1))
     ray.shutdown()
     nodes.shutdown()
     counts = {kind: f"{sum(same)} of {len(same)}" for kind, same in found.items()}
