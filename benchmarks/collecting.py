@@ -25,7 +25,7 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.common import machine
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, train_agent
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Ray, Skill, train_agent
 from skillweave.types import Array, Step
 
 GRID = "MiniGrid-DoorKey-8x8-v0"
@@ -52,14 +52,14 @@ def grid(render_mode: str | None = None) -> gym.Env[Any, Any]:
     return Flat(gym.make(GRID, render_mode=render_mode))
 
 
-def ours(workers: int, steps: int) -> float:
+def ours(workers: int, steps: int, cluster: Ray | None = None) -> float:
     config = PPO(
         num_envs=ENVS, n_steps=ROWS, batch_size=BATCH, update_epochs=EPOCHS, network=NETWORK,
         normalize_obs=False,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         spec = EnvSpec(grid, engine="sync", workers=workers)
-        run = train_agent(spec, config, steps, Path(folder) / "run", quiet=True)
+        run = train_agent(spec, config, steps, Path(folder) / "run", quiet=True, cluster=cluster)
         return float(run.info()["stages"][0]["steps_per_second"])
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from skillweave.api.hub import from_hub
     from skillweave.api.options import make_options_env
     from skillweave.api.player import Player
+    from skillweave.collecting.cluster import Ray
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
     from skillweave.envs.pool import PoolWrapper, envpool
@@ -74,6 +75,7 @@ _HOME = {
     "PoolWrapper": "envs.pool",
     "RNN": "networks.config",
     "Range": "evolution.config",
+    "Ray": "collecting.cluster",
     "Reflex": "skills",
     "Report": "experience",
     "Rollout": "experience",
@@ -144,6 +146,7 @@ __all__ = [
     "Policy",
     "PoolWrapper",
     "Range",
+    "Ray",
     "Reflex",
     "Report",
     "Rollout",

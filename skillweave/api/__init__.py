@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +13,19 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopt, check_run, spec_of
 from skillweave.api.run import Run
+from skillweave.api.training import begin, declared_of, go_on
+from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
-from skillweave.evolution.plan import Evolve, make_learner, plan
+from skillweave.evolution.plan import Evolve
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import below
 from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
-from skillweave.messages import as_path, short, whole_number
-from skillweave.reporting.progress import Progress
+from skillweave.messages import as_path, whole_number
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.trackers import make_trackers
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
 from skillweave.types import SkillweaveError
 
 
@@ -44,19 +42,30 @@ class Agent(PlainAgent):
         quiet: bool = False,
         track: Sequence[str] = (),
         evolve: Evolve = None,
+        cluster: Ray | None = None,
     ) -> Run:
         """Train it; all goes to ``run_dir``.
 
-        ``seed``, ``quiet``, ``track`` and ``evolve`` are as in ``Hierarchy.train``.
+        ``seed``, ``quiet``, ``track``, ``evolve`` and ``cluster`` are as in ``Hierarchy.train``.
         """
         content = self.manifest(whole_number(seed, "seed", 0))
-        return _train(self, content, run_dir, quiet, track, evolve)
+        return begin(self, content, run_dir, quiet, track, evolve, cluster)
 
-    def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
-        """Finish the run in ``run_dir``; with ``quiet`` and ``evolve`` as ``Hierarchy.resume``."""
+    def resume(
+        self,
+        run_dir: str | Path,
+        *,
+        quiet: bool = False,
+        evolve: Evolve = None,
+        cluster: Ray | None = None,
+    ) -> Run:
+        """Finish the run in ``run_dir``.
+
+        ``quiet``, ``evolve`` and ``cluster`` are as in ``Hierarchy.resume``.
+        """
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
-        return _go_on(self, run, quiet, evolve)
+        return go_on(self, run, quiet, evolve, cluster)
 
     def load(self, run_dir: str | Path) -> Run:
         """The finished run of this agent in ``run_dir``."""
@@ -119,6 +128,7 @@ class Hierarchy(Declaration):
         quiet: bool = False,
         track: Sequence[str] = (),
         evolve: Evolve = None,
+        cluster: Ray | None = None,
     ) -> Run:
         """Train every skill, then the selector if it is not ready; all goes to ``run_dir``.
 
@@ -130,6 +140,7 @@ class Hierarchy(Declaration):
             track: any of "tensorboard", "wandb" and "mlflow".
             evolve: a population for every stage, or for some by name (a skill's, "selector",
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
+            cluster: run collectors on ``Ray``; None: here, in processes where it pays.
 
         Returns:
             The finished run.
@@ -138,23 +149,31 @@ class Hierarchy(Declaration):
             SkillweaveError: the declaration does not fit the environment, or training diverged.
         """
         content = training.manifest(self, seed=whole_number(seed, "seed", 0), flat=flat)
-        return _train(self, content, run_dir, quiet, track, evolve)
+        return begin(self, content, run_dir, quiet, track, evolve, cluster)
 
-    def resume(self, run_dir: str | Path, *, quiet: bool = False, evolve: Evolve = None) -> Run:
+    def resume(
+        self,
+        run_dir: str | Path,
+        *,
+        quiet: bool = False,
+        evolve: Evolve = None,
+        cluster: Ray | None = None,
+    ) -> Run:
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
         ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
-        selection of your own.
+        selection of your own. ``cluster``: where its collectors run from now on; their number
+        stays.
         """
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         adopt(self, run)
-        return _go_on(self, run, quiet, evolve)
+        return go_on(self, run, quiet, evolve, cluster)
 
     def load(self, run_dir: str | Path) -> Run:
         """The finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         adopt(self, run)
-        return Run(_declared(self, run), run.path, training.load(self, run))
+        return Run(declared_of(self, run), run.path, training.load(self, run))
 
     def plain_agent(self) -> Agent:
         """The flat baseline: one agent on the task itself, without skills and reflexes."""
@@ -208,6 +227,7 @@ def train_agent(
     quiet: bool = False,
     track: Sequence[str] = (),
     evolve: Evolve = None,
+    cluster: Ray | None = None,
 ) -> Run:
     """Train one plain agent on an environment's own reward; the run is like any other.
 
@@ -224,6 +244,7 @@ def train_agent(
         quiet: no progress.
         track: any of "tensorboard", "wandb" and "mlflow".
         evolve: an ``Evolution``: a population in place of one agent.
+        cluster: run collectors on ``Ray``; None: here, in processes where it pays.
 
     Returns:
         The finished run.
@@ -240,60 +261,7 @@ def train_agent(
         eval_every=eval_every,
         eval_episodes=eval_episodes,
     )
-    return agent.train(run_dir, seed=seed, quiet=quiet, track=track, evolve=evolve)
-
-
-def _train(
-    declared: Hierarchy | Agent,
-    content: dict[str, Any],
-    run_dir: str | Path,
-    quiet: bool,
-    track: Sequence[str],
-    evolve: Evolve,
-) -> Run:
-    """Check everything, begin a run of this manifest, and train it."""
-    run_dir = as_path(run_dir, "run_dir")
-    observation_space, action_space = declared.check_spaces()
-    plan(content["stages"], evolve)
-    check_stages(content["stages"], content["eval_every"])
-    assign_workers(content["stages"], declared.spec)
-    for stage in content["stages"]:
-        acts: Any = action_space
-        if stage["decides"] in stage["learns"] and isinstance(declared, Hierarchy):
-            acts = declared.chooses_from(stage["decides"], action_space)
-        check_replay(stage, observation_space, acts)
-        for name, config in stage.get("algorithms", {}).items():
-            if not name.endswith(CRITIC):  # it keeps nothing
-                assert isinstance(declared, Hierarchy)
-                acts = declared.chooses_from(name, action_space)
-                check_replay(stage | {"algorithm": config}, observation_space, acts)
-    if isinstance(track, str) or not isinstance(track, Sequence):
-        raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
-    track = tuple(track)
-    make_trackers(track, None)  # a missing extra is said before anything is written
-    run = RunDirectory.create(run_dir, content | {"recipe": declared.recipe, "track": track})
-    return _go_on(declared, run, quiet, evolve)
-
-
-def _go_on(declared: Hierarchy | Agent, run: RunDirectory, quiet: bool, evolve: Evolve) -> Run:
-    """Train what is left of a run."""
-    learner = make_learner(run.manifest["stages"], evolve)
-    with ExitStack() as stack:
-        stack.callback(run.close)
-        run.begin()
-        progress = stack.enter_context(Progress(quiet=quiet))
-        trackers = make_trackers(run.manifest.get("track", ()), run)
-        for tracker in trackers:
-            stack.callback(tracker.close)
-        policy = training.train(declared, run, (progress, *trackers), learner)
-    return Run(_declared(declared, run), run.path, policy)
-
-
-def _declared(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
-    """What a run trained: a hierarchy, or its flat baseline."""
-    if run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy):
-        return declared.plain_agent()
-    return declared
+    return agent.train(run_dir, seed=seed, quiet=quiet, track=track, evolve=evolve, cluster=cluster)
 
 
 __all__ = ["Agent", "Hierarchy", "Run", "train_agent"]

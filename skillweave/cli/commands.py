@@ -25,7 +25,16 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Train(Output):
+class OnRay(Output):
+    """Where it runs."""
+
+    ray: str | None = None
+    """Use Ray: --ray alone on this machine (or where RAY_ADDRESS says), or --ray HOST:PORT, or
+    --ray auto for the cluster that this machine is a part of."""
+
+
+@dataclass(frozen=True)
+class Train(OnRay):
     """Train a recipe: every skill, then the selector."""
 
     recipe: Positional[str] = tyro.MISSING
@@ -50,10 +59,13 @@ class Train(Output):
     """Episodes of the final evaluation; 0: none."""
     render: bool = False
     """Write a captioned GIF into the run as well."""
+    collectors: int | None = None
+    """Processes, or with --ray actors, that step environments; default: measured. Results depend
+    on their number, not on where they are."""
 
 
 @dataclass(frozen=True)
-class Resume(Output):
+class Resume(OnRay):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
     run: Positional[Path] = tyro.MISSING
@@ -62,6 +74,32 @@ class Resume(Output):
     """The file that declares the hierarchy, unless it is a shipped recipe."""
     evaluate: int = 100
     """Episodes of the final evaluation; 0: none."""
+
+
+@dataclass(frozen=True)
+class Sweep(OnRay):
+    """Train a recipe with many seeds and settings; what is finished is not trained again."""
+
+    recipe: Positional[str] = tyro.MISSING
+    """A shipped recipe, or a Python file that defines a Hierarchy."""
+    seeds: str = "0:5"
+    """0:20 for 0 to 19, or 0,3,7."""
+    set_each: UseAppendAction[tuple[str, ...]] = ()
+    """Try each of these values: --set-each selector.gamma=0.99,0.995. Of several settings, all
+    combinations."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """Change a setting in all runs."""
+    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """A directory for the runs, old or new; default: runs/NAME-sweep. With --ray on several
+    machines all must see it."""
+    flat: bool = False
+    """Train one plain agent on the same number of steps instead: the baseline."""
+    scale: float = 1.0
+    """Multiply every training budget."""
+    evaluate: int = 100
+    """Episodes of each run's evaluation."""
+    jobs: int | None = None
+    """Runs at once; default: one for each core, or for each CPU of the cluster."""
 
 
 @dataclass(frozen=True)
@@ -220,6 +258,7 @@ class ImportAgilerl(Output):
 COMMANDS = (
     Train,
     Resume,
+    Sweep,
     Evaluate,
     Render,
     Plot,
@@ -236,6 +275,7 @@ COMMANDS = (
 Command = (
     Train
     | Resume
+    | Sweep
     | Evaluate
     | Render
     | Plot

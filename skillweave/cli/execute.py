@@ -10,6 +10,7 @@ from skillweave import recipes
 from skillweave.cli import commands, share
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.run_lines import run_lines
+from skillweave.cli.sweep import sweep
 from skillweave.cli.targets import declared_by_run, target
 from skillweave.cli.telling import save_score, tell
 from skillweave.cli.training import resume, train
@@ -29,6 +30,8 @@ def run(command: commands.Command) -> int:
             train(command)
         case commands.Resume():
             resume(command)
+        case commands.Sweep():
+            return _sweep(command)
         case commands.Evaluate():
             _evaluate(command)
         case commands.Render():
@@ -54,6 +57,12 @@ def run(command: commands.Command) -> int:
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0
+
+
+def _sweep(command: commands.Sweep) -> int:
+    result, text = sweep(command)
+    tell(command, result, text)
+    return 1 if result["failed"] else 0
 
 
 def _evaluate(command: commands.Evaluate) -> None:

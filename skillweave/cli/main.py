@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
+
+ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/-][^\s/]*:\S*")
+"""What may follow ``--ray``."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -16,6 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     words = sys.argv[1:] if arguments is None else arguments
     given = ["--no-deterministic" if word == "--stochastic" else word for word in words]
+    given = _with_addresses(given)
     parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         parser,
@@ -35,6 +40,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(command, str(error) or "interrupted", 130)
     except BrokenPipeError:
         return 1
+
+
+def _with_addresses(words: Sequence[str]) -> list[str]:
+    """The words with an empty address after each ``--ray`` that has none."""
+    found: list[str] = []
+    for word in words:
+        if found[-1:] == ["--ray"] and not ADDRESS.fullmatch(word):
+            found.append("")
+        found.append(word)
+    return [*found, ""] if found[-1:] == ["--ray"] else found
 
 
 def _fail(command: Any, message: str, code: int) -> int:

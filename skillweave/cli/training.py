@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.targets import declared_by_run, free
 from skillweave.cli.telling import save_score, tell
+from skillweave.collecting.cluster import Ray
 from skillweave.evolution.config import Evolution
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
@@ -32,6 +34,8 @@ def train(command: commands.Train) -> None:
     hierarchy = recipes.load(command.recipe)
     apply_overrides(hierarchy, command.set)
     hierarchy.scale(command.scale)
+    if command.collectors is not None:
+        hierarchy.env = replace(hierarchy.spec, workers=command.collectors)
     evolve = parse_evolve(command.evolve, hierarchy, command.flat)
     trained = _trained(command, hierarchy, command.flat, command.out, evolve)
     result, lines = _told(trained, command.evaluate, command.render)
@@ -47,10 +51,11 @@ def train(command: commands.Train) -> None:
 def resume(command: commands.Resume) -> None:
     """Finish a run that was stopped."""
     declared = declared_by_run(command.run, command.recipe, "resume_needs_recipe")
+    cluster = None if command.ray is None else Ray(address=command.ray or None)
     try:
-        trained = declared.resume(command.run, quiet=command.quiet)
+        trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
     except KeyboardInterrupt:
-        raise _interrupted(command.run) from None
+        raise _interrupted(command.run, command.ray) from None
     result, lines = _told(trained, command.evaluate)
     tell(command, result, "\n".join(lines))
 
@@ -65,6 +70,7 @@ def _trained(
     name = Path(command.recipe).stem + ("-flat" if flat else "")
     path = out or free(Path("runs") / f"{name}-s{command.seed}")
     try:
+        cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(
             path,
             seed=command.seed,
@@ -72,9 +78,10 @@ def _trained(
             quiet=command.quiet,
             track=command.track,
             evolve=evolve,
+            cluster=cluster,
         )
     except KeyboardInterrupt:
-        raise _interrupted(path) from None
+        raise _interrupted(path, command.ray) from None
 
 
 def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
@@ -116,7 +123,7 @@ def _told(trained: Run, episodes: int, render: bool = False) -> tuple[dict[str, 
     return result, lines
 
 
-def _interrupted(path: Path) -> KeyboardInterrupt:
+def _interrupted(path: Path, ray: str | None) -> KeyboardInterrupt:
     """The same interrupt, with what is saved and how to go on."""
     if not (path / "run.json").exists():
         return KeyboardInterrupt("nothing was trained yet")
@@ -124,6 +131,7 @@ def _interrupted(path: Path) -> KeyboardInterrupt:
     recipe, hint = manifest.get("recipe"), ""
     if manifest.get("resume_needs_recipe", True) and recipe not in recipes.names():
         hint = f" --recipe {recipe or 'FILE.py'}"
+    hint += "" if ray is None else f" --ray {ray}".rstrip()
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]
         saved = f"saved at {at['steps']:,} steps of {at['stage']}"

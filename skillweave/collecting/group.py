@@ -11,6 +11,9 @@ from skillweave.collecting.collector import Collected, Collector, side_by_side
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
+MakeCollector = Callable[[int, int], Collector]
+"""Given how many environments and the number of the first one, makes a collector."""
+
 
 class Collectors:
     """W collectors of as many environments each, whose experience stands side by side.
@@ -94,13 +97,17 @@ def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
     return [unprefixed(str(i), state) for i in range(count)]
 
 
+MakeCollectors = Callable[[MakeCollector, int, int, int, str], Collectors]
+"""As ``make_collectors``: who makes them says where they run."""
+
+
 def make_collectors(
-    make: Callable[[int, int], Collector], num_envs: int, workers: int, members: int, name: str
+    make: MakeCollector, num_envs: int, workers: int, members: int, name: str
 ) -> Collectors:
     """Collectors of ``num_envs`` environments: one in this thread, or ``workers`` processes.
 
     Args:
-        make: given how many environments and the number of the first one, makes a collector.
+        make: makes one.
         workers: 0 and 1: in this thread.
 
     Raises:
@@ -108,11 +115,21 @@ def make_collectors(
     """
     if workers <= 1:
         return Collectors([make(num_envs, 0)], members)
+    from skillweave.collecting.processes import ProcessCollectors
+
+    each = share_of(num_envs, workers, members, name)
+    return ProcessCollectors(make, each, workers, members, name)
+
+
+def share_of(num_envs: int, workers: int, members: int, name: str) -> int:
+    """Environments of each of ``workers``; those of every member are shared out equally.
+
+    Raises:
+        SkillweaveError: they cannot be.
+    """
     if num_envs % (workers * members):
         raise SkillweaveError(
             f"{name}: num_envs is {num_envs // members}; it must be a multiple of workers, "
             f"{workers}, so that each has as many environments"
         )
-    from skillweave.collecting.processes import ProcessCollectors
-
-    return ProcessCollectors(make, num_envs // workers, workers, members, name)
+    return num_envs // workers

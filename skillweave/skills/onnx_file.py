@@ -57,6 +57,14 @@ class OnnxPolicy(Foreign):
                 f"{file} takes exactly {batch} observations at once; export it with a dynamic batch"
             )
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if k not in ("_session", "_input")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._session = _session(self.data, self.file)
+        self._input = self._session.get_inputs()[0]
+
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """A copy for these spaces.
 

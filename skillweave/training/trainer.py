@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import state_to
+from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.group import make_collectors
+from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
 from skillweave.experience import Anchor
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
@@ -100,14 +101,19 @@ MakeLearner = Callable[[StageRun], StageLearner]
 
 
 class OneAgent:
-    """A stage's learner where nothing evolves."""
+    """A stage's learner where nothing evolves.
+
+    Args:
+        make_collectors: says where collectors run.
+    """
 
     schema: Any = Checkpoint
 
-    def __init__(self, stage: StageRun) -> None:
+    def __init__(self, stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> None:
         if stage.entry.get("evolution") is not None:
             raise SkillweaveError(f"stage {stage.name!r} evolves: it needs a population to train")
         self.stage, self._open = stage, ExitStack()
+        self._make_collectors = make_collectors
 
     def open(self) -> Any:
         """Make the environments and the agent; the agent's state."""
@@ -118,8 +124,9 @@ class OneAgent:
         self._open.callback(self.evaluation.close)
         fresh = self.make_agents()
         workers = int(stage.entry.get("workers", 1))
-        make: Any = self.collector
-        self.collectors = make_collectors(make, config.num_envs, workers, 1, scene.name)
+        self.collectors = self._make_collectors(
+            self.maker(), config.num_envs, workers, 1, scene.name
+        )
         self._open.callback(self.collectors.close)
         self.episodes = Episodes()
         return fresh
@@ -131,10 +138,9 @@ class OneAgent:
         self.algorithm = make_algorithm(stage.config, *spaces)
         return self.algorithm.init([stage.seeds / "member" / 0])
 
-    def collector(self, num_envs: int, first: int) -> Collector:
-        """A collector in which the agent acts."""
-        acting = Acting([(self.algorithm, 1)], num_envs)
-        return self.stage.scene.collector(num_envs, acting, first)
+    def maker(self) -> MakeCollector:
+        """What makes collectors in which the agent acts; it may be sent to other machines."""
+        return partial(_collector, self.stage.scene, self.algorithm)
 
     def learner_from(self, state: Any, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """Who learns, from this state on."""
@@ -214,6 +220,10 @@ class OneAgent:
     def close(self) -> None:
         """Release the environments."""
         self._open.close()
+
+
+def _collector(scene: Scene, algorithm: Algorithm, num_envs: int, first: int) -> Collector:
+    return scene.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
 
 
 def keep_to_guide(learner: Learner, nats: float | None) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, checked_tensor, make_algorithm, state_from
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
+from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
@@ -34,9 +37,10 @@ from skillweave.training.woven_learner import WovenLearner, decides
 from skillweave.types import Array, prefixed, unprefixed
 
 
-def agents_of(stage: StageRun) -> OneAgent:
-    """Who learns in a stage where nothing evolves."""
-    return WovenAgents(stage) if "together" in stage.entry else OneAgent(stage)
+def agents_of(stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> OneAgent:
+    """Who learns in a stage where nothing evolves, from collectors that are made so."""
+    kind = WovenAgents if "together" in stage.entry else OneAgent
+    return kind(stage, make_collectors)
 
 
 class WovenAgents(OneAgent):
@@ -81,16 +85,13 @@ class WovenAgents(OneAgent):
         scene: WovenScene = self.stage.scene
         return scene
 
-    def collector(self, num_envs: int, first: int) -> Collector:
-        """A collector in which all act."""
-        return self.woven(make_engine(self.scene.spec, num_envs, first=first))
+    def maker(self) -> MakeCollector:
+        """What makes collectors in which all act; it may be sent to other machines."""
+        return partial(_collector, self.scene, self._acting(), self._margins())
 
-    def woven(self, engine: Engine) -> WovenCollector:
-        """A collector of these environments in which all act."""
-        n = engine.num_envs
-        acting = {self._below(k): Acting([(a, 1)], n) for k, a in self.algorithms.items()}
-        selector = acting.pop(SELECTOR, None)
-        return self.scene.woven(engine, selector, acting, self._margins())
+    def _acting(self) -> dict[str, Algorithm]:
+        """Who acts, by their paths in the hierarchy that this stage is of."""
+        return {self._below(k): a for k, a in self.algorithms.items()}
 
     def _margins(self) -> dict[str, float]:
         """By the paths of critics, where calls are cut."""
@@ -200,7 +201,7 @@ class WovenAgents(OneAgent):
 
     def play(self, arena: Collector, seeds: Seeds) -> Array:
         """An episode in each environment of an arena, (N, 4), by the hierarchy as it is now."""
-        player = self.woven(arena.engine)
+        player = _woven(self.scene, self._acting(), self._margins(), arena.engine)
         requests = {
             name: Request(
                 0, (s.algorithm.acting_params(s.state),), s.state.gamma.cpu().numpy(),
@@ -220,3 +221,25 @@ class WovenAgents(OneAgent):
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
         log.save(None, (tick.extra or {}) | states)
+
+
+def _collector(
+    scene: WovenScene,
+    algorithms: Mapping[str, Algorithm],
+    margins: Mapping[str, float],
+    num_envs: int,
+    first: int,
+) -> Collector:
+    return _woven(scene, algorithms, margins, make_engine(scene.spec, num_envs, first=first))
+
+
+def _woven(
+    scene: WovenScene,
+    algorithms: Mapping[str, Algorithm],
+    margins: Mapping[str, float],
+    engine: Engine,
+) -> WovenCollector:
+    """A collector of these environments in which all act."""
+    acting = {k: Acting([(a, 1)], engine.num_envs) for k, a in algorithms.items()}
+    selector = acting.pop(SELECTOR, None)
+    return scene.woven(engine, selector, acting, margins)

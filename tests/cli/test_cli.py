@@ -19,7 +19,7 @@ from skillweave.runs.files import read_json, read_tensors, write_json, write_ten
 from skillweave.types import SkillweaveError
 
 COMMANDS = ("train", "resume", "evaluate", "render", "plot", "report", "compare", "list", "info")
-COMMANDS += ("weights", "export", "import-agilerl")
+COMMANDS += ("sweep", "weights", "export", "import-agilerl")
 
 # The same hierarchy twice: as plain data, and with a reflex, which only code can say.
 PLAIN = '''

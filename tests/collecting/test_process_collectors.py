@@ -181,7 +181,7 @@ class Stuck(Again):
 def test_closing_ends_workers_that_are_stuck(in_processes):
     collectors = in_processes(stepping(Stuck))
     collectors.start(Seeds(0))
-    collectors._workers[0].pipe.send(("collect", next(requests(5)).of_collector(0)))
+    collectors._workers[0].pipe.send(("collect", next(requests(5))))
     workers = [w.process for w in collectors._workers]
     collectors.close()
     assert not any(w.is_alive() for w in workers)

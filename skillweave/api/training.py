@@ -1,0 +1,158 @@
+"""How ``train`` and ``resume`` go: check, write a run, train it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from skillweave.api.run import Run
+from skillweave.collecting.cluster import Ray
+from skillweave.collecting.group import MakeCollectors, make_collectors
+from skillweave.evolution.plan import Evolve, make_learner, plan
+from skillweave.hierarchy import training
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.messages import as_path, short
+from skillweave.reporting.progress import Progress
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import identity
+from skillweave.runs.trackers import make_trackers
+from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
+from skillweave.types import SkillweaveError
+
+if TYPE_CHECKING:
+    from skillweave.api import Agent, Hierarchy
+
+
+def begin(
+    declared: Hierarchy | Agent,
+    content: dict[str, Any],
+    run_dir: str | Path,
+    quiet: bool,
+    track: Sequence[str],
+    evolve: Evolve,
+    cluster: Ray | None,
+) -> Run:
+    """Check everything, begin a run of this manifest, and train it."""
+    run_dir = as_path(run_dir, "run_dir")
+    _plan(declared, content, evolve, cluster)
+    if isinstance(track, str) or not isinstance(track, Sequence):
+        raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
+    track = tuple(track)
+    make_trackers(track, None)  # a missing extra is said before anything is written
+    if cluster is not None:
+        cluster.check()
+    run = RunDirectory.create(run_dir, content | {"recipe": declared.recipe, "track": track})
+    return go_on(declared, run, quiet, evolve, cluster)
+
+
+def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
+    """The finished run of this manifest in ``run_dir``: begun, or gone on with, where it is not.
+
+    Raises:
+        SkillweaveError: there is a run, but of another manifest.
+    """
+    run = begun(declared, content, run_dir)
+    if run is None:
+        return begin(declared, content, run_dir, True, (), None, None)
+    return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
+
+
+def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
+    """The run of this manifest in ``run_dir``; None: it is not begun.
+
+    Raises:
+        SkillweaveError: there is a run, but of another manifest.
+    """
+    if not (run_dir / "run.json").exists():
+        return None
+    run, content = RunDirectory.open(run_dir), copy.deepcopy(content)
+    _plan(declared, content, None, None)
+    if run.manifest.get("id") != identity(content):
+        raise SkillweaveError(
+            f"{run_dir} holds a run of other settings (or of another recipe, budget or version); "
+            "choose another directory"
+        )
+    return run
+
+
+def _plan(
+    declared: Hierarchy | Agent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
+) -> None:
+    """Check everything, and write into a manifest's stages how they are trained."""
+    observation_space, action_space = declared.check_spaces()
+    plan(content["stages"], evolve)
+    check_stages(content["stages"], content["eval_every"])
+    spec = declared.spec
+    _check(cluster)
+    if cluster is not None and cluster.collectors is not None:
+        spec = replace(spec, workers=cluster.collectors)
+    assign_workers(content["stages"], spec)
+    for stage in content["stages"]:
+        acts: Any = action_space
+        if stage["decides"] in stage["learns"] and isinstance(declared, Declaration):
+            acts = declared.chooses_from(stage["decides"], action_space)
+        check_replay(stage, observation_space, acts)
+        for name, config in stage.get("algorithms", {}).items():
+            if not name.endswith(CRITIC):  # it keeps nothing
+                assert isinstance(declared, Declaration)
+                acts = declared.chooses_from(name, action_space)
+                check_replay(stage | {"algorithm": config}, observation_space, acts)
+
+
+def go_on(
+    declared: Hierarchy | Agent,
+    run: RunDirectory,
+    quiet: bool,
+    evolve: Evolve,
+    cluster: Ray | None,
+) -> Run:
+    """Train what is left of a run."""
+    with ExitStack() as stack:
+        stack.callback(run.close)
+        run.begin()
+        progress = stack.enter_context(Progress(quiet=quiet))
+        trackers = make_trackers(run.manifest.get("track", ()), run)
+        for tracker in trackers:
+            stack.callback(tracker.close)
+        make = _where(cluster, run, progress, stack)
+        learner = make_learner(run.manifest["stages"], evolve, make)
+        policy = training.train(declared, run, (progress, *trackers), learner)
+    return Run(declared_of(declared, run), run.path, policy)
+
+
+def declared_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
+    """What a run trained: a hierarchy, or its flat baseline."""
+    if run.manifest["kind"] == "agent" and isinstance(declared, Declaration):
+        return declared.plain_agent()
+    return declared
+
+
+def _where(
+    cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack
+) -> MakeCollectors:
+    """Where collectors of a run are made; a cluster is left when ``stack`` is closed.
+
+    Raises:
+        SkillweaveError: the run was begun with another number of collectors.
+    """
+    _check(cluster)
+    if cluster is None or run.finished:
+        return make_collectors
+    left = [s for s in run.manifest["stages"] if s["status"] != "done"]
+    counts = [s.get("workers", 1) for s in left if s.get("evolution") is None]
+    asked = cluster.collectors
+    if asked is not None and any(count != asked for count in counts):
+        raise SkillweaveError(
+            f"{run.path} was begun with {', '.join(map(str, sorted(set(counts))))} collectors, and "
+            f"goes on with as many, as results depend on it; leave out collectors={asked}"
+        )
+    return stack.enter_context(cluster.connected(max(counts, default=1), progress.message))
+
+
+def _check(cluster: Any) -> None:
+    if not isinstance(cluster, Ray | None):
+        raise SkillweaveError(f"cluster is {short(cluster)}; write cluster=Ray(collectors=8)")

@@ -1,0 +1,253 @@
+"""``sweep``: many runs of a recipe, here in processes or on Ray; the table of what came out.
+
+Each run is an ordinary run directory. So whoever is stopped, the sweep or one of its runs, goes on
+where it stood when the same command is given again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import platform
+import re
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from skillweave import recipes
+from skillweave.api import Hierarchy
+from skillweave.api.training import begun, finish
+from skillweave.cli import commands
+from skillweave.cli.overrides import apply_overrides
+from skillweave.cli.sweep_table import summary
+from skillweave.collecting.cluster import Ray
+from skillweave.collecting.shipping import packed, unpacked
+from skillweave.envs.make import cores
+from skillweave.hierarchy import training
+from skillweave.messages import short, told, whole_number
+from skillweave.training.evaluation_file import load_evaluation
+from skillweave.types import SkillweaveError
+
+MOST = 10_000
+"""Runs of a sweep."""
+MARK = ".sweep"
+"""An empty file in the sweep's directory, by which a machine knows that it sees it."""
+RETRIES = 20
+"""How often Ray begins a run again whose machine was lost; it goes on from its checkpoint."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep."""
+
+    settings: str
+    """What it differs in from the others, beside the seed: "selector.gamma=0.99"; may be empty."""
+    seed: int
+    path: Path
+    flat: bool
+    evaluate: int
+
+    def run(self, code: bytes) -> float | str:
+        """Train it, or what is left of it, and evaluate it: its mean return, or what went wrong."""
+        try:
+            if not (self.path.parent / MARK).exists():
+                raise SkillweaveError(
+                    f"{self.path.parent} is not seen from the machine {platform.node()}: with "
+                    "--ray on several machines, --out must be in a directory that all share"
+                )
+            hierarchy = unpacked(code)
+            trained = finish(hierarchy, self._manifest(hierarchy), self.path)
+            return float(trained.evaluate(self.evaluate, save=True).mean)
+        except SkillweaveError as error:
+            return str(error)
+        except Exception as error:
+            return told(error)
+
+    def known(self, hierarchy: Hierarchy) -> float | str | None:
+        """What ``run`` would give, where nothing is left to be done; else None."""
+        try:
+            run = begun(hierarchy, self._manifest(hierarchy), self.path)
+            if run is None or not run.finished:
+                return None
+            saved = load_evaluation(run)
+        except SkillweaveError as error:
+            return str(error)
+        if saved is None or len(saved.evaluation.returns) != self.evaluate:
+            return None
+        return float(saved.evaluation.mean)
+
+    def _manifest(self, hierarchy: Hierarchy) -> dict[str, Any]:
+        return training.manifest(hierarchy, seed=self.seed, flat=self.flat)
+
+
+def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
+    """Train all runs of a sweep; what came out, as JSON and for people."""
+    whole_number(command.evaluate, "evaluate", 1)
+    if command.jobs is not None:
+        whole_number(command.jobs, "jobs", 1)
+    seeds, choices = parse_seeds(command.seeds), parse_choices(command.set_each)
+    if len(seeds) * len(choices) > MOST:
+        raise SkillweaveError(
+            f"{len(seeds)} seeds of {len(choices)} settings are {len(seeds) * len(choices):,} "
+            f"runs; at most {MOST:,} are made"
+        )
+    name = Path(command.recipe).stem + ("-flat" if command.flat else "")
+    out = (command.out or Path("runs") / f"{name}-sweep").absolute()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / MARK).touch()
+    except OSError as error:
+        raise SkillweaveError(f"could not write {out}: {error.strerror}") from error
+    found: dict[Job, float | str] = {}
+    jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
+    for settings, hierarchy in _hierarchies(command, choices):
+        code = packed(hierarchy, command.recipe)
+        for seed in seeds:
+            path = out / _file_name(settings, seed)
+            job = Job(settings, seed, path, command.flat, command.evaluate)
+            jobs.append(job)
+            if (known := job.known(hierarchy)) is None:
+                tasks.append((code, job))
+            else:
+                found[job] = known
+    run = _on_ray if command.ray is not None else _in_processes
+    try:
+        for job, result in run(tasks, command) if tasks else ():
+            found[job] = result
+            if not command.quiet:
+                says = result if isinstance(result, str) else f"return {result:.1f}"
+                line = f"{len(found)} of {len(jobs)}: {job.path.name}: {says}"
+                print(line, file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"{len(found)} of {len(jobs)} runs are finished; the same command goes on"
+        ) from None
+    return summary([(j.settings, j.seed, j.path, found[j]) for j in jobs], out)
+
+
+def parse_seeds(text: str) -> list[int]:
+    """The seeds that "0:20" or "0,3,7" names."""
+    try:
+        if ":" in text:
+            first, last = (int(part) for part in text.split(":"))
+            seeds = list(range(first, last))
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError:
+        seeds = []
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
+        raise SkillweaveError(
+            f"--seeds {short(text)}: write 0:20 for 0 to 19, or 0,3,7: whole numbers, each once"
+        )
+    return seeds
+
+
+def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
+    """All combinations of the values of ``--set-each``, as settings; one without any if none."""
+    names, options = set[str](), []
+    for setting in each:
+        name, sign, text = (part.strip() for part in setting.partition("="))
+        values = [v.strip() for v in re.split(r",(?![^(\[]*[)\]])", text)]
+        if not sign or not all(values) or len(set(values)) < len(values):
+            raise SkillweaveError(
+                f"--set-each {short(setting)}: write name=value,value, each value once, for "
+                "example selector.gamma=0.99,0.995"
+            )
+        if name in names:
+            raise SkillweaveError(f"--set-each {name} is given twice; write all values at once")
+        names.add(name)
+        options.append([f"{name}={value}" for value in values])
+    return list(itertools.product(*options))
+
+
+def _hierarchies(
+    command: commands.Sweep, choices: Sequence[tuple[str, ...]]
+) -> Iterator[tuple[str, Hierarchy]]:
+    """For each choice its name, and the hierarchy with these settings."""
+    for choice in choices:
+        hierarchy = recipes.load(command.recipe)
+        apply_overrides(hierarchy, [*command.set, *choice])
+        hierarchy.scale(command.scale)
+        # Runs share the cores, so each has one; and it is the same whichever machine it is on.
+        hierarchy.env = replace(hierarchy.spec, workers=1)
+        yield ", ".join(choice), hierarchy
+
+
+def _file_name(settings: str, seed: int) -> str:
+    kept = re.sub(r"[^\w.=(),+-]", "", settings.replace(", ", "+"))
+    return f"{kept}-s{seed}" if kept else f"s{seed}"
+
+
+Tasks = Sequence[tuple[bytes, Job]]
+
+
+def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
+    """Each run in a process of its own, so many at once as there are cores."""
+    with processes(min(command.jobs or cores(), len(tasks))) as pool:
+        due = {pool.submit(job.run, code): job for code, job in tasks}
+        for future in as_completed(due):
+            try:
+                yield due[future], future.result()
+            except BrokenProcessPool:
+                raise SkillweaveError(
+                    "a run's process was ended, perhaps because memory ran out; runs that are "
+                    "finished are kept, and the same command goes on (fewer at once: --jobs)"
+                ) from None
+
+
+@contextmanager
+def processes(count: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of fresh processes that end when this one does, however it ends."""
+    start = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(count, start, initializer=_end_with_parent, max_tasks_per_child=1)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+def _end_with_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
+    """Each run as a task of Ray; one whose machine is lost goes on elsewhere."""
+    cluster = Ray(address=command.ray or None)
+    with cluster.joined(command.jobs or cores()) as ray:
+        kind = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_run)
+        codes = {code: ray.put(code) for code in {code for code, _ in tasks}}
+        waiting, due = list(reversed(tasks)), dict[Any, Job]()
+        while waiting or due:
+            while waiting and len(due) < (command.jobs or MOST):
+                code, job = waiting.pop()
+                due[kind.remote(job, codes[code])] = job
+            (ref, *_), _ = ray.wait(list(due))
+            job = due.pop(ref)
+            try:
+                yield job, ray.get(ref)
+            except ray.exceptions.RayError as error:
+                yield job, f"its process was lost again and again: {told(error)}"
+
+
+def _run(job: Job, code: bytes) -> float | str:
+    return job.run(code)

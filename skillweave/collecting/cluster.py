@@ -1,0 +1,179 @@
+"""Where collectors run if not here: on Ray."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from skillweave.collecting.group import Collectors, MakeCollector, MakeCollectors, share_of
+from skillweave.envs.make import cores
+from skillweave.messages import short, told, whole_number
+from skillweave.types import MissingExtra, SkillweaveError
+
+PATIENCE = 5.0
+"""Seconds that an address has to answer."""
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Collectors as actors of Ray, on this machine or on a cluster.
+
+    The weights are those of as many collectors in processes (``EnvSpec(workers=8)``), bit for bit
+    on processors of one kind, also where actors or nodes are lost on the way.
+
+    ```python
+    import skillweave as sw
+
+    cluster = sw.Ray(collectors=8, address="10.0.0.1:6379")
+    ```
+
+    Raises:
+        SkillweaveError: a value is out of its range.
+    """
+
+    collectors: int | None = None
+    """How many; the environments of a stage are shared out equally. None: as many as there would be
+    processes without Ray. A run keeps the number, as results depend on it."""
+    address: str | None = None
+    """``host:port`` of a cluster's head, ``ray://host:port``, or ``auto``: the one that runs on
+    this machine. None: what RAY_ADDRESS says, or else a new one of this machine alone."""
+    cpus: float = 1.0
+    """Of the cluster's CPUs, what each collector takes."""
+    patience: float = 300.0
+    """Seconds to wait while the cluster has no room for all collectors, or lost some of it."""
+
+    def __post_init__(self) -> None:
+        if self.collectors is not None:
+            whole_number(self.collectors, "Ray: collectors", 1)
+        if self.address is not None and not isinstance(self.address, str):
+            raise SkillweaveError(
+                f"Ray: address is {short(self.address)}; it must be a text such as '10.0.0.1:6379'"
+            )
+        for name, least in (("cpus", "more than 0"), ("patience", "at least 0")):
+            value: Any = getattr(self, name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not 0 <= value < math.inf or (name == "cpus" and value == 0):
+                raise SkillweaveError(f"Ray: {name} is {short(value)}; it must be {least}")
+
+    def check(self) -> None:
+        """Raise a SkillweaveError where Ray is not installed, or nobody listens at the address."""
+        if not imported().is_initialized() and self._where not in ("local", "auto"):
+            _must_listen(self._where)
+
+    @property
+    def _where(self) -> str:
+        return self.address or os.environ.get("RAY_ADDRESS") or "local"
+
+    @contextmanager
+    def joined(self, most: int) -> Iterator[Any]:
+        """Be connected to the cluster; the module ``ray``.
+
+        Args:
+            most: what will run at once.
+
+        Raises:
+            MissingExtra: the extra 'ray' is not installed.
+            SkillweaveError: nobody listens at the address, or another version of Ray or Python.
+        """
+        self.check()
+        ray = imported()
+        begun = not ray.is_initialized()
+        if begun:
+            self._connect(ray, most)
+        try:
+            yield ray
+        finally:
+            if begun:
+                ray.shutdown()
+
+    @contextmanager
+    def connected(self, most: int, tell: Callable[[str], None]) -> Iterator[MakeCollectors]:
+        """Be connected to the cluster; what makes collectors on it.
+
+        Args:
+            most: collectors that will run at once.
+            tell: is told what people should know.
+
+        Raises:
+            SkillweaveError: as of ``joined``.
+        """
+        with self.joined(most):
+            from skillweave.collecting.actors import Actors, RayCollectors
+
+            actors = Actors(most, self.cpus, self.patience, tell)
+
+            def make_collectors(
+                make: MakeCollector, num_envs: int, workers: int, members: int, name: str
+            ) -> Collectors:
+                each = share_of(num_envs, workers, members, name)
+                return RayCollectors(actors, make, each, workers, members, name)
+
+            try:
+                yield make_collectors
+            finally:
+                actors.close()
+
+    def _connect(self, ray: Any, most: int) -> None:
+        address = self._where
+        how: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+        if address == "local":  # as many as were asked for, be there cores or not
+            room = max(cores(), math.ceil(most * self.cpus))
+            how |= {"num_cpus": room, "include_dashboard": False}
+        try:
+            ray.init(address, **how)
+        except ConnectionError as error:
+            if address == "auto":
+                raise SkillweaveError(
+                    "this machine is part of no Ray cluster that runs. Begin one with: ray start "
+                    "--head; or leave 'auto' out, for this machine alone"
+                ) from error
+            raise SkillweaveError(
+                f"somebody listens at {short(address)}, but Ray could not connect "
+                f"({told(error)}). Perhaps it is no Ray cluster, or one that asks for a token, as "
+                "those of `ray start` do: then RAY_AUTH_MODE=token is needed here, too (see Ray's "
+                "page on token authentication)"
+            ) from error
+        except (RuntimeError, ValueError) as error:  # another version of Ray or Python
+            raise SkillweaveError(
+                f"the Ray cluster at {short(address)} cannot be used: {told(error)}"
+            ) from error
+
+
+def imported() -> Any:
+    """Ray, told to be quiet.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    # What Ray says of lost actors would go to standard output; it is told by ``workers``.
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingExtra("Ray, for collectors on a cluster,", "ray") from error
+    return ray
+
+
+def _must_listen(address: str) -> None:
+    """Raise a SkillweaveError where nobody does: Ray itself would try for minutes."""
+    host, sign, port = address.removeprefix("ray://").rpartition(":")
+    if not sign or not host or not port.isdigit() or not 0 < int(port) < 65_536:
+        raise SkillweaveError(
+            f"Ray: address is {short(address)}; write host:port (that of the head, usually with "
+            "6379), ray://host:port, or auto"
+        )
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise SkillweaveError(
+            f"nobody listens at {address} ({why}), so there is no Ray cluster. Begin one with: ray "
+            "start --head; or leave the address out, for this machine alone"
+        ) from error

@@ -1,0 +1,95 @@
+"""What stands on a node of a Ray cluster: an actor with a collector."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+import ray
+
+from skillweave.collecting.shipping import unpacked
+from skillweave.collecting.workers import Station
+from skillweave.messages import told
+from skillweave.types import SkillweaveError
+
+
+def actor_class() -> type:
+    """The class of actors.
+
+    It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
+    """
+
+    class CollectorActor:
+        def versions(self) -> dict[str, Any]:
+            """What runs here, and where that is."""
+            found: dict[str, Any] = {"node": ray.util.get_node_ip_address()}
+            found |= {"process": os.getpid(), "Python": platform.python_version()}
+            try:
+                return found | {"Skillweave": metadata.version("skillweave")}
+            except metadata.PackageNotFoundError:
+                return found | {"Skillweave": None}
+
+        def make(self, code: bytes, each: int, number: int) -> Any:
+            """Make the collector: (error, None)."""
+            try:
+                from skillweave.collecting.stationed import Stationed
+            except ImportError as error:
+                return str(error), None
+            self.stationed = Stationed()
+            return self.stationed.make(code, each, number)
+
+        def answer(self, what: str, task: Any) -> Any:
+            """Do something: (error, answer)."""
+            return self.stationed.answer(what, task)
+
+        def close(self) -> None:
+            """Close the environments, if there are any."""
+            if hasattr(self, "stationed"):
+                self.stationed.close()
+
+    return CollectorActor
+
+
+class Stationed:
+    """A station whose errors are answers."""
+
+    station: Station | None = None
+
+    def make(self, code: bytes, each: int, number: int) -> tuple[str | None, None]:
+        """Make the collector."""
+        import torch
+
+        torch.set_num_threads(1)
+
+        def made() -> None:
+            self.station = Station(unpacked(code), each, number)
+
+        return _tried(made)
+
+    def answer(self, what: str, task: Any) -> tuple[str | None, Any]:
+        """What the station answers."""
+        if isinstance(task, dict):  # a state; arrays of the object store cannot be written to
+            task = {k: np.array(v) for k, v in task.items()}
+        station: Any = self.station
+        return _tried(lambda: station.answer(what, task))
+
+    def close(self) -> None:
+        """Close the environments, if there are any."""
+        station, self.station = self.station, None
+        if station is not None:
+            with suppress(Exception):
+                station.collector.close()
+
+
+def _tried(do: Callable[[], Any]) -> tuple[str | None, Any]:
+    try:
+        return None, do()
+    except SkillweaveError as error:
+        return str(error), None
+    except BaseException as error:
+        return told(error), None

@@ -1,0 +1,215 @@
+"""Collectors that run elsewhere: what they are asked for, and how lost ones are made again.
+
+A collector is a function of its state and of what it is asked for. So whoever is lost, be it a
+process or a machine, is made again from its last known state, does what it was asked since, and
+finds the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from typing import Any, Protocol
+
+from skillweave.collecting.acting import Request
+from skillweave.collecting.collector import Collected
+from skillweave.collecting.group import Collectors, MakeCollector, joined_states, split_states
+from skillweave.seeding import Seeds
+from skillweave.types import Array, SkillweaveError
+
+SNAPSHOT_EVERY = 16
+"""Requests after which workers say where they stand, so that less need be done again."""
+
+
+class WorkerLost(Exception):
+    """A worker's process or machine is no more; the message says what became of it."""
+
+
+class Worker(Protocol):
+    """Somebody elsewhere who has a collector: it does one task after another."""
+
+    def begin(self) -> None:
+        """Have the collector made; ``receive`` then gives None."""
+        ...
+
+    def send(self, what: str, task: Any) -> None:
+        """Ask for something; see ``Station.answer``.
+
+        Raises:
+            WorkerLost: nobody is there.
+        """
+        ...
+
+    def receive(self) -> Any:
+        """The answer to the oldest task that has none.
+
+        Raises:
+            WorkerLost: nobody is there any more.
+            SkillweaveError: the collector failed; it says why.
+        """
+        ...
+
+    def release(self) -> None:
+        """End it, if it has not ended."""
+        ...
+
+
+class Station:
+    """What stands where a worker runs: a collector that answers tasks.
+
+    Args:
+        each: its environments.
+        number: of the worker.
+    """
+
+    def __init__(self, make: MakeCollector, each: int, number: int) -> None:
+        self.number, self.collector = number, make(each, number * each)
+
+    def answer(self, what: str, task: Any) -> Any:
+        """Do what a method of ``Collectors`` asks for; all workers get the same task.
+
+        A state is of one worker alone.
+        """
+        if what == "state":
+            return self.collector.state()
+        if what == "collect":
+            task = task.of_collector(self.number)
+        elif what in ("start", "cut"):
+            task = task / self.number
+        return getattr(self.collector, what)(task)
+
+
+class WorkerCollectors(Collectors):
+    """Collectors elsewhere, each with as many environments.
+
+    Args:
+        workers: W of them.
+        each: environments of a worker.
+        members: P.
+        name: what messages call the environment.
+
+    Raises:
+        SkillweaveError: an environment failed, or a worker was lost again and again at the same
+            place; the message names it.
+    """
+
+    tries = 1
+    """How often lost workers are made again before a request fails."""
+
+    def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
+        self.members, self.num_envs, self.steps_made = members, each * len(workers), 0
+        self.parts = []
+        self._workers, self._each, self._name = list(workers), each, name
+        self._past: list[tuple[str, Sequence[Any]]] = []
+        """What brings workers to where they stand: a start or states, then requests."""
+        try:
+            for worker in self._workers:
+                worker.begin()
+            self._completed(self._received(range(len(workers))), [])
+        except BaseException:
+            self.close()
+            raise
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment anew, unless they are under way."""
+        if not self._past:
+            self._ask("start", self._shared(seeds))
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        found = self._joined(self._ask("collect", self._shared(request)))
+        if len(self._past) > SNAPSHOT_EVERY:
+            self._states()
+        return found
+
+    def cut(self, seeds: Seeds) -> Array:
+        """Make ready for ``state``; (k,) environments that begin anew."""
+        return self._columns(self._ask("cut", self._shared(seeds)))
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs, right after ``cut``."""
+        return joined_states(self._states())
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Stand where ``state`` says; (k,) environments that begin anew."""
+        states = split_states(state, len(self._workers))
+        self._past = []
+        return self._columns(self._ask("restore", states))
+
+    def close(self) -> None:
+        """End the workers."""
+        for worker in self._workers:
+            worker.release()
+
+    def _shared(self, task: Any) -> Sequence[Any]:
+        """A task for each worker, where all get the same."""
+        return [task] * len(self._workers)
+
+    def _states(self) -> list[dict[str, Array]]:
+        """Where each worker stands; lost ones need go back no further from now on."""
+        states: list[dict[str, Array]] = self._ask("state", self._shared(None), kept=False)
+        self._past = [("restore", states)]
+        return states
+
+    def _ask(self, what: str, tasks: Sequence[Any], kept: bool = True) -> list[Any]:
+        """What workers answer to their tasks; those that are lost are made again.
+
+        Args:
+            kept: the tasks change where workers stand.
+        """
+        path = [*self._past, (what, tasks)]
+        if kept:
+            self._past = path
+        return self._completed(self._asked(range(len(self._workers)), what, tasks), path)
+
+    def _completed(
+        self, found: dict[int, Any], path: Sequence[tuple[str, Sequence[Any]]]
+    ) -> list[Any]:
+        """What all workers answer in the end; those that are not in ``found`` are made again."""
+        for tried in range(self.tries):
+            if lost := [i for i in range(len(self._workers)) if i not in found]:
+                found |= self._again(lost, path, must=tried == self.tries - 1)
+        return [found[i] for i in range(len(self._workers))]
+
+    def _again(
+        self, numbers: list[int], path: Sequence[tuple[str, Sequence[Any]]], must: bool
+    ) -> dict[int, Any]:
+        """Make workers again, and let them do all that others did."""
+        for i in numbers:
+            self._workers[i].release()
+        for i in numbers:
+            self._workers[i].begin()
+        found = self._received(numbers, must)
+        for what, tasks in path:
+            found = self._asked(found, what, tasks, must)
+        return found
+
+    def _asked(
+        self, numbers: Iterable[int], what: str, tasks: Sequence[Any], must: bool = False
+    ) -> dict[int, Any]:
+        """What some workers answer; without those that are lost."""
+        numbers = list(numbers)
+        for i in numbers:
+            with suppress(WorkerLost):  # that is found out when it should answer
+                self._workers[i].send(what, tasks[i])
+        return self._received(numbers, must)
+
+    def _received(self, numbers: Iterable[int], must: bool = False) -> dict[int, Any]:
+        """What some workers answer; ``must``: none may be lost."""
+        found = {}
+        for i in numbers:
+            try:
+                found[i] = self._workers[i].receive()
+            except WorkerLost as lost:
+                if must:
+                    raise self._failed(i, lost) from None
+            except SkillweaveError as error:
+                raise SkillweaveError(f"{error} (in worker {i})") from error
+        return found
+
+    def _failed(self, number: int, lost: WorkerLost) -> SkillweaveError:
+        first = number * self._each
+        return SkillweaveError(
+            f"{self._name}: worker {number} (environments {first} to {first + self._each - 1}) "
+            f"{lost}, and again when it was made anew"
+        )

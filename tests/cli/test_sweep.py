@@ -1,0 +1,190 @@
+"""A sweep trains each run once, whoever is stopped, and tells what came out."""
+
+import json
+import re
+
+import pytest
+
+from skillweave.cli import main, sweep
+from skillweave.cli.main import _with_addresses
+from skillweave.cli.sweep_table import summary
+from skillweave.runs.directory import RunDirectory
+from skillweave.types import SkillweaveError
+
+RECIPE = '''
+"""One skill on CartPole."""
+from skillweave import Network, PPO, Hierarchy, Skill
+
+class Still(Skill):
+    def reward(self, step):
+        return -abs(step.next_obs[:, 1])
+
+small = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network(hidden=(8,)))
+hierarchy = Hierarchy(
+    "CartPole-v1", [Still()], algorithm=small, selector=small, skill_steps=64, selector_steps=64,
+    cut_every=32,
+)
+'''
+
+
+@pytest.fixture
+def asked(tmp_path):
+    """A command's words: ``asked(...)`` adds to them."""
+    recipe = tmp_path / "still.py"
+    recipe.write_text(RECIPE)
+
+    def words(*more):
+        start = ["sweep", str(recipe), "--out", str(tmp_path / "runs"), "--evaluate", "3"]
+        return [*start, "--json", "--quiet", *more]
+
+    return words
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Runs are trained in this process, one after another; which ones."""
+    names = []
+
+    def here(tasks, command):
+        for code, job in tasks:
+            names.append(job.path.name)
+            yield job, job.run(code)
+
+    monkeypatch.setattr(sweep, "_in_processes", here)
+    return names
+
+
+def answer(capsys, words):
+    code = main(words)
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_each_combination_is_trained_with_each_seed_and_none_twice(capsys, asked, trained):
+    words = asked("--seeds", "0:2", "--set-each", "selector.gamma=0.9,0.99")
+    code, first = answer(capsys, words)
+    assert code == 0
+    names = [f"selector.gamma={g}-s{s}" for g in (0.9, 0.99) for s in (0, 1)]
+    assert trained == names
+    gammas = [
+        RunDirectory.open(run["run"]).stage("selector")["algorithm"]["gamma"]
+        for run in first["runs"]
+    ]
+    assert gammas == [0.9, 0.9, 0.99, 0.99]
+    assert [g["settings"] for g in first["groups"]] == ["selector.gamma=0.9", "selector.gamma=0.99"]
+    trained.clear()
+    assert answer(capsys, [*words[:-4], "--seeds", "0,1,4", *words[-2:]])[0] == 0
+    assert trained == ["selector.gamma=0.9-s4", "selector.gamma=0.99-s4"]
+    trained.clear()
+    assert answer(capsys, words) == (0, first)
+    assert trained == []
+
+
+def test_a_run_that_was_stopped_goes_on_to_the_same_end(capsys, asked, trained, monkeypatch):
+    one = asked("--seeds", "3:4")
+    _, whole = answer(capsys, [w.replace("runs", "whole") for w in one])
+    save, left = RunDirectory.save_checkpoint, [2]
+
+    def stop(self, *about):
+        save(self, *about)
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunDirectory, "save_checkpoint", stop)
+    assert main(one) == 130
+    assert "0 of 1 runs are finished; the same command goes on" in capsys.readouterr().out
+    trained.clear()
+    _, found = answer(capsys, one)
+    assert trained == ["s3"]
+    assert found["runs"][0]["return"] == whole["runs"][0]["return"]
+    ends = [RunDirectory.open(r["runs"][0]["run"]).stage("selector") for r in (whole, found)]
+    assert ends[0]["sha256"] == ends[1]["sha256"]
+
+
+def test_runs_of_other_settings_are_not_taken_for_these(capsys, asked, trained):
+    answer(capsys, asked("--seeds", "0:1"))
+    code, found = answer(capsys, asked("--seeds", "0:1", "--scale", "2"))
+    assert code == 1
+    assert "holds a run of other settings" in found["failed"][0]["error"]
+    assert found["groups"] == [{"settings": "as declared", "runs": 0}]
+
+
+def test_a_run_in_a_process(capsys, asked):
+    code, found = answer(capsys, asked("--seeds", "2"))
+    assert code == 0
+    assert [run["seed"] for run in found["runs"]] == [2]
+
+
+def test_what_goes_wrong_in_a_run_is_told_and_the_others_are_trained(
+    capsys, asked, trained, tmp_path
+):
+    broken = tmp_path / "runs" / "s0"
+    broken.mkdir(parents=True)
+    (broken / "mine.txt").touch()
+    code, found = answer(capsys, asked("--seeds", "0:2"))
+    assert code == 1
+    assert [run["seed"] for run in found["runs"]] == [1]
+    assert "s0 exists and is not an empty directory" in found["failed"][0]["error"]
+
+
+def test_the_table_has_interquartile_means_intervals_and_medians(tmp_path):
+    some = [("a=1", seed, tmp_path, value) for seed, value in enumerate([1.0, 2.0, 3.0, 10.0])]
+    result, text = summary([*some, ("a=2", 0, tmp_path, 7.0), ("a=2", 1, tmp_path, "no")], tmp_path)
+    first, second = result["groups"]
+    assert (first["runs"], first["iqm"], first["median"]) == (4, 2.5, 2.5)
+    assert (first["least"], first["most"]) == (1.0, 10.0)
+    assert first["low"] < 2.5 < first["high"]
+    assert second == {
+        "settings": "a=2", "runs": 1, "iqm": 7.0, "median": 7.0, "least": 7.0, "most": 7.0,
+    }  # fmt: skip
+    assert re.search(r"a=2 +1 +7\.0 +one seed +7\.0 +7\.0 to 7\.0", text)
+    assert f"failed  {tmp_path}: no" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("0:3", [0, 1, 2]), ("5", [5]), ("4,2", [4, 2]), ("7:8", [7])]
+)
+def test_seeds(text, seeds):
+    assert sweep.parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "3:1", "-1:2", "a", "1,1", "1:2:3"])
+def test_what_are_no_seeds_is_told(text):
+    with pytest.raises(SkillweaveError, match="write 0:20 for 0 to 19"):
+        sweep.parse_seeds(text)
+
+
+def test_choices_are_all_combinations_and_values_may_be_tuples():
+    assert sweep.parse_choices([]) == [()]
+    found = sweep.parse_choices(["a=1,2", "b.c=(8,8),(16,16)"])
+    assert found == [
+        ("a=1", "b.c=(8,8)"), ("a=1", "b.c=(16,16)"), ("a=2", "b.c=(8,8)"), ("a=2", "b.c=(16,16)"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("each", [["a"], ["a="], ["a=1,1"], ["a=1,,2"], ["a=1", "a=2"]])
+def test_what_are_no_choices_is_told(each):
+    with pytest.raises(SkillweaveError, match="--set-each"):
+        sweep.parse_choices(each)
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["train", "x.py", "--ray"], ["train", "x.py", "--ray", ""]),
+        (["train", "--ray", "x.py"], ["train", "--ray", "", "x.py"]),
+        (["train", "--ray", "--quiet"], ["train", "--ray", "", "--quiet"]),
+        (["train", "--ray", "auto", "x"], ["train", "--ray", "auto", "x"]),
+        (["train", "--ray", "h:6379", "x"], ["train", "--ray", "h:6379", "x"]),
+        (["train", "--ray", "ray://h:1", "x"], ["train", "--ray", "ray://h:1", "x"]),
+    ],
+)
+def test_ray_may_be_said_with_an_address_or_without(words, found):
+    assert _with_addresses(words) == found
+
+
+def test_without_ray_the_extra_is_named(capsys, asked, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    for words in (["train", *asked()[1:2], "--ray"], asked("--ray")):
+        assert main(words) == 1
+        assert "pip install 'skillweave[ray]'" in capsys.readouterr().err

@@ -1,0 +1,79 @@
+"""What is sent to other processes arrives as it was, whatever it is made of."""
+
+import subprocess
+import sys
+import threading
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from skillweave import SkillweaveError, from_onnx, recipes
+from skillweave.collecting.shipping import packed, unpacked
+
+SPACES = gym.spaces.Box(-1.0, 1.0, (4,), np.float32), gym.spaces.Discrete(2)
+
+RECIPE = '''
+"""Nothing here can be imported elsewhere."""
+import gymnasium as gym
+from gymnasium.envs.classic_control import CartPoleEnv
+from helper_of_recipe import half
+from skillweave import Hierarchy, Skill
+
+class Own(CartPoleEnv):
+    pass
+
+gym.register("OwnPole-v0", Own, max_episode_steps=20)
+
+class Still(Skill):
+    def reward(self, step):
+        return half(step.reward)
+
+hierarchy = Hierarchy("OwnPole-v0", [Still()])
+'''
+
+
+@pytest.fixture
+def recipe(tmp_path, monkeypatch):
+    (tmp_path / "helper_of_recipe.py").write_text("def half(x):\n    return x / 2\n")
+    file = tmp_path / "own_pole.py"
+    file.write_text(RECIPE)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield str(file)
+    gym.registry.pop("OwnPole-v0", None)
+    for name in ("helper_of_recipe", "skillweave_recipe_own_pole"):
+        sys.modules.pop(name, None)
+
+
+def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_path):
+    file = tmp_path / "packed"
+    file.write_bytes(packed(recipes.load(recipe), "it"))
+    code = (
+        "import sys; from types import SimpleNamespace as S\n"
+        "from skillweave.collecting.shipping import unpacked\n"
+        f"own = unpacked(open({str(file)!r}, 'rb').read())\n"
+        "print(type(own.spec.make().unwrapped).__name__, own.skills[0].reward(S(reward=3.0)))\n"
+    )
+    command = [sys.executable, "-c", code]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["Own", "1.5"]
+
+
+def test_an_onnx_file_arrives_as_the_same_policy(tmp_path):
+    pytest.importorskip("onnxruntime")
+    torch.manual_seed(0)
+    path = tmp_path / "net.onnx"
+    torch.onnx.export(
+        torch.nn.Linear(4, 2), (torch.zeros(1, 4),), str(path), dynamo=False,
+        input_names=["x"], dynamic_axes={"x": {0: "batch"}},
+    )  # fmt: skip
+    policy = from_onnx(path).bind(*SPACES, "skill x")
+    obs = np.random.default_rng(0).normal(size=(8, 4)).astype(np.float32)
+    arrived = unpacked(packed(policy, "it"))
+    np.testing.assert_array_equal(arrived.act({}, obs)[0], policy.act({}, obs)[0])
+
+
+def test_what_cannot_be_sent_is_told_with_whose_it_is():
+    with pytest.raises(SkillweaveError, match=r"the arm cannot be sent.*lock"):
+        packed({"a": threading.Lock()}, "the arm")
