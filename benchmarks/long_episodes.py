@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from benchmarks.common import report
-from skillweave import PPO, Hierarchy, Skill, api
+from skillweave import PPO, Hierarchy, Skill
+from skillweave.api import running
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 
@@ -51,7 +52,7 @@ class Stop(Exception):
     """Training is to be stopped here."""
 
 
-class Stopping(api.Progress):
+class Stopping(running.Progress):
     """Stops training in the middle."""
 
     at = 0
@@ -73,11 +74,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         whole, broken = Path(name) / "whole", Path(name) / "broken"
         hierarchy(given.length, given.steps).train(whole, flat=True, quiet=True)
-        Stopping.at, plain = int(0.7 * given.steps), api.Progress
-        api.Progress = Stopping  # type: ignore[misc]
+        Stopping.at, plain = int(0.7 * given.steps), running.Progress
+        running.Progress = Stopping  # type: ignore[misc]
         with contextlib.suppress(Stop):
             hierarchy(given.length, given.steps).train(broken, flat=True, quiet=True)
-        api.Progress = plain  # type: ignore[misc]
+        running.Progress = plain  # type: ignore[misc]
         hierarchy(given.length, given.steps).resume(broken, quiet=True)
         weights = [
             read_tensors(run / "policies" / "agent.safetensors")[0] for run in (whole, broken)

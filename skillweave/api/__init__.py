@@ -13,7 +13,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopt, check_run, spec_of
 from skillweave.api.run import Run
-from skillweave.api.training import begin, declared_of, go_on
+from skillweave.api.running import begin, declared_of, go_on
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec

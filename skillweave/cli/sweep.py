@@ -24,7 +24,7 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave.api import Hierarchy
-from skillweave.api.training import begun, finish
+from skillweave.api.running import begun, finish
 from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.sweep_table import summary

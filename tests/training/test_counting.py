@@ -100,14 +100,14 @@ def test_what_a_killed_and_resumed_run_made_again_is_not_reported_twice(made, tm
     class Stop(Exception):
         pass
 
-    class Stopping(sw.api.Progress):
+    class Stopping(sw.api.running.Progress):
         def tick(self, name, steps, seconds, metrics):
             if name == "always" and steps >= 400:
                 raise Stop
 
     whole = hierarchy(cut_every=150).train(tmp_path / "whole", quiet=True)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("skillweave.api.Progress", Stopping)
+        patched.setattr("skillweave.api.running.Progress", Stopping)
         with pytest.raises(Stop):
             hierarchy(cut_every=150).train(tmp_path / "broken", quiet=True)
     again = hierarchy(cut_every=150).resume(tmp_path / "broken", quiet=True)
