@@ -4,46 +4,30 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import platform
 import signal
 import statistics
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from skillweave.cli.sweep import processes
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.types import Array, SkillweaveError
+
+workers = processes
+"""A pool of fresh processes that end when this one does, however it ends."""
 
 
 def machine() -> str:
     cores = len(os.sched_getaffinity(0))
     return f"{platform.machine()}, {cores} cores, Python {platform.python_version()}"
-
-
-def workers(count: int) -> ProcessPoolExecutor:
-    """A pool of fresh processes that end when this one does, however it ends."""
-    start = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(count, start, initializer=_end_with_parent)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def cases_asked(

@@ -133,6 +133,19 @@ def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> 
     return run
 
 
+def interrupt_at_checkpoint(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """Ctrl-C, right after so many checkpoints were written."""
+    save, left = RunDirectory.save_checkpoint, [number]
+
+    def stop(self: RunDirectory, *about: Any) -> None:
+        save(self, *about)
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunDirectory, "save_checkpoint", stop)
+
+
 Kinds = Mapping[str, Callable[[], Hierarchy]]
 
 

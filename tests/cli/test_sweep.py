@@ -4,6 +4,7 @@ import json
 import re
 
 import pytest
+from small_runs import interrupt_at_checkpoint
 
 from skillweave.cli import main, sweep
 from skillweave.cli.main import _with_addresses
@@ -82,15 +83,7 @@ def test_each_combination_is_trained_with_each_seed_and_none_twice(capsys, asked
 def test_a_run_that_was_stopped_goes_on_to_the_same_end(capsys, asked, trained, monkeypatch):
     one = asked("--seeds", "3:4")
     _, whole = answer(capsys, [w.replace("runs", "whole") for w in one])
-    save, left = RunDirectory.save_checkpoint, [2]
-
-    def stop(self, *about):
-        save(self, *about)
-        left[0] -= 1
-        if not left[0]:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(RunDirectory, "save_checkpoint", stop)
+    interrupt_at_checkpoint(monkeypatch, 2)
     assert main(one) == 130
     assert "0 of 1 runs are finished; the same command goes on" in capsys.readouterr().out
     trained.clear()

@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from reference_calls import Counter, Left, Right, Zigzag
+from small_runs import interrupt_at_checkpoint
 from toy_acting import Again, Choices, requests
 
 from skillweave import PPO, Agent
@@ -25,7 +26,6 @@ from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.group import Collectors
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
@@ -174,15 +174,7 @@ def test_a_run_on_ray_goes_on_in_processes_and_ends_as_if_nothing_had_happened(
     whole = Agent(spec, small, 512, cut_every=128)
     whole.train(tmp_path / "whole", quiet=True)
     agent = Agent(replace(spec, workers=1), small, 512, cut_every=128)
-    save, left = RunDirectory.save_checkpoint, [2]
-
-    def stop(self, *about):
-        save(self, *about)
-        left[0] -= 1
-        if not left[0]:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(RunDirectory, "save_checkpoint", stop)
+    interrupt_at_checkpoint(monkeypatch, 2)
     with pytest.raises(KeyboardInterrupt):
         agent.train(tmp_path / "on", quiet=True, cluster=Ray(collectors=2))
     assert 0 < read_tensors(tmp_path / "on" / "checkpoint.safetensors")[1]["steps"] < 512
