@@ -63,6 +63,6 @@ def suite() -> Suite:
         bonus=0.01,
         fixed={"by-leg": by_leg},
         # More than learns the first task, skills included; a further task takes a tenth here.
-        flat_steps=3_700_000,
+        flat_steps=4_000_000,
         evaluations=8,
     )

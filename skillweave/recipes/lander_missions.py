@@ -183,7 +183,7 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
         "algorithm": PILOT,
         "selector": SELECTOR,
         "skill_steps": 600_000,
-        "selector_steps": 250_000,
+        "selector_steps": 600_000,
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
     found.skill("go_right").steps = 800_000  # it begins on the left, too
