@@ -396,7 +396,9 @@ def test_a_film_of_a_skill_alone_shows_its_reflexes_too(tmp_path):
     anywhere = Reflex(lambda obs: np.ones(len(obs), bool), action=2)
     declared = Hierarchy(Shown, [Left(), Zigzag()], reflexes=[anywhere])
     policy = HierarchyPolicy(Chooser(2), declared.skill_set([Left.policy, Zigzag.policy]))
-    told = Run(declared, None, policy).render(tmp_path / "a.gif", episodes=3, skill="left")
+    told = Run(declared, tmp_path / "run", policy).render(
+        tmp_path / "a.gif", episodes=3, skill="left"
+    )
     assert [e["return"] for e in told["episodes"]] == [2.0 * e["length"] for e in told["episodes"]]
     assert [e["skills"] for e in told["episodes"]] == [
         {"left": e["length"]} for e in told["episodes"]

@@ -433,4 +433,11 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
     assert len(found.pop("compat/pickles.py")) == 1
     source = (LIBRARY / "compat/pickles.py").read_text()
     assert re.findall(r"\bpickle\.\w+", source) == ["pickle.Unpickler"]
+    # The one that sends the user's own code to processes of the same user, as multiprocessing does:
+    # no file is ever read by it, and only these send and receive.
+    assert len(found.pop("collecting/shipping.py")) == 2
+    sender = (LIBRARY / "collecting/shipping.py").read_text()
+    assert not re.search(r"\bopen\(|\.read|\.load\(", sender)
+    users = {str(p.relative_to(LIBRARY)) for p in modules if "collecting.shipping" in p.read_text()}
+    assert users == {"cli/sweep.py", "collecting/actors.py", "collecting/stationed.py"}
     assert {k: v for k, v in found.items() if v} == {}
