@@ -91,7 +91,7 @@ def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
     if low > flat_high:
         return [f"{both}: the hierarchy is better."]
     if flat_low > high:
-        found = "the flat agent is better. One agent can learn this task from its reward alone."
+        found = "the flat agent is better, as often where the reward alone leads to the goal."
     else:
         found = "there is no clear difference."
     return [
