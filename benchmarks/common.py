@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.cli.sweep import processes
+from skillweave.cli.processes import processes
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.types import Array, SkillweaveError
 

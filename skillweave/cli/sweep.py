@@ -7,17 +7,11 @@ where it stood when the same command is given again.
 from __future__ import annotations
 
 import itertools
-import multiprocessing
-import os
 import platform
 import re
-import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +21,7 @@ from skillweave.api import Hierarchy
 from skillweave.api.running import begun, finish
 from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
+from skillweave.cli.processes import ProcessEnded, processes
 from skillweave.cli.sweep_table import summary
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.shipping import packed, unpacked
@@ -196,38 +191,11 @@ def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, 
         for future in as_completed(due):
             try:
                 yield due[future], future.result()
-            except BrokenProcessPool:
+            except ProcessEnded as error:
                 raise SkillweaveError(
-                    "a run's process was ended, perhaps because memory ran out; runs that are "
-                    "finished are kept, and the same command goes on (fewer at once: --jobs)"
+                    f"{error}; runs that are finished are kept, and the same command goes on "
+                    "(fewer at once: --jobs)"
                 ) from None
-
-
-@contextmanager
-def processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of fresh processes that end when this one does, however it ends."""
-    start = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, start, initializer=_end_with_parent, max_tasks_per_child=1)
-    try:
-        yield pool
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in multiprocessing.active_children():
-            child.terminate()
-        raise
-    pool.shutdown()
-
-
-def _end_with_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:

@@ -1,0 +1,118 @@
+"""Jobs side by side, each in a fresh process that ends when this one does, however it ends.
+
+``ProcessPoolExecutor`` does not serve: where each of its processes does one job alone
+(``max_tasks_per_child=1``), it may wait for ever as it is shut down.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+from skillweave.types import SkillweaveError
+
+_START = multiprocessing.get_context("spawn")
+
+
+class ProcessEnded(SkillweaveError):
+    """A job's process was ended before it answered."""
+
+
+class Processes:
+    """So many jobs at once; see ``processes``."""
+
+    def __init__(self, count: int) -> None:
+        self._threads, self._lock = ThreadPoolExecutor(count), threading.Lock()
+        self._running: list[Any] = []
+        self._over = False
+
+    def submit(self, job: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """What ``job(*arguments)`` will return; job and arguments must be importable there.
+
+        Its result raises a ``SkillweaveError`` as the job did, a ``RuntimeError`` with the
+        traceback for any other error, and ``ProcessEnded``.
+        """
+        return self._threads.submit(self._run, job, arguments)
+
+    def _run(self, job: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        receiver, sender = _START.Pipe(duplex=False)
+        child = _START.Process(target=_answer, args=(sender, job, arguments))
+        with self._lock:
+            if self._over:
+                raise ProcessEnded("a job was not begun, as another one failed")
+            child.start()
+            self._running.append(child)
+        sender.close()
+        try:
+            result, error = receiver.recv()
+        except EOFError:
+            child.join()
+            raise ProcessEnded(
+                f"a process was ended before its job was done (exit code {child.exitcode}), "
+                "perhaps because memory ran out"
+            ) from None
+        finally:
+            receiver.close()
+            with self._lock:
+                self._running.remove(child)
+        child.join()
+        if error is not None:
+            raise error
+        return result
+
+    def end(self) -> None:
+        """End all jobs, and begin no other."""
+        with self._lock:
+            self._over = True
+            for child in self._running:
+                child.terminate()
+
+    def close(self) -> None:
+        """Wait for all jobs."""
+        self._threads.shutdown()
+
+
+@contextmanager
+def processes(count: int) -> Iterator[Processes]:
+    """A pool of fresh processes, of which ``count`` run at once; an error here ends them all."""
+    pool = Processes(count)
+    try:
+        yield pool
+    except BaseException:
+        pool.end()
+        raise
+    finally:
+        pool.close()
+
+
+def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    """Do a job, and send its result or its error."""
+    _end_with_parent()
+    result: Any = None
+    problem: Exception | None = None
+    try:
+        result = job(*arguments)
+    except SkillweaveError as error:
+        problem = SkillweaveError(str(error))
+    except Exception:  # any, as it comes from what a user wrote; not all errors can be sent
+        problem = RuntimeError(traceback.format_exc())
+    sender.send((result, problem))
+
+
+def _end_with_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
