@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections import Counter
 from dataclasses import replace
 
@@ -274,3 +276,21 @@ def test_curves_count_the_steps_of_earlier_stages(done):
     path = done.run_path("line", "right", HIERARCHY, 0)
     curve = curve_of(path, 1.0, ("selector",))
     assert curve[0][0] > 2 * 128  # skills came first
+
+
+def test_jobs_of_the_command_run_in_processes_of_their_own(tmp_path):
+    """What a process is sent must be importable there: nothing of a package's ``__main__`` is."""
+    pytest.importorskip("Box2D")
+    folder = tmp_path / "lander-missions" / "any" / "hierarchy"
+    folder.mkdir(parents=True)
+    (folder / "0.json").write_text("{}")
+    asked = ["lander-missions/any", "--agents", "hierarchy", "--seeds", "0", "--out", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.pay", *asked],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "0.json is damaged" in line  # a job read it, and told

@@ -202,12 +202,15 @@ def test_going_on_is_never_worth_as_much_as_arriving(skill):
     assert missions.CRASH < 0 < best < skill.prize / 2
 
 
-def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_ground():
+def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_pad():
     land = missions.Land()
     high = step_of(lander(SKY), lander((0.2, 1.0), speed=(-0.4, -0.2)))  # 0.4 of 0.5 down
     assert land.reward(high) == pytest.approx(1.0, abs=1e-6)
     ground = lander(PAD, speed=(0.0, -0.1), legs=(1.0, 0.0))
-    assert land.reward(step_of(lander(SKY), ground, action=2)) == pytest.approx(0.5)
+    assert land.reward(step_of(lander(SKY), ground)) == 2.0
+    assert land.reward(step_of(lander(SKY), ground, action=2)) == 1.0
+    off_pad = lander((0.3, 0.0), speed=(-0.6, -0.1), legs=(1.0, 0.0))  # 0.1 of 0 down
+    assert land.reward(step_of(lander(SKY), off_pad)) == pytest.approx(0.9)
     beside = step_of(lander(SKY), lander((0.4, 1.0), speed=(-0.8, 0.0)))  # it must not sink yet
     assert land.reward(beside) == pytest.approx(1.0, abs=1e-6)
     rest = step_of(ground, lander(PAD, legs=(1.0, 1.0)), terminated=True)

@@ -1,0 +1,52 @@
+"""Keys and doors: eight skills learnt in small rooms (``skillweave train keys-and-doors``)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from benchmarks.pay.suite import Policies, Suite, Task
+from skillweave import Array, Hierarchy
+from skillweave.recipes import _rooms
+from skillweave.recipes import keys_and_doors as rooms
+
+SOLVED = 0.8
+
+
+def source(task: Task) -> Hierarchy:
+    """Skills, each by itself, then a selector for the small rooms."""
+    return rooms.declare(task.name)
+
+
+def further(task: Task, skills: Policies) -> Hierarchy:
+    """A selector over skills that are there already."""
+    return rooms.with_skills(task.name, skills)
+
+
+def cells(obs: Array) -> Array:
+    """All that is in view, (n, 147)."""
+    found: Array = obs.reshape(len(obs), -1)
+    return found
+
+
+def suite() -> Suite:
+    """Small rooms, and six tasks of MiniGrid; a score is the share of episodes that do the task."""
+    return Suite(
+        name="keys-and-doors",
+        tasks=[Task(name, _rooms.spec(name), SOLVED) for name in _rooms.ROOMS],
+        unit=1.0,
+        source=source,
+        further=further,
+        skills=lambda: [skill() for skill in rooms.SKILLS],
+        # The selector's settings and network, and it sees the same.
+        flat=replace(rooms.SELECTOR, ent_coef=0.01, ent_coef_final=None),
+        weights=(
+            {s.name: 0.01 for s in rooms.SKILLS[1:]},
+            {s.name: 0.05 for s in rooms.SKILLS[1:]},
+        ),
+        cells=cells,
+        bonus=0.01,
+        episodes=100,
+        greedy=False,
+        evaluations=5,
+        evaluated=20,
+    )

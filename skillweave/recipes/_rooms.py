@@ -1,0 +1,190 @@
+"""The rooms of the recipe ``keys-and-doors``: MiniGrid, alone and in EnvPool, seen as cells."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave import Array, EnvSpec, SkillweaveError, envpool
+
+SMALL = (
+    "DoorKey-8x8",
+    "KeyCorridorS3R1",
+    "MultiRoom-N2-S4",
+    "MultiRoom-N4-S5",
+    "ObstructedMaze-1Dl",
+    "UnlockPickup",
+    "BlockedUnlockPickup",
+    "PutNear-8x8-N3",
+)
+"""The rooms in which skills are learnt: each episode is in one of them."""
+TARGETS = {
+    "unlock-pickup": "UnlockPickup",
+    "blocked-unlock-pickup": "BlockedUnlockPickup",
+    "door-key-16x16": "DoorKey-16x16",
+    "multi-room": "MultiRoom-N6",
+    "key-corridor": "KeyCorridorS3R3",
+    "obstructed-maze": "ObstructedMaze-1Dlh",
+}
+"""Tasks by name, and what MiniGrid calls them."""
+ROOMS = {"small": SMALL} | {name: (room,) for name, room in TARGETS.items()}
+EMPTY, WALL, FLOOR, DOOR, KEY, BALL, BOX, GOAL = 1, 2, 3, 4, 5, 6, 7, 8
+"""What may be in a cell: the first of its three numbers."""
+OPEN, CLOSED, LOCKED = 0, 1, 2
+"""A door's state: the third."""
+LEFT, RIGHT, FORWARD, PICK_UP, DROP, TOGGLE = range(6)
+SPACE = gym.spaces.Box(0, 255, (7, 7, 3), np.uint8)
+
+
+def ahead(obs: Array) -> Array:
+    """The cell before the agent, (n, 3)."""
+    found: Array = obs[:, 3, 5]
+    return found
+
+
+def holds(obs: Array, *kinds: int) -> Array:
+    """One of these is in the agent's hands, (n,) bool; of none: anything."""
+    found: Array = np.isin(obs[:, 3, 6, 0], kinds or (KEY, BALL, BOX))
+    return found
+
+
+def in_view(obs: Array, *kinds: int, state: int | None = None) -> Array:
+    """One of these is in view, and not in the agent's hands, (n,) bool."""
+    seen: Any = np.isin(obs[..., 0], kinds)
+    seen[:, 3, 6] = False
+    if state is not None:
+        seen = seen & (obs[..., 2] == state)
+    found: Array = seen.any(axis=(1, 2))
+    return found
+
+
+def shut(cells: Array) -> Array:
+    """A door that is closed or locked, for cells (n, 3), (n,) bool."""
+    found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] != OPEN)
+    return found
+
+
+def free(cells: Array) -> Array:
+    """An agent can go there, for cells (n, 3), (n,) bool."""
+    opened = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
+    found: Array = np.isin(cells[:, 0], (EMPTY, FLOOR, GOAL)) | opened
+    return found
+
+
+def between_walls(obs: Array) -> Array:
+    """There is a wall on its left and on its right, as in a doorway, (n,) bool."""
+    found: Array = (obs[:, 2, 6, 0] == WALL) & (obs[:, 4, 6, 0] == WALL)
+    return found
+
+
+class Rooms(gym.Env[Any, Any]):
+    """One agent that begins each episode in one of several rooms, drawn evenly.
+
+    Args:
+        rooms: what MiniGrid calls them, without ``MiniGrid-`` and ``-v0``.
+        render_mode: of MiniGrid.
+
+    Raises:
+        SkillweaveError: MiniGrid is missing.
+    """
+
+    def __init__(self, rooms: Sequence[str], render_mode: str | None = None) -> None:
+        try:
+            import minigrid  # noqa: F401, it registers the environments
+        except ImportError as error:
+            raise SkillweaveError(
+                "keys-and-doors needs MiniGrid: pip install 'skillweave[minigrid]'"
+            ) from error
+        with warnings.catch_warnings():
+            # Of some rooms there is a later version, but not in EnvPool.
+            warnings.filterwarnings("ignore", message=".*is out of date.*")
+            self._envs = [gym.make(f"MiniGrid-{r}-v0", render_mode=render_mode) for r in rooms]
+        self._now = self._envs[0]
+        self.observation_space, self.action_space = SPACE, self._now.action_space
+        self.render_mode, self.metadata = render_mode, self._now.metadata
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Draw a room, and begin there."""
+        super().reset(seed=seed)
+        self._now = self._envs[int(self.np_random.integers(len(self._envs)))]
+        obs, info = self._now.reset(seed=seed, options=options)
+        return obs["image"], info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """As MiniGrid does, but it pays 1 where the task is done, however long it took."""
+        obs, reward, terminated, truncated, info = self._now.step(action)
+        return obs["image"], float(float(reward) > 0), terminated, truncated, info
+
+    def render(self) -> Any:
+        """The picture of the room."""
+        return self._now.render()
+
+    def close(self) -> None:
+        """Close all rooms."""
+        for env in self._envs:
+            env.close()
+
+
+class RoomPool:
+    """Many agents, in EnvPool's rooms: agent i is always in room i modulo the number of rooms.
+
+    Args:
+        rooms: what MiniGrid calls them, without ``MiniGrid-`` and ``-v0``.
+    """
+
+    observation_space, action_space = SPACE, gym.spaces.Discrete(7)
+
+    def __init__(self, rooms: Sequence[str], num_envs: int, threads: int, seed: int) -> None:
+        self._kinds = len(rooms)
+        self._pools = {
+            k: envpool(f"MiniGrid-{room}-v0", -((k - num_envs) // self._kinds), threads, seed + k)
+            for k, room in enumerate(rooms[:num_envs])
+        }
+
+    def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes."""
+        seen = np.empty((len(ids), *SPACE.shape), np.uint8)
+        for kind, rows in self._by_room(ids):
+            obs, _ = self._pools[kind].reset(ids[rows] // self._kinds)
+            seen[rows] = obs["image"]
+        return seen, {}
+
+    def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """Act, each in its room."""
+        n = len(ids)
+        seen = np.empty((n, *SPACE.shape), np.uint8)
+        reward = np.empty(n, np.float32)
+        terminated, truncated = np.empty(n, bool), np.empty(n, bool)
+        for kind, rows in self._by_room(ids):
+            obs, *told, _ = self._pools[kind].step(action[rows], ids[rows] // self._kinds)
+            seen[rows] = obs["image"]
+            reward[rows], terminated[rows], truncated[rows] = told
+        reward = (reward > 0).astype(np.float32)
+        return seen, reward, terminated, truncated, {}
+
+    def _by_room(self, ids: Array) -> list[tuple[int, Array]]:
+        """Which rows of ``ids`` are in which room."""
+        kinds = ids % self._kinds
+        return [(int(k), np.flatnonzero(kinds == k)) for k in np.unique(kinds)]
+
+
+def spec(name: str = "small") -> EnvSpec:
+    """The rooms of this name, for ``Hierarchy(env=...)``.
+
+    Raises:
+        SkillweaveError: there are none of this name.
+    """
+    if name not in ROOMS:
+        raise SkillweaveError(f"no rooms {name!r}; there are: {', '.join(ROOMS)}")
+    rooms = ROOMS[name]
+
+    def one(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return Rooms(rooms, render_mode)
+
+    one.__name__ = f"Rooms({name})"
+    return EnvSpec(one, pool=partial(RoomPool, rooms))

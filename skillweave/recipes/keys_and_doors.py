@@ -1,0 +1,244 @@
+"""Keys and doors: eight skills for MiniGrid's rooms, and a selector for each task.
+
+The agent sees the 7×7 cells before it: kind, colour and state of each. Skills are learnt once, in
+small rooms of several kinds, each for what it can see: a key, a shut door, a ball. A selector
+learns each further task, where a reward is paid at the end alone.
+
+    skillweave train keys-and-doors
+
+Needs MiniGrid: ``pip install 'skillweave[minigrid]'``; with EnvPool it trains ten times as fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
+from skillweave.recipes._rooms import (
+    BALL,
+    BOX,
+    CLOSED,
+    DOOR,
+    DROP,
+    FORWARD,
+    GOAL,
+    KEY,
+    LOCKED,
+    OPEN,
+    TOGGLE,
+    ahead,
+    between_walls,
+    free,
+    holds,
+    in_view,
+    shut,
+    spec,
+)
+
+
+class Errand(Skill):
+    """Do one thing, as fast as it can; subclasses say what, in ``success``."""
+
+    max_steps = 32
+
+    def reward(self, step: Step) -> Array:
+        """1 where it is done, less 0.02 for each step."""
+        found: Array = self.success(step) - 0.02
+        return found
+
+    def success(self, step: Step) -> Array:
+        """Whether it is done, (N,) bool."""
+        raise NotImplementedError
+
+    def termination(self, step: Step) -> Array:
+        """It is done."""
+        return self.success(step)
+
+
+class Explore(Errand):
+    """Go about until another skill may start."""
+
+    max_steps = 16
+
+    def initiation(self, obs: Array) -> Array:
+        """No other skill may start, or only `drop`."""
+        return ~something_to_do(obs)
+
+    def reward(self, step: Step) -> Array:
+        """As the others', but a step forward costs nothing."""
+        forward = (step.action == FORWARD) & free(ahead(step.obs))
+        found: Array = super().reward(step) + 0.02 * forward
+        return found
+
+    def success(self, step: Step) -> Array:
+        """Another skill may start."""
+        return something_to_do(step.next_obs)
+
+
+def something_to_do(obs: Array) -> Array:
+    """A skill may start that does something with what is in view, (n,) bool."""
+    found: Array = np.any([make().initiation(obs) for make in SKILLS[1:] if make is not Drop], axis=0)
+    return found
+
+
+class GetKey(Errand):
+    """Pick up a key."""
+
+    def initiation(self, obs: Array) -> Array:
+        """A key is in view, and its hands are free."""
+        return in_view(obs, KEY) & ~holds(obs)
+
+    def success(self, step: Step) -> Array:
+        """It has the key."""
+        return holds(step.next_obs, KEY)
+
+
+class PickUp(Errand):
+    """Pick up a ball or a box."""
+
+    def initiation(self, obs: Array) -> Array:
+        """One is in view, and its hands are free."""
+        return in_view(obs, BALL, BOX) & ~holds(obs)
+
+    def success(self, step: Step) -> Array:
+        """It has it."""
+        return holds(step.next_obs, BALL, BOX)
+
+
+class OpenBox(Errand):
+    """Open a box: what is in it lies in its place then."""
+
+    def initiation(self, obs: Array) -> Array:
+        """A box is in view, and its hands are free."""
+        return in_view(obs, BOX) & ~holds(obs)
+
+    def success(self, step: Step) -> Array:
+        """The box before it is gone."""
+        before, after = ahead(step.obs)[:, 0], ahead(step.next_obs)[:, 0]
+        found: Array = (step.action == TOGGLE) & (before == BOX) & (after != BOX)
+        return found
+
+
+class Drop(Errand):
+    """Put down what it holds."""
+
+    max_steps = 8
+
+    def initiation(self, obs: Array) -> Array:
+        """It holds something."""
+        return holds(obs)
+
+    def success(self, step: Step) -> Array:
+        """Its hands are free."""
+        found: Array = (step.action == DROP) & ~holds(step.next_obs)
+        return found
+
+
+class OpenDoor(Errand):
+    """Open a door that is shut."""
+
+    def initiation(self, obs: Array) -> Array:
+        """A closed door is in view, or a locked one and a key in its hands."""
+        locked = in_view(obs, DOOR, state=LOCKED) & holds(obs, KEY)
+        return in_view(obs, DOOR, state=CLOSED) | locked
+
+    def success(self, step: Step) -> Array:
+        """The door before it is open now."""
+        opened = shut(ahead(step.obs)) & free(ahead(step.next_obs))
+        found: Array = opened & (step.action == TOGGLE)
+        return found
+
+
+class NextRoom(Errand):
+    """Go through an open door."""
+
+    def initiation(self, obs: Array) -> Array:
+        """An open door is in view."""
+        return in_view(obs, DOOR, state=OPEN)
+
+    def success(self, step: Step) -> Array:
+        """It leaves a doorway straight on."""
+        on = (step.action == FORWARD) & free(ahead(step.obs))
+        found: Array = on & between_walls(step.obs) & ~between_walls(step.next_obs)
+        return found
+
+
+class ReachGoal(Errand):
+    """Go to the goal."""
+
+    def initiation(self, obs: Array) -> Array:
+        """The goal is in view."""
+        return in_view(obs, GOAL)
+
+    def success(self, step: Step) -> Array:
+        """It goes there."""
+        found: Array = (step.action == FORWARD) & (ahead(step.obs)[:, 0] == GOAL)
+        return found
+
+
+CELLS = Network(hidden=(64,), encoder="cells")  # a cell's numbers are kinds, not brightnesses
+WORKER = PPO(
+    num_envs=32,
+    n_steps=64,
+    batch_size=256,
+    learning_rate=1e-3,
+    gamma=0.98,
+    gae_lambda=0.95,
+    ent_coef=0.01,
+    network=CELLS,
+)
+SELECTOR = PPO(
+    num_envs=32,
+    n_steps=128,
+    batch_size=256,
+    gamma=0.995,
+    gae_lambda=0.95,
+    ent_coef=0.02,
+    ent_coef_final=0.005,
+    network=CELLS,
+)
+SKILLS = (Explore, GetKey, OpenDoor, NextRoom, ReachGoal, PickUp, Drop, OpenBox)
+
+STEPS = {
+    "explore": 200_000,
+    "get_key": 250_000,
+    "open_door": 400_000,
+    "next_room": 500_000,
+    "reach_goal": 500_000,
+    "pick_up": 800_000,
+    "drop": 100_000,
+    "open_box": 400_000,
+}
+"""Most of them look for where a skill may start."""
+
+
+def declare(rooms: str = "small", **how: Any) -> Hierarchy:
+    """The hierarchy in these rooms; ``how`` changes any of its settings."""
+    settings: dict[str, Any] = {
+        "call_steps": None,
+        "start_calls": 4,
+        "call_cost": 0.005,
+        "greedy_skills": False,
+        "algorithm": WORKER,
+        "selector": SELECTOR,
+        "skill_steps": 100_000,
+        "selector_steps": 200_000,
+    } | how
+    found = Hierarchy(spec(rooms), [s() for s in SKILLS], **settings)
+    for name, steps in STEPS.items():
+        found.skill(name).steps = steps
+    return found
+
+
+def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
+    """The hierarchy in these rooms with skills that are there already, by name."""
+    found = declare(rooms, **({"selector_steps": 1_000_000} | how))
+    for skill in found.skills:
+        skill.policy = skills[skill.name]
+    return found
+
+
+hierarchy = declare()

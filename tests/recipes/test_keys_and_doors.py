@@ -1,0 +1,150 @@
+"""Keys and doors: where skills may start and end, by hand, and rooms beside each other."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from skillweave import SkillweaveError, Step
+from skillweave.recipes import _rooms as world
+from skillweave.recipes import keys_and_doors as rooms
+
+SKILLS = {s.name: s for s in (make() for make in rooms.SKILLS)}
+
+
+def view(ahead=(world.EMPTY, 0, 0), hands=world.EMPTY, far=(world.EMPTY, 0, 0), sides=world.EMPTY):
+    """What one agent sees: an empty room, but for these cells."""
+    obs = np.zeros((1, 7, 7, 3), np.uint8)
+    obs[..., 0] = world.EMPTY
+    obs[0, 3, 5], obs[0, 3, 6, 0], obs[0, 1, 2] = ahead, hands, far
+    obs[0, (2, 4), 6, 0] = sides
+    return obs
+
+
+def step_of(before, action, after):
+    no = np.zeros(1, bool)
+    zero = np.zeros(1, np.float32)
+    return Step(before, np.array([action]), after, zero, no, no, no, np.ones(1, int), {})
+
+
+KEY, BALL, BOX = (world.KEY, 0, 0), (world.BALL, 1, 0), (world.BOX, 2, 0)
+OPEN, CLOSED, LOCKED = ((world.DOOR, 3, s) for s in (world.OPEN, world.CLOSED, world.LOCKED))
+GOAL, WALL = (world.GOAL, 1, 0), (world.WALL, 5, 0)
+
+
+@pytest.mark.parametrize(
+    ("seen", "may"),
+    [
+        (view(), {"explore"}),
+        (view(far=KEY), {"get_key"}),
+        (view(far=BALL), {"pick_up"}),
+        (view(far=BOX), {"pick_up", "open_box"}),
+        (view(far=GOAL), {"reach_goal"}),
+        (view(far=OPEN), {"next_room"}),
+        (view(far=CLOSED), {"open_door"}),
+        (view(far=LOCKED), {"explore"}),
+        (view(hands=world.KEY), {"explore", "drop"}),  # what it holds is not in view
+        (view(hands=world.KEY, far=LOCKED), {"drop", "open_door"}),
+        (view(hands=world.BALL, far=LOCKED), {"explore", "drop"}),
+        (view(hands=world.BALL, far=KEY), {"explore", "drop"}),
+    ],
+)
+def test_a_skill_may_start_where_its_thing_is_in_view(seen, may):
+    found = {n for n, s in SKILLS.items() if s.initiation(seen).all()}
+    assert found == may
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "action", "after", "done"),
+    [
+        ("get_key", view(KEY), world.PICK_UP, view(hands=world.KEY), True),
+        ("get_key", view(BALL), world.PICK_UP, view(hands=world.BALL), False),
+        ("pick_up", view(BOX), world.PICK_UP, view(hands=world.BOX), True),
+        ("drop", view(hands=world.KEY), world.DROP, view(KEY), True),
+        ("drop", view(WALL, hands=world.KEY), world.DROP, view(WALL, hands=world.KEY), False),
+        ("open_box", view(BOX), world.TOGGLE, view(KEY), True),
+        ("open_box", view(BOX), world.PICK_UP, view(hands=world.BOX), False),
+        ("open_door", view(CLOSED), world.TOGGLE, view(OPEN), True),
+        ("open_door", view(LOCKED, world.KEY), world.TOGGLE, view(OPEN, world.KEY), True),
+        ("open_door", view(OPEN), world.TOGGLE, view(CLOSED), False),
+        ("open_door", view(CLOSED), world.FORWARD, view(CLOSED), False),
+        ("next_room", view(OPEN), world.FORWARD, view(sides=world.WALL), False),
+        ("next_room", view(sides=world.WALL), world.FORWARD, view(), True),
+        ("next_room", view(CLOSED, sides=world.WALL), world.FORWARD, view(), False),
+        ("next_room", view(sides=world.WALL), world.LEFT, view(), False),
+        ("reach_goal", view(GOAL), world.FORWARD, view(), True),
+        ("reach_goal", view(GOAL), world.TOGGLE, view(GOAL), False),
+    ],
+)
+def test_a_skill_ends_where_it_is_done_and_is_paid_for_it(name, before, action, after, done):
+    skill, step = SKILLS[name], step_of(before, action, after)
+    assert skill.success(step).all() == done
+    assert skill.termination(step).all() == done
+    assert skill.reward(step) == pytest.approx(done - 0.02)
+
+
+def test_explore_ends_where_another_skill_may_start_and_a_step_forward_costs_nothing():
+    explore = SKILLS["explore"]
+    assert explore.reward(step_of(view(), world.FORWARD, view())) == pytest.approx(0.0)
+    assert explore.reward(step_of(view(WALL), world.FORWARD, view(WALL))) == pytest.approx(-0.02)
+    assert explore.reward(step_of(view(), world.LEFT, view())) == pytest.approx(-0.02)
+    found = step_of(view(), world.FORWARD, view(far=CLOSED))
+    assert explore.reward(found) == pytest.approx(1.0)
+    assert explore.termination(found)
+    assert not explore.termination(step_of(view(), world.FORWARD, view(far=LOCKED)))
+
+
+def test_a_pool_has_each_agent_in_its_own_room_and_repeats_itself():
+    pytest.importorskip("envpool")
+    names, n = ("DoorKey-5x5", "Unlock", "Empty-5x5"), 7
+    ids = np.arange(n, dtype=np.int32)
+    played = []
+    for some in (ids, ids[::-1]):  # the order in which they are named does not count
+        pool = world.RoomPool(names, n, 1, seed=3)
+        seen = np.empty((2, n, 7, 7, 3), np.uint8)
+        seen[0, some] = pool.reset(some)[0]
+        seen[1, some] = pool.step(np.full(n, world.LEFT), some)[0]
+        played.append(seen)
+    np.testing.assert_array_equal(*played)
+    doors = (played[0][..., 0] == world.DOOR).any(axis=(0, 2, 3))
+    assert not doors[2::3].any()  # Empty has none
+
+
+def test_a_task_pays_one_however_long_it_took():
+    pytest.importorskip("minigrid")
+    env = world.Rooms(("Empty-5x5",))
+    env.reset(seed=0)
+    paid = [env.step(a) for a in (2, 2, 1, 2, 2)]
+    assert [p[1] for p in paid] == [0.0, 0.0, 0.0, 0.0, 1.0]
+    assert paid[-1][2]
+
+
+def test_rooms_are_drawn_anew_for_each_episode():
+    pytest.importorskip("minigrid")
+    env = world.Rooms(world.SMALL)
+    drawn = [env.reset(seed=s)[0] for s in (0, *[None] * 40)]
+    assert drawn[0].shape == world.SPACE.shape
+    again = world.Rooms(world.SMALL)
+    np.testing.assert_array_equal(drawn[0], again.reset(seed=0)[0])
+    seen = set(np.unique([d[..., 0] for d in drawn]))
+    assert {world.KEY, world.BALL, world.BOX, world.DOOR} <= seen
+
+
+def test_rooms_that_are_not_there_are_named_with_those_that_are():
+    with pytest.raises(SkillweaveError, match="no rooms 'cellar'; there are: small, unlock-pickup"):
+        world.spec("cellar")
+
+
+def test_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "minigrid", None)
+    with pytest.raises(SkillweaveError, match=r"skillweave\[minigrid\]"):
+        world.Rooms(("Empty-5x5",))
+
+
+def test_skills_that_are_there_learn_nothing_more():
+    ready = {name: lambda obs: np.zeros(len(obs), np.int64) for name in SKILLS}
+    found = rooms.with_skills("multi-room", ready, selector_steps=4096)
+    assert found.total_steps == 4096
+    assert [s.name for s in found.skills] == list(SKILLS)
