@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from skillweave.collecting.lengths import calls_to_json
-from skillweave.hierarchy.assembly import assembled
+from skillweave.hierarchy.assembly import assembled, can_act
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
 from skillweave.hierarchy.guidance import guide_entry, ready_guide
 from skillweave.hierarchy.nesting import (
@@ -161,6 +161,12 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
         raise SkillweaveError(
             f"{run.path}: all is learnt, but whether the hierarchy before or that after learning "
             f"together is better was not judged yet; skillweave resume {run.path}"
+        )
+    absent = [s.name for s in declaration.skills if not can_act(s, found)]
+    if absent:
+        raise SkillweaveError(
+            f"{run.path}: {', '.join(map(repr, absent))} did not learn there: declare the skills "
+            "with the policies that they had when it was trained"
         )
     policy = assembled(declaration, found)
     check_parts(declaration, policy, str(run.path))

@@ -80,7 +80,9 @@ class Explore(Errand):
 
 def something_to_do(obs: Array) -> Array:
     """A skill may start that does something with what is in view, (n,) bool."""
-    found: Array = np.any([make().initiation(obs) for make in SKILLS[1:] if make is not Drop], axis=0)
+    found: Array = np.any(
+        [make().initiation(obs) for make in SKILLS[1:] if make is not Drop], axis=0
+    )
     return found
 
 
@@ -201,6 +203,7 @@ SELECTOR = PPO(
     network=CELLS,
 )
 SKILLS = (Explore, GetKey, OpenDoor, NextRoom, ReachGoal, PickUp, Drop, OpenBox)
+WITH_THINGS = (GetKey(), OpenDoor(), NextRoom(), ReachGoal(), PickUp(), OpenBox())
 
 STEPS = {
     "explore": 200_000,

@@ -122,6 +122,12 @@ def test_a_policy_of_another_kind_and_one_of_other_shapes_are_refused(made):
         declare(*skills).load(run.path)
 
 
+def test_a_run_with_a_ready_skill_is_not_loaded_where_it_is_declared_without(tmp_path):
+    run = declare(skill("one", upright), skill("two", upright)).train(tmp_path / "run", quiet=True)
+    with pytest.raises(SkillweaveError, match=r"run: 'two' did not learn there: declare"):
+        declare(skill("one", upright), skill("two", None)).load(run.path)
+
+
 def test_a_model_of_sb3_in_memory_is_kept_by_its_weights(tmp_path):
     sb3 = pytest.importorskip("stable_baselines3")
 
