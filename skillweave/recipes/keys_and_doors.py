@@ -59,12 +59,12 @@ class Errand(Skill):
 
 
 class Explore(Errand):
-    """Go about until another skill may start."""
+    """Go about until there is something to do."""
 
     max_steps = 16
 
     def initiation(self, obs: Array) -> Array:
-        """No other skill may start, or only `drop`."""
+        """There is nothing to do; but `drop` or `next_room` may start."""
         return ~something_to_do(obs)
 
     def reward(self, step: Step) -> Array:
@@ -74,15 +74,16 @@ class Explore(Errand):
         return found
 
     def success(self, step: Step) -> Array:
-        """Another skill may start."""
+        """There is something to do."""
         return something_to_do(step.next_obs)
 
 
 def something_to_do(obs: Array) -> Array:
-    """A skill may start that does something with what is in view, (n,) bool."""
-    found: Array = np.any(
-        [make().initiation(obs) for make in SKILLS[1:] if make is not Drop], axis=0
-    )
+    """A skill may start that does something with what is in view, (n,) bool.
+
+    Not `next_room`: an agent without memory would go to and fro through the door behind it.
+    """
+    found: Array = np.any([skill.initiation(obs) for skill in ERRANDS], axis=0)
     return found
 
 
@@ -203,7 +204,7 @@ SELECTOR = PPO(
     network=CELLS,
 )
 SKILLS = (Explore, GetKey, OpenDoor, NextRoom, ReachGoal, PickUp, Drop, OpenBox)
-WITH_THINGS = (GetKey(), OpenDoor(), NextRoom(), ReachGoal(), PickUp(), OpenBox())
+ERRANDS = (GetKey(), OpenDoor(), ReachGoal(), PickUp(), OpenBox())
 
 STEPS = {
     "explore": 200_000,
