@@ -18,6 +18,7 @@ SMALL = (
     "MultiRoom-N2-S4",
     "MultiRoom-N4-S5",
     "ObstructedMaze-1Dl",
+    "ObstructedMaze-1Dlh",
     "UnlockPickup",
     "BlockedUnlockPickup",
     "PutNear-8x8-N3",

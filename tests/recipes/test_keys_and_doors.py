@@ -85,15 +85,16 @@ def test_a_skill_ends_where_it_is_done_and_is_paid_for_it(name, before, action, 
     assert skill.reward(step) == pytest.approx(done - 0.02)
 
 
-def test_explore_ends_where_there_is_something_to_do_and_a_step_forward_costs_nothing():
+def test_explore_goes_straight_on_turns_at_walls_and_ends_where_there_is_something_to_do():
     explore = SKILLS["explore"]
-    assert explore.reward(step_of(view(), world.FORWARD, view())) == pytest.approx(0.0)
-    assert explore.reward(step_of(view(WALL), world.FORWARD, view(WALL))) == pytest.approx(-0.02)
-    assert explore.reward(step_of(view(), world.LEFT, view())) == pytest.approx(-0.02)
-    found = step_of(view(), world.FORWARD, view(far=CLOSED))
-    assert explore.reward(found) == pytest.approx(1.0)
-    assert explore.termination(found)
+    corner = view(WALL)
+    corner[0, 4, 6] = WALL
+    seen = np.concatenate([view(), view(OPEN), view(WALL), corner, view(WALL, sides=world.WALL)])
+    turn = [world.RIGHT, world.LEFT, world.RIGHT]
+    assert explore.policy(seen).tolist() == [world.FORWARD, world.FORWARD, *turn]
+    assert explore.termination(step_of(view(), world.FORWARD, view(far=CLOSED)))
     assert not explore.termination(step_of(view(), world.FORWARD, view(far=LOCKED)))
+    assert not explore.termination(step_of(view(), world.FORWARD, view(far=OPEN)))
 
 
 def test_a_pool_has_each_agent_in_its_own_room_and_repeats_itself():
