@@ -40,11 +40,13 @@ def train(command: commands.Train) -> None:
     trained = _trained(command, hierarchy, command.flat, command.out, evolve)
     result, lines = _told(trained, command.evaluate, command.render)
     if command.versus_flat:
+        if not command.json:  # now: the flat agent takes as long again
+            print("\n".join(lines), flush=True)
         hierarchy.flat_steps = None  # as many as the hierarchy
         flat = _trained(command, hierarchy, True, flat_out)
         result["flat"], more = _told(flat, command.evaluate)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
-        lines += ["", "the flat agent:", *more, "", *verdict]
+        lines = ["", "the flat agent:", *more, "", *verdict]
     tell(command, result, "\n".join(lines))
 
 

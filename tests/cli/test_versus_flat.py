@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from cli.test_cli import PLAIN
 
-from skillweave.cli import main
+from skillweave.cli import main, training
 from skillweave.cli.training import _verdict
 
 
@@ -48,6 +48,23 @@ def test_both_are_trained_on_as_many_steps_and_compared(
     assert {found["evaluation"]["episodes"], found["flat"]["evaluation"]["episodes"]} == {4}
     assert main([*common, "--quiet"]) == 1, "the run is there already"
     assert "run-flat is there already" in capsys.readouterr().err
+
+
+def test_what_the_hierarchy_scored_is_told_before_the_flat_agent_is_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "plain.py").write_text(PLAIN)
+    train = training._trained
+
+    def stopped(command: Any, hierarchy: Any, flat: bool, *more: Any) -> Any:
+        if flat:
+            raise KeyboardInterrupt("stopped")
+        return train(command, hierarchy, flat, *more)
+
+    monkeypatch.setattr(training, "_trained", stopped)
+    asked = ["train", str(tmp_path / "plain.py"), "-o", str(tmp_path / "run"), "--versus-flat"]
+    assert main([*asked, "--quiet", "--evaluate", "4"]) == 130
+    assert "over 4 episodes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
