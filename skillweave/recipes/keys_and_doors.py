@@ -1,8 +1,8 @@
 """Keys and doors: eight skills for MiniGrid's rooms, and a selector for each task.
 
-The agent sees the 7×7 cells before it: kind, colour and state of each. Skills are learnt once, in
-small rooms of several kinds, each for what it can see: a key, a shut door, a ball. A selector
-learns each further task, where a reward is paid at the end alone.
+The agent sees the 7×7 cells before it: kind, colour and state of each. Seven skills are learnt
+once, in small rooms of several kinds, each for what it can see: a key, a shut door, a ball; one is
+written by hand. A selector learns each further task, where a reward is paid at the end alone.
 
     skillweave train keys-and-doors
 
