@@ -296,6 +296,7 @@ REPLAYERS = {
     "rainbow": (DQN.rainbow(**REPLAY), "discrete", "Discrete"),
     "td3": (TD3(**REPLAY, normalize_obs=True), "vector", "Box"),
     "sac": (SAC(**REPLAY, normalize_obs=True), "tuple", "Box"),
+    "sac beside collecting": (SAC(**REPLAY, overlap=True), "vector", "Box"),
     "sac of choices": (SAC(**REPLAY), "image, channels first", "Discrete"),
 }
 

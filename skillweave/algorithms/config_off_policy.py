@@ -128,6 +128,10 @@ class OffPolicy:
     """The network that acts."""
     save_buffer: bool = True
     """Checkpoints hold the replay buffer, so that resuming is exact; else it fills anew."""
+    overlap: bool = False
+    """Collect while learning, with the parameters of one update before: pays where environments
+    are slow. An update then follows each ``train_freq`` steps of every environment, so these are
+    the lag."""
     threads: int = 1
     """Torch threads while learning."""
     compile: bool = False

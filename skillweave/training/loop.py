@@ -104,7 +104,8 @@ class _Loop:
         set_threads = torch.set_num_threads  # torch counts threads for each thread
         self._thread = ThreadPoolExecutor(1, "learner", set_threads, (learner.threads,))
         self._pending: Future[dict[str, Tensor]] | None = None
-        self._told = 0, 0  # the pending update's number, and the steps when it is done
+        self._told = 0, 0, False
+        """The pending update's number, the steps when it is done, and whether it is reported."""
 
     def round(self, budget: int, cut_every: int) -> None:
         """Collect, and learn from it, or begin to."""
@@ -119,10 +120,10 @@ class _Loop:
         learner.take(collected.experience)
         if learner.overlap and not cut:
             self.ask()  # before the parameters change
-        self._begin(update)
+        every = learner.report_every
+        self._begin(update, not every or cut or crossed(every, before, at.steps))
         if cut or not learner.overlap:
-            kept = self._cut() if cut and not over else None
-            self.wait(cut, kept, before)
+            self.wait(cut, self._cut() if cut and not over else None)
             if not over:
                 self.ask()
 
@@ -131,28 +132,24 @@ class _Loop:
         at = self.at
         self._request = self.learner.request(at.update, at.steps, self._progress(at.steps))
 
-    def _begin(self, update: int) -> None:
-        """Learn, on the thread if it may overlap."""
+    def _begin(self, update: int, due: bool) -> None:
+        """Learn, on the thread if it may overlap; the update is reported if that is due."""
         about = update, self.at.steps, self._progress(self.at.steps)
-        self._told = update + 1, self.at.steps
+        self._told = update + 1, self.at.steps, due
         if self.learner.overlap:
-            self._summary = self.episodes.summary()
+            self._summary = self.episodes.summary() if due else {}
             self._pending = self._thread.submit(self.learner.learn, *about)
         else:
             self._pending = Future()
             self._pending.set_result(self.learner.learn(*about))
 
-    def wait(
-        self, cut: bool = False, kept: dict[str, Tensor] | None = None, before: int | None = None
-    ) -> None:
+    def wait(self, cut: bool = False, kept: dict[str, Tensor] | None = None) -> None:
         """Let a pending update end, and report it."""
         if self._pending is None:
             return
         found, self._pending = self._pending.result(), None
         self._metrics |= found
-        update, steps = self._told
-        every = self.learner.report_every
-        due = not every or before is None or cut or crossed(every, before, steps)
+        update, steps, due = self._told
         if not due:
             return
         self.at.seconds = time.perf_counter() - self._started

@@ -36,7 +36,6 @@ class ReplayLearner:
         goes_on_at: environment steps of the stage so far.
     """
 
-    overlap = False
     report_every = 1_000
 
     def __init__(
@@ -50,7 +49,7 @@ class ReplayLearner:
     ) -> None:
         self.stacks, self._seeds, self._row_steps = stacks, seeds, row_steps
         self.store, self.config = store, stacks[0].algorithm.config
-        self.threads = int(self.config.threads)
+        self.overlap, self.threads = bool(self.config.overlap), int(self.config.threads)
         self.members = sum(s.members for s in stacks)
         self._first = [0, *itertools.accumulate(s.members for s in stacks)]
         self._random_until = int(self.config.learning_starts) * self.members

@@ -189,6 +189,37 @@ def test_schedules_count_from_where_a_rollout_began(overlap):
     assert spied(4, config, schedule_steps=2 * 256).spent == [0.0, 0.5, 1.0, 1.0]
 
 
+def lags_of_replay(overlap: bool) -> list[int]:
+    """How many updates old the policy is by which each experience is collected, from the 4th on."""
+    config = replace(REPLAY, overlap=overlap, learning_starts=16, update_ratio=0.25)
+    env = Identity(16)
+    algorithm = make_algorithm(config, env.observation_space, env.action_space)
+    found = training(algorithm, env)
+    learn, collect = found.learner.learn, found.collectors.collect
+    versions, used = [found.state.params.clone()], []
+
+    def learnt(*about):
+        metrics = learn(*about)
+        versions.append(found.state.params.clone())
+        return metrics
+
+    def collected(request):
+        used.append(algorithm.acting.flatten(request.params[0].views).clone())
+        return collect(request)
+
+    found.learner.learn, found.collectors.collect = learnt, collected
+    found.run(16 * 9, cut_every=16 * 6)
+    acting = [v[:, : algorithm.acting.size] for v in versions]
+    return [
+        k - max(i for i, v in enumerate(acting) if torch.equal(v, used[k])) for k in range(3, 9)
+    ]
+
+
+def test_replay_learns_beside_collecting_if_asked_with_a_lag_of_one_update():
+    assert lags_of_replay(overlap=False) == [0] * 6
+    assert lags_of_replay(overlap=True) == [1, 1, 1, 0, 1, 1]  # the 6th is a cut
+
+
 @pytest.mark.parametrize("overlap", [True, False])
 def test_every_update_is_reported_once_and_in_order(overlap):
     ticks: list[Tick] = []
