@@ -81,7 +81,7 @@ class Collector:
             limit: steps after which an episode is cut.
 
         Returns:
-            (N, 4), as ``Collected.episodes``.
+            (N, 4), as ``Collected.episodes``; NaN where none could begin.
         """
         self.begun = False
         self.start(seeds)
@@ -94,10 +94,15 @@ class Collector:
             for ids, told in zip(self._who, self._ended, strict=True):
                 first = playing[ids]
                 found[ids[first]], playing[ids[first]] = told[first], False
+            playing &= ~self._given_up()
             if not playing.any():
                 return found
         found[playing, :3] = self.kept["sums"][playing]
         return found
+
+    def _given_up(self) -> Array:
+        """(N,) bool, environments in which an episode cannot begin, as it seems."""
+        return np.zeros(self.num_envs, bool)
 
     def cut(self, seeds: Seeds) -> Array:
         """Make ready for ``state``: take new seeds, so that the past need not be kept.

@@ -184,6 +184,12 @@ class SkillCollector(Collector):
                 "trained in that order; or give an environment that starts where it holds"
             )
 
+    def _given_up(self) -> Array:
+        if not self._searches:
+            return self._never
+        given_up: Array = self.kept["searched"] > PATIENCE
+        return given_up
+
     def _sought(self) -> str:
         """By whom a start was searched for."""
         if self._starters.skills is None:

@@ -132,7 +132,7 @@ class Rooms(gym.Env[Any, Any]):
 
 
 class RoomPool:
-    """Many agents, in EnvPool's rooms: agent i is always in room i modulo the number of rooms.
+    """Many agents, in EnvPool's rooms; each begins every episode in one that is drawn evenly.
 
     Args:
         rooms: what MiniGrid calls them, without ``MiniGrid-`` and ``-v0``.
@@ -141,37 +141,37 @@ class RoomPool:
     observation_space, action_space = SPACE, gym.spaces.Discrete(7)
 
     def __init__(self, rooms: Sequence[str], num_envs: int, threads: int, seed: int) -> None:
-        self._kinds = len(rooms)
-        self._pools = {
-            k: envpool(f"MiniGrid-{room}-v0", -((k - num_envs) // self._kinds), threads, seed + k)
-            for k, room in enumerate(rooms[:num_envs])
-        }
+        self._pools = [
+            envpool(f"MiniGrid-{room}-v0", num_envs, threads, seed + k)
+            for k, room in enumerate(rooms)
+        ]
+        self._rngs = [np.random.default_rng([seed, i]) for i in range(num_envs)]
+        self._room = np.zeros(num_envs, np.int64)
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
-        """Begin episodes."""
+        """Draw rooms, and begin there."""
+        self._room[ids] = [self._rngs[i].integers(len(self._pools)) for i in ids]
         seen = np.empty((len(ids), *SPACE.shape), np.uint8)
-        for kind, rows in self._by_room(ids):
-            obs, _ = self._pools[kind].reset(ids[rows] // self._kinds)
+        for pool, rows in self._by_room(ids):
+            obs, _ = pool.reset(ids[rows])
             seen[rows] = obs["image"]
         return seen, {}
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Act, each in its room."""
         n = len(ids)
-        seen = np.empty((n, *SPACE.shape), np.uint8)
-        reward = np.empty(n, np.float32)
+        seen, reward = np.empty((n, *SPACE.shape), np.uint8), np.empty(n, np.float32)
         terminated, truncated = np.empty(n, bool), np.empty(n, bool)
-        for kind, rows in self._by_room(ids):
-            obs, *told, _ = self._pools[kind].step(action[rows], ids[rows] // self._kinds)
+        for pool, rows in self._by_room(ids):
+            obs, *told, _ = pool.step(action[rows], ids[rows])
             seen[rows] = obs["image"]
             reward[rows], terminated[rows], truncated[rows] = told
-        reward = (reward > 0).astype(np.float32)
-        return seen, reward, terminated, truncated, {}
+        return seen, (reward > 0).astype(np.float32), terminated, truncated, {}
 
-    def _by_room(self, ids: Array) -> list[tuple[int, Array]]:
-        """Which rows of ``ids`` are in which room."""
-        kinds = ids % self._kinds
-        return [(int(k), np.flatnonzero(kinds == k)) for k in np.unique(kinds)]
+    def _by_room(self, ids: Array) -> list[tuple[Any, Array]]:
+        """Rooms that are in use, and which rows of ``ids`` are there."""
+        room = self._room[ids]
+        return [(self._pools[k], np.flatnonzero(room == k)) for k in np.unique(room)]
 
 
 def spec(name: str = "small") -> EnvSpec:

@@ -14,13 +14,17 @@ from skillweave.types import Array
 
 
 def returns_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
-    """Returns (N,) of one episode in each of the arena's environments, acting greedily."""
+    """Returns of one episode in each of the arena's environments, as of ``episodes_of``."""
     returns: Array = episodes_of(policy, arena, seeds)[:, RETURN]
     return returns
 
 
 def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
-    """What one episode in each environment came to, (N, 4), as ``Collected.episodes``."""
+    """What one episode in each environment came to, acting greedily, as ``Collected.episodes``.
+
+    Returns:
+        (n, 4), n at least 1; environments where a skill could never start are left out.
+    """
     algorithm = policy.algorithm
     player = arena.like(arena.engine, Acting([(algorithm, 1)], arena.num_envs))
     params = algorithm.acting_params_of(policy.weights)
@@ -28,4 +32,5 @@ def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
     request = Request(0, (params,), gamma, seeds / "act", greedy=True)
     with torch_threads(1):  # several wait for each other, for ever on a busy machine
         found: Array = player.play(request, seeds / "start", LONGEST_EPISODE)
-    return found
+    began: Array = ~np.isnan(found[:, RETURN])
+    return found[began]

@@ -31,7 +31,7 @@ class PeriodicEvaluation:
         """Evaluate where it is time to, and tell metrics; else none.
 
         Args:
-            play: plays an episode in each environment of an arena: (N, 4), as
+            play: plays an episode in each environment of an arena: (n, 4), as
                 ``Collected.episodes``.
         """
         if self._every is None or not crossed(self._every, self._last, steps):

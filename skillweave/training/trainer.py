@@ -164,7 +164,7 @@ class OneAgent:
         return {self.stage.name: state_to(stack.state, "cpu")}
 
     def play(self, arena: Collector, seeds: Seeds) -> Array:
-        """An episode in each environment of an arena, (N, 4); see ``Collected.episodes``."""
+        """An episode in each environment of an arena, (n, 4); see ``episodes_of``."""
         (policy,) = self.policies().values()
         return episodes_of(policy, arena, seeds)
 

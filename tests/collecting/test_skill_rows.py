@@ -374,6 +374,26 @@ def test_an_initiation_that_never_holds_is_an_error(collector, monkeypatch):
         step(env, np.zeros(2, np.int64))
 
 
+def test_an_environment_in_which_an_episode_cannot_begin_is_given_up_when_one_is_played(
+    collector, monkeypatch
+):
+    monkeypatch.setattr(skill_rows, "PATIENCE", 50)
+
+    class Here(Nowhere):
+        """May start in the first environment, and lasts 3 steps."""
+
+        max_steps = 3
+
+    env = collector(skill=Here(), num_envs=2, acting=Acting)
+    env.begun = False
+    env.start(Seeds(0))
+    Here.only, before = env.obs[0, TAG], env.engine.steps_made
+    first, second = env.play(next(requests(1)), Seeds(0), 10_000)
+    assert first[2] == 3
+    assert np.isnan(second).all()
+    assert env.engine.steps_made - before <= 2 * 60
+
+
 def test_an_initiation_that_holds_somewhere_is_searched_for_ever_after_a_resume_too(
     collector, monkeypatch
 ):
