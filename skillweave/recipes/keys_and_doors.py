@@ -224,7 +224,6 @@ def declare(rooms: str = "small", **how: Any) -> Hierarchy:
     settings: dict[str, Any] = {
         "call_steps": None,
         "start_calls": 4,
-        "call_cost": 0.005,
         "greedy_skills": False,
         "algorithm": WORKER,
         "selector": SELECTOR,
