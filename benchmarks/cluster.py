@@ -189,8 +189,8 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
         alone = make(each, 0)
         alone.start(Seeds(0))
         seconds: dict[str, list[float]] = {"collect": [], "there and back": [], "learn": []}
-        with Ray(count).connected(count, print) as make_collectors:
-            away = make_collectors(make, each * count, count, 1, name)
+        with Ray(count).connected(count, print) as where:
+            away = where.collectors(make, each * count, count, 1, name)
             away.start(Seeds(0))
             for update in range(given.updates):
                 request, began = learner.request(update, 0, 0.0), time.process_time()
