@@ -1,6 +1,6 @@
 """Collectors on Ray: how they scale, what they cost, and whether the weights stay the same.
 
-    python -m benchmarks.cluster [scale] [overhead] [equal] [costs] [saturation]
+    python -m benchmarks.cluster [scale] [overhead] [equal] [costs] [saturation] [population]
 
 ``scale``: an environment whose step sleeps 2 ms, so that it waits and does not compute: steps per
 second of 1 to 16 collectors with 4 environments each, against as many times those of one.
@@ -8,7 +8,8 @@ second of 1 to 16 collectors with 4 environments each, against as many times tho
 rounds take turns, the median ratio counts. ``equal``: weights after ``kill -9`` of an actor at
 random moments, and of a whole node (Ray's ``Cluster``), against those of processes. ``costs``:
 microseconds and bytes of a step, here and there. ``saturation``: a simulation of more collectors
-than there are, by these.
+than there are, by these. ``population``: 16 members in three parts on three nodes (Ray's
+``Cluster``), one of which is killed at a random moment, against three processes here.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ import numpy as np
 
 from benchmarks.collecting import EPOCHS, NETWORK, grid, ours
 from benchmarks.common import report, table
-from skillweave import PPO, EnvSpec, Ray, train_agent
+from skillweave import PPO, EnvSpec, Evolution, Network, Ray, train_agent
 from skillweave.collecting.cluster import imported
 from skillweave.types import Array
 
@@ -108,16 +110,25 @@ def overhead(given: argparse.Namespace) -> dict[str, Any]:
     return {"ratios": ratios, "median": statistics.median(ratios)}
 
 
+def below(parent: int, name: str) -> list[int]:
+    """The processes that a process began, and whose command holds ``name``."""
+    asked = ["pgrep", "-P", str(parent), "-f", name]
+    found = subprocess.run(asked, capture_output=True, text=True)
+    return [int(pid) for pid in found.stdout.split()]
+
+
 def actors() -> list[int]:
     """The processes of all actors in nodes that this process began."""
-
-    def below(parent: int, name: str) -> list[int]:
-        asked = ["pgrep", "-P", str(parent), "-f", name]
-        found = subprocess.run(asked, capture_output=True, text=True)
-        return [int(pid) for pid in found.stdout.split()]
-
     raylets = below(os.getpid(), "raylet")
-    return [pid for raylet in raylets for pid in below(raylet, "ray::CollectorActor")]
+    return [pid for raylet in raylets for pid in actors_of(raylet)]
+
+
+def actors_of(raylet: int) -> list[int]:
+    return below(raylet, "ray::CollectorActor")
+
+
+def raylets_of(node: Any) -> list[int]:
+    return [process.pid for kind, process in node.live_processes() if kind == "raylet"]
 
 
 def equal(given: argparse.Namespace) -> dict[str, Any]:
@@ -165,6 +176,54 @@ def equal(given: argparse.Namespace) -> dict[str, Any]:
     nodes.shutdown()
     counts = {kind: f"{sum(same)} of {len(same)}" for kind, same in found.items()}
     return {"equal": counts}
+
+
+def population(given: argparse.Namespace) -> dict[str, Any]:
+    ray = imported()
+    from ray.cluster_utils import Cluster
+
+    rng, parts = random.Random(0), 3
+
+    def evolved(cluster: Ray | None) -> dict[str, Any]:
+        with tempfile.TemporaryDirectory() as folder:
+            spec, path = EnvSpec(Sleeping, engine="sync", workers=parts), Path(folder) / "run"
+            evolve, began = Evolution(population=16, generations=3, episodes=2), time.monotonic()
+            config = replace(small(1, 2, 32), batch_size=64, network=Network((16, 16)))
+            run = train_agent(spec, config, 600, path, quiet=True, evolve=evolve, cluster=cluster)
+            found = (run.path / "policies" / "agent.safetensors").read_bytes()
+            found += (run.path / "lineage.jsonl").read_bytes()
+            seconds = time.monotonic() - began
+            return {"result": hashlib.sha256(found).hexdigest(), "seconds": round(seconds, 1)}
+
+    plain = evolved(None)
+    nodes = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False}
+    )
+    others = [nodes.add_node(num_cpus=1) for _ in range(parts + 1)]  # one more than are needed
+    ray.init(nodes.address, logging_level="ERROR", log_to_driver=False)
+    on_ray, same = evolved(Ray(parts)), list[dict[str, Any]]()
+    print(f"processes {plain}, Ray {on_ray}", flush=True)
+    while len(same) < given.nodes:
+        done: list[float] = []
+
+        def kill(done: list[float] = done) -> None:
+            if busy := [node for node in others if any(map(actors_of, raylets_of(node)))]:
+                nodes.remove_node(rng.choice(busy), allow_graceful=False)
+                done.append(1)
+
+        timer = threading.Timer(rng.uniform(0.1, 0.9) * on_ray["seconds"], kill)
+        timer.start()
+        found = evolved(Ray(parts))
+        timer.cancel()
+        if done:  # else it was over too early
+            others = [node for node in others if node.live_processes()]
+            others.append(nodes.add_node(num_cpus=1))
+            same.append({"equal": found["result"] == plain["result"], "seconds": found["seconds"]})
+            print(same[-1], flush=True)
+    ray.shutdown()
+    nodes.shutdown()
+    undisturbed = on_ray["result"] == plain["result"]
+    return {"processes": plain, "on_ray": on_ray | {"equal": undisturbed}, "node_killed": same}
 
 
 def costs(given: argparse.Namespace) -> dict[str, Any]:
@@ -251,6 +310,7 @@ def saturation(given: argparse.Namespace) -> dict[str, Any]:
 
 PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "scale": scale, "overhead": overhead, "equal": equal, "costs": costs, "saturation": saturation,
+    "population": population,
 }  # fmt: skip
 
 
