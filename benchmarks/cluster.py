@@ -203,23 +203,24 @@ def population(given: argparse.Namespace) -> dict[str, Any]:
     ray.init(nodes.address, logging_level="ERROR", log_to_driver=False)
     on_ray, same = evolved(Ray(parts)), list[dict[str, Any]]()
     print(f"processes {plain}, Ray {on_ray}", flush=True)
+    done: list[str] = []
+
+    def kill() -> None:
+        if busy := [node for node in others if any(map(actors_of, raylets_of(node)))]:
+            others.remove(lost := rng.choice(busy))
+            nodes.remove_node(lost, allow_graceful=False)
+            done.append("killed")
+
     while len(same) < given.nodes:
-        done: list[float] = []
-
-        def kill(done: list[float] = done) -> None:
-            if busy := [node for node in others if any(map(actors_of, raylets_of(node)))]:
-                nodes.remove_node(rng.choice(busy), allow_graceful=False)
-                done.append(1)
-
         timer = threading.Timer(rng.uniform(0.1, 0.9) * on_ray["seconds"], kill)
         timer.start()
         found = evolved(Ray(parts))
         timer.cancel()
         if done:  # else it was over too early
-            others = [node for node in others if node.live_processes()]
             others.append(nodes.add_node(num_cpus=1))
             same.append({"equal": found["result"] == plain["result"], "seconds": found["seconds"]})
             print(same[-1], flush=True)
+        done.clear()
     ray.shutdown()
     nodes.shutdown()
     undisturbed = on_ray["result"] == plain["result"]

@@ -39,8 +39,9 @@ class Ray:
     """
 
     collectors: int | None = None
-    """How many; the environments of a stage are shared out equally. None: as many as there would be
-    processes without Ray. A run keeps the number, as results depend on it."""
+    """How many; the environments of a stage are shared out equally, or the members of a population.
+    None: as many as there would be processes without Ray. A run keeps the number, as results depend
+    on it."""
     address: str | None = None
     """``host:port`` of a cluster's head, ``ray://host:port``, or ``auto``: the one that runs on
     this machine. None: what RAY_ADDRESS says, or else a new one of this machine alone."""
