@@ -1,6 +1,7 @@
 """Collectors on Ray: how they scale, what they cost, and whether the weights stay the same.
 
     python -m benchmarks.cluster [scale] [overhead] [equal] [costs] [saturation] [population]
+    python -m benchmarks.cluster sweep [--ray]
 
 ``scale``: an environment whose step sleeps 2 ms, so that it waits and does not compute: steps per
 second of 1 to 16 collectors with 4 environments each, against as many times those of one.
@@ -9,7 +10,9 @@ rounds take turns, the median ratio counts. ``equal``: weights after ``kill -9``
 random moments, and of a whole node (Ray's ``Cluster``), against those of processes. ``costs``:
 microseconds and bytes of a step, here and there. ``saturation``: a simulation of more collectors
 than there are, by these. ``population``: 16 members in three parts on three nodes (Ray's
-``Cluster``), one of which is killed at a random moment, against three processes here.
+``Cluster``), one of which is killed at a random moment, against three processes here. ``sweep``: 20
+seeds, the driver killed (``kill -9``) at two moments, against a sweep that nobody disturbed; with
+``--ray`` its runs are tasks of Ray, else processes.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import random
 import signal
 import statistics
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -184,47 +188,121 @@ def population(given: argparse.Namespace) -> dict[str, Any]:
 
     rng, parts = random.Random(0), 3
 
-    def evolved(cluster: Ray | None) -> dict[str, Any]:
-        with tempfile.TemporaryDirectory() as folder:
-            spec, path = EnvSpec(Sleeping, engine="sync", workers=parts), Path(folder) / "run"
-            evolve, began = Evolution(population=16, generations=3, episodes=2), time.monotonic()
-            config = replace(small(1, 2, 32), batch_size=64, network=Network((16, 16)))
-            run = train_agent(spec, config, 600, path, quiet=True, evolve=evolve, cluster=cluster)
-            found = (run.path / "policies" / "agent.safetensors").read_bytes()
-            found += (run.path / "lineage.jsonl").read_bytes()
-            seconds = time.monotonic() - began
-            return {"result": hashlib.sha256(found).hexdigest(), "seconds": round(seconds, 1)}
+    def evolved(cluster: Ray | None, path: Path) -> dict[str, Any]:
+        spec, began = EnvSpec(Sleeping, engine="sync", workers=parts), time.monotonic()
+        evolve = Evolution(population=16, generations=3, episodes=2)
+        config = replace(small(1, 2, 32), batch_size=64, network=Network((16, 16)))
+        train_agent(spec, config, 600, path, quiet=True, evolve=evolve, cluster=cluster)
+        found = (path / "policies" / "agent.safetensors").read_bytes()
+        found += (path / "lineage.jsonl").read_bytes()
+        seconds = round(time.monotonic() - began, 1)
+        return {"result": hashlib.sha256(found).hexdigest(), "seconds": seconds}
 
-    plain = evolved(None)
-    nodes = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False}
-    )
-    others = [nodes.add_node(num_cpus=1) for _ in range(parts + 1)]  # one more than are needed
-    ray.init(nodes.address, logging_level="ERROR", log_to_driver=False)
-    on_ray, same = evolved(Ray(parts)), list[dict[str, Any]]()
-    print(f"processes {plain}, Ray {on_ray}", flush=True)
-    done: list[str] = []
-
-    def kill() -> None:
+    def kill(path: Path, over: threading.Event, longest: float) -> None:
+        """Kill a node at which a part is, after the first generation."""
+        lineage = path / "lineage.jsonl"
+        while not over.wait(0.05) and not (lineage.exists() and lineage.stat().st_size):
+            pass
+        if over.wait(rng.uniform(0.0, longest)):
+            return
         if busy := [node for node in others if any(map(actors_of, raylets_of(node)))]:
             others.remove(lost := rng.choice(busy))
             nodes.remove_node(lost, allow_graceful=False)
-            done.append("killed")
 
-    while len(same) < given.nodes:
-        timer = threading.Timer(rng.uniform(0.1, 0.9) * on_ray["seconds"], kill)
-        timer.start()
-        found = evolved(Ray(parts))
-        timer.cancel()
-        if done:  # else it was over too early
-            others.append(nodes.add_node(num_cpus=1))
-            same.append({"equal": found["result"] == plain["result"], "seconds": found["seconds"]})
-            print(same[-1], flush=True)
-        done.clear()
-    ray.shutdown()
-    nodes.shutdown()
+    with tempfile.TemporaryDirectory() as folder:
+        plain = evolved(None, Path(folder) / "here")
+        nodes = Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False}
+        )
+        others = [nodes.add_node(num_cpus=1) for _ in range(parts + 1)]  # one more than are needed
+        ray.init(nodes.address, logging_level="ERROR", log_to_driver=False)
+        on_ray = evolved(Ray(parts), Path(folder) / "ray")
+        print(f"processes {plain}, Ray {on_ray}", flush=True)
+        killed = list[dict[str, Any]]()
+        while len(killed) < given.nodes:
+            path, over = Path(tempfile.mkdtemp(dir=folder)) / "run", threading.Event()
+            thread = threading.Thread(target=kill, args=(path, over, plain["seconds"] / 3))
+            thread.start()
+            found = evolved(Ray(parts), path)
+            over.set()
+            thread.join()
+            if len(others) <= parts:  # else it was over too early
+                others.append(nodes.add_node(num_cpus=1))
+                same = found["result"] == plain["result"]
+                killed.append({"equal": same, "seconds": found["seconds"]})
+                print(killed[-1], flush=True)
+        ray.shutdown()
+        nodes.shutdown()
     undisturbed = on_ray["result"] == plain["result"]
-    return {"processes": plain, "on_ray": on_ray | {"equal": undisturbed}, "node_killed": same}
+    return {"processes": plain, "on_ray": on_ray | {"equal": undisturbed}, "node_killed": killed}
+
+
+SWEPT = """
+from skillweave import Network, PPO, Hierarchy, Skill
+
+class Still(Skill):
+    def reward(self, step):
+        return -abs(step.next_obs[:, 1])
+
+small = PPO(num_envs=2, n_steps=32, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
+hierarchy = Hierarchy(
+    "CartPole-v1", [Still()], algorithm=small, selector=small, skill_steps=640,
+    selector_steps=640, cut_every=128,
+)
+"""
+
+
+def sweep(given: argparse.Namespace) -> dict[str, Any]:
+    rng, seeds = random.Random(0), 20
+
+    def words(out: Path) -> list[str]:
+        found = [sys.executable, "-m", "skillweave", "sweep", str(recipe), "--seeds", f"0:{seeds}"]
+        found += ["--out", str(out), "--evaluate", "2", "--jobs", "2", "--json", "--quiet"]
+        return [*found, "--ray"] if given.ray else found
+
+    def told(out: Path) -> dict[str, Any]:
+        found = subprocess.run(words(out), stdout=subprocess.PIPE, text=True, check=True).stdout
+        answer: dict[str, Any] = json.loads(found)
+        return answer
+
+    def finished(out: Path) -> dict[str, int]:
+        """By name, the runs of which nothing is left to be done, and when that was."""
+        saved = {p.parent.name: p.stat().st_mtime_ns for p in out.glob("s*/evaluation.json")}
+        return {k: v for k, v in saved.items() if not (out / k / "checkpoint.safetensors").exists()}
+
+    def result(out: Path, seed: int) -> str:
+        """A checksum of weights and metrics, times left out."""
+        path = out / f"s{seed}"
+        lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        kept = json.dumps([line | {"seconds": 0} for line in lines]).encode()
+        weights = [p.read_bytes() for p in sorted((path / "policies").glob("*.safetensors"))]
+        return hashlib.sha256(b"".join([kept, *weights])).hexdigest()
+
+    with tempfile.TemporaryDirectory() as folder:
+        recipe, out, whole = (Path(folder) / name for name in ("swept.py", "killed", "whole"))
+        recipe.write_text(SWEPT)
+        undisturbed = told(whole)
+        before, kills, again = dict[str, int](), list[int](), 0
+        for least in (rng.randrange(3, 9), rng.randrange(10, 17)):
+            driver = subprocess.Popen(words(out), stdout=subprocess.DEVNULL)
+            while driver.poll() is None and len(finished(out)) < least:
+                time.sleep(0.05)
+            time.sleep(rng.uniform(0.0, 2.0))
+            driver.kill()
+            driver.wait()
+            kills.append(len(finished(out)))
+            again += sum(finished(out).get(name) != when for name, when in before.items())
+            before = finished(out)
+            print(f"killed when {kills[-1]} runs were finished", flush=True)
+        answer = told(out)
+        again += sum(finished(out).get(name) != when for name, when in before.items())
+        same = sum(result(out, seed) == result(whole, seed) for seed in range(seeds))
+        values = [[run["return"] for run in found["runs"]] for found in (answer, undisturbed)]
+    return {
+        "finished_when_killed": kills, "trained_again": again, "equal": same,
+        "runs_in_table": len(answer["runs"]), "failed": len(answer["failed"]),
+        "same_table": values[0] == values[1],
+    }  # fmt: skip
 
 
 def costs(given: argparse.Namespace) -> dict[str, Any]:
@@ -311,7 +389,7 @@ def saturation(given: argparse.Namespace) -> dict[str, Any]:
 
 PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "scale": scale, "overhead": overhead, "equal": equal, "costs": costs, "saturation": saturation,
-    "population": population,
+    "population": population, "sweep": sweep,
 }  # fmt: skip
 
 
@@ -323,6 +401,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=20)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--nodes", type=int, default=5)
+    parser.add_argument("--ray", action="store_true", help="of sweep: runs are tasks of Ray")
     given = parser.parse_args()
     # Ray's processes would else be behind all others on a busy machine, and those here are not.
     os.environ.setdefault("RAY_worker_niceness", "0")
