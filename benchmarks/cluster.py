@@ -1,6 +1,7 @@
 """Collectors on Ray: how they scale, what they cost, and whether the weights stay the same.
 
-    python -m benchmarks.cluster [scale] [overhead] [equal] [costs] [saturation]
+    python -m benchmarks.cluster [scale] [overhead] [equal] [costs] [saturation] [population]
+    python -m benchmarks.cluster sweep [--ray]
 
 ``scale``: an environment whose step sleeps 2 ms, so that it waits and does not compute: steps per
 second of 1 to 16 collectors with 4 environments each, against as many times those of one.
@@ -8,7 +9,10 @@ second of 1 to 16 collectors with 4 environments each, against as many times tho
 rounds take turns, the median ratio counts. ``equal``: weights after ``kill -9`` of an actor at
 random moments, and of a whole node (Ray's ``Cluster``), against those of processes. ``costs``:
 microseconds and bytes of a step, here and there. ``saturation``: a simulation of more collectors
-than there are, by these.
+than there are, by these. ``population``: 16 members in three parts on three nodes (Ray's
+``Cluster``), one of which is killed at a random moment, against three processes here. ``sweep``: 20
+seeds, the driver killed (``kill -9``) at two moments, against a sweep that nobody disturbed; with
+``--ray`` its runs are tasks of Ray, else processes.
 """
 
 from __future__ import annotations
@@ -21,10 +25,12 @@ import random
 import signal
 import statistics
 import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +39,7 @@ import numpy as np
 
 from benchmarks.collecting import EPOCHS, NETWORK, grid, ours
 from benchmarks.common import report, table
-from skillweave import PPO, EnvSpec, Ray, train_agent
+from skillweave import PPO, EnvSpec, Evolution, Network, Ray, train_agent
 from skillweave.collecting.cluster import imported
 from skillweave.types import Array
 
@@ -108,16 +114,25 @@ def overhead(given: argparse.Namespace) -> dict[str, Any]:
     return {"ratios": ratios, "median": statistics.median(ratios)}
 
 
+def below(parent: int, name: str) -> list[int]:
+    """The processes that a process began, and whose command holds ``name``."""
+    asked = ["pgrep", "-P", str(parent), "-f", name]
+    found = subprocess.run(asked, capture_output=True, text=True)
+    return [int(pid) for pid in found.stdout.split()]
+
+
 def actors() -> list[int]:
     """The processes of all actors in nodes that this process began."""
-
-    def below(parent: int, name: str) -> list[int]:
-        asked = ["pgrep", "-P", str(parent), "-f", name]
-        found = subprocess.run(asked, capture_output=True, text=True)
-        return [int(pid) for pid in found.stdout.split()]
-
     raylets = below(os.getpid(), "raylet")
-    return [pid for raylet in raylets for pid in below(raylet, "ray::CollectorActor")]
+    return [pid for raylet in raylets for pid in actors_of(raylet)]
+
+
+def actors_of(raylet: int) -> list[int]:
+    return below(raylet, "ray::CollectorActor")
+
+
+def raylets_of(node: Any) -> list[int]:
+    return [process.pid for kind, process in node.live_processes() if kind == "raylet"]
 
 
 def equal(given: argparse.Namespace) -> dict[str, Any]:
@@ -167,6 +182,129 @@ def equal(given: argparse.Namespace) -> dict[str, Any]:
     return {"equal": counts}
 
 
+def population(given: argparse.Namespace) -> dict[str, Any]:
+    ray = imported()
+    from ray.cluster_utils import Cluster
+
+    rng, parts = random.Random(0), 3
+
+    def evolved(cluster: Ray | None, path: Path) -> dict[str, Any]:
+        spec, began = EnvSpec(Sleeping, engine="sync", workers=parts), time.monotonic()
+        evolve = Evolution(population=16, generations=3, episodes=2)
+        config = replace(small(1, 2, 32), batch_size=64, network=Network((16, 16)))
+        train_agent(spec, config, 600, path, quiet=True, evolve=evolve, cluster=cluster)
+        found = (path / "policies" / "agent.safetensors").read_bytes()
+        found += (path / "lineage.jsonl").read_bytes()
+        seconds = round(time.monotonic() - began, 1)
+        return {"result": hashlib.sha256(found).hexdigest(), "seconds": seconds}
+
+    def kill(path: Path, over: threading.Event, longest: float) -> None:
+        """Kill a node at which a part is, after the first generation."""
+        lineage = path / "lineage.jsonl"
+        while not over.wait(0.05) and not (lineage.exists() and lineage.stat().st_size):
+            pass
+        if over.wait(rng.uniform(0.0, longest)):
+            return
+        if busy := [node for node in others if any(map(actors_of, raylets_of(node)))]:
+            others.remove(lost := rng.choice(busy))
+            nodes.remove_node(lost, allow_graceful=False)
+
+    with tempfile.TemporaryDirectory() as folder:
+        plain = evolved(None, Path(folder) / "here")
+        nodes = Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False}
+        )
+        others = [nodes.add_node(num_cpus=1) for _ in range(parts + 1)]  # one more than are needed
+        ray.init(nodes.address, logging_level="ERROR", log_to_driver=False)
+        on_ray = evolved(Ray(parts), Path(folder) / "ray")
+        print(f"processes {plain}, Ray {on_ray}", flush=True)
+        killed = list[dict[str, Any]]()
+        while len(killed) < given.nodes:
+            path, over = Path(tempfile.mkdtemp(dir=folder)) / "run", threading.Event()
+            thread = threading.Thread(target=kill, args=(path, over, plain["seconds"] / 3))
+            thread.start()
+            found = evolved(Ray(parts), path)
+            over.set()
+            thread.join()
+            if len(others) <= parts:  # else it was over too early
+                others.append(nodes.add_node(num_cpus=1))
+                same = found["result"] == plain["result"]
+                killed.append({"equal": same, "seconds": found["seconds"]})
+                print(killed[-1], flush=True)
+        ray.shutdown()
+        nodes.shutdown()
+    undisturbed = on_ray["result"] == plain["result"]
+    return {"processes": plain, "on_ray": on_ray | {"equal": undisturbed}, "node_killed": killed}
+
+
+SWEPT = """
+from skillweave import Network, PPO, Hierarchy, Skill
+
+class Still(Skill):
+    def reward(self, step):
+        return -abs(step.next_obs[:, 1])
+
+small = PPO(num_envs=2, n_steps=32, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
+hierarchy = Hierarchy(
+    "CartPole-v1", [Still()], algorithm=small, selector=small, skill_steps=640,
+    selector_steps=640, cut_every=128,
+)
+"""
+
+
+def sweep(given: argparse.Namespace) -> dict[str, Any]:
+    rng, seeds = random.Random(0), 20
+
+    def words(out: Path) -> list[str]:
+        found = [sys.executable, "-m", "skillweave", "sweep", str(recipe), "--seeds", f"0:{seeds}"]
+        found += ["--out", str(out), "--evaluate", "2", "--jobs", "2", "--json", "--quiet"]
+        return [*found, "--ray"] if given.ray else found
+
+    def told(out: Path) -> dict[str, Any]:
+        found = subprocess.run(words(out), stdout=subprocess.PIPE, text=True, check=True).stdout
+        answer: dict[str, Any] = json.loads(found)
+        return answer
+
+    def finished(out: Path) -> dict[str, int]:
+        """By name, the runs of which nothing is left to be done, and when that was."""
+        saved = {p.parent.name: p.stat().st_mtime_ns for p in out.glob("s*/evaluation.json")}
+        return {k: v for k, v in saved.items() if not (out / k / "checkpoint.safetensors").exists()}
+
+    def result(out: Path, seed: int) -> str:
+        """A checksum of weights and metrics, times left out."""
+        path = out / f"s{seed}"
+        lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        kept = json.dumps([line | {"seconds": 0} for line in lines]).encode()
+        weights = [p.read_bytes() for p in sorted((path / "policies").glob("*.safetensors"))]
+        return hashlib.sha256(b"".join([kept, *weights])).hexdigest()
+
+    with tempfile.TemporaryDirectory() as folder:
+        recipe, out, whole = (Path(folder) / name for name in ("swept.py", "killed", "whole"))
+        recipe.write_text(SWEPT)
+        undisturbed = told(whole)
+        before, kills, again = dict[str, int](), list[int](), 0
+        for least in (rng.randrange(3, 9), rng.randrange(10, 17)):
+            driver = subprocess.Popen(words(out), stdout=subprocess.DEVNULL)
+            while driver.poll() is None and len(finished(out)) < least:
+                time.sleep(0.05)
+            time.sleep(rng.uniform(0.0, 2.0))
+            driver.kill()
+            driver.wait()
+            kills.append(len(finished(out)))
+            again += sum(finished(out).get(name) != when for name, when in before.items())
+            before = finished(out)
+            print(f"killed when {kills[-1]} runs were finished", flush=True)
+        answer = told(out)
+        again += sum(finished(out).get(name) != when for name, when in before.items())
+        same = sum(result(out, seed) == result(whole, seed) for seed in range(seeds))
+        values = [[run["return"] for run in found["runs"]] for found in (answer, undisturbed)]
+    return {
+        "finished_when_killed": kills, "trained_again": again, "equal": same,
+        "runs_in_table": len(answer["runs"]), "failed": len(answer["failed"]),
+        "same_table": values[0] == values[1],
+    }  # fmt: skip
+
+
 def costs(given: argparse.Namespace) -> dict[str, Any]:
     """Of a step, in microseconds of one processor: collecting, coming back, learning; its bytes."""
     from skillweave.algorithms.policy import make_algorithm
@@ -189,8 +327,8 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
         alone = make(each, 0)
         alone.start(Seeds(0))
         seconds: dict[str, list[float]] = {"collect": [], "there and back": [], "learn": []}
-        with Ray(count).connected(count, print) as make_collectors:
-            away = make_collectors(make, each * count, count, 1, name)
+        with Ray(count).connected(count, print) as where:
+            away = where.collectors(make, each * count, count, 1, name)
             away.start(Seeds(0))
             for update in range(given.updates):
                 request, began = learner.request(update, 0, 0.0), time.process_time()
@@ -251,6 +389,7 @@ def saturation(given: argparse.Namespace) -> dict[str, Any]:
 
 PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "scale": scale, "overhead": overhead, "equal": equal, "costs": costs, "saturation": saturation,
+    "population": population, "sweep": sweep,
 }  # fmt: skip
 
 
@@ -262,6 +401,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=20)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--nodes", type=int, default=5)
+    parser.add_argument("--ray", action="store_true", help="of sweep: runs are tasks of Ray")
     given = parser.parse_args()
     # Ray's processes would else be behind all others on a busy machine, and those here are not.
     os.environ.setdefault("RAY_worker_niceness", "0")

@@ -45,7 +45,7 @@ def speed(members: int, config: PPO, steps: int, seed: int) -> float:
     population = Population.fresh(config, Evolution(), skill_scene(LANDER), Seeds(seed))
     population.members = population.members[:members]
     started = time.perf_counter()
-    population.train(steps // members, steps // members, Seeds(seed), lambda steps, tick: None)
+    population.train(steps // members, steps // members, Seeds(seed), lambda steps, metrics: None)
     return population.steps / (time.perf_counter() - started)
 
 

@@ -107,13 +107,14 @@ def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
 
 def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch):
     declare(workers=2).train(tmp_path / "processes", seed=3, quiet=True)
-    from skillweave.collecting import group
+    from skillweave.collecting import group, where
 
     def here(make, num_envs, workers, members, name):
         each = num_envs // workers
         return group.Collectors([make(each, i * each) for i in range(workers)], members)
 
-    monkeypatch.setattr("skillweave.training.trainer.make_collectors", here)
+    places = where.Where(here, where.HERE.workers)
+    monkeypatch.setattr("skillweave.api.running.HERE", places)
     declare(workers=2).train(tmp_path / "here", seed=3, quiet=True)
     assert_same(tmp_path / "processes", tmp_path / "here")
 

@@ -201,6 +201,11 @@ def add_registration(found: Registration) -> None:
     _REGISTERED[found.config.__name__] = found
 
 
+def own_registrations() -> list[Registration]:
+    """The algorithms that are not of this library."""
+    return [found for name, found in _REGISTERED.items() if name not in BUILT_IN]
+
+
 def registration_of(config: Any) -> Registration:
     """The algorithm that settings belong to.
 

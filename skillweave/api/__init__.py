@@ -140,7 +140,8 @@ class Hierarchy(Declaration):
             track: any of "tensorboard", "wandb" and "mlflow".
             evolve: a population for every stage, or for some by name (a skill's, "selector",
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
-            cluster: run collectors on ``Ray``; None: here, in processes where it pays.
+            cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
+                where it pays.
 
         Returns:
             The finished run.
@@ -244,7 +245,8 @@ def train_agent(
         quiet: no progress.
         track: any of "tensorboard", "wandb" and "mlflow".
         evolve: an ``Evolution``: a population in place of one agent.
-        cluster: run collectors on ``Ray``; None: here, in processes where it pays.
+        cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
+            where it pays.
 
     Returns:
         The finished run.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from skillweave.api.run import Run
 from skillweave.collecting.cluster import Ray
-from skillweave.collecting.group import MakeCollectors, make_collectors
+from skillweave.collecting.where import HERE, Where
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -20,7 +20,7 @@ from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import identity
 from skillweave.runs.trackers import make_trackers
-from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages
+from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
@@ -131,24 +131,30 @@ def declared_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | A
     return declared
 
 
-def _where(
-    cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack
-) -> MakeCollectors:
-    """Where collectors of a run are made; a cluster is left when ``stack`` is closed.
+def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack) -> Where:
+    """Where collectors of a run, and parts of its populations, run.
+
+    A cluster is left when ``stack`` is closed.
 
     Raises:
         SkillweaveError: the run was begun with another number of collectors.
     """
     _check(cluster)
     if cluster is None or run.finished:
-        return make_collectors
+        return HERE
     left = [s for s in run.manifest["stages"] if s["status"] != "done"]
-    counts = [s.get("workers", 1) for s in left if s.get("evolution") is None]
+    counts = [s.get("workers", 1) for s in left]
     asked = cluster.collectors
-    if asked is not None and any(count != asked for count in counts):
+    if asked is not None and any(s.get("workers", 1) != workers_of(s, asked) for s in left):
         raise SkillweaveError(
             f"{run.path} was begun with {', '.join(map(str, sorted(set(counts))))} collectors, and "
             f"goes on with as many, as results depend on it; leave out collectors={asked}"
+        )
+    alone = [s["name"] for s in left if s.get("evolution") and s.get("workers", 1) == 1]
+    if alone:
+        progress.message(
+            f"{', '.join(alone)}: the population trains in this process, as nobody said into how "
+            "many parts it is to be split: Ray(collectors=4), --collectors 4"
         )
     return stack.enter_context(cluster.connected(max(counts, default=1), progress.message))
 

@@ -60,8 +60,8 @@ class Train(OnRay):
     render: bool = False
     """Write a captioned GIF into the run as well."""
     collectors: int | None = None
-    """Processes, or with --ray actors, that step environments; default: measured. Results depend
-    on their number, not on where they are."""
+    """Processes, or with --ray actors, that step environments, or train the parts of a population;
+    default: measured. Results depend on their number, not on where they are."""
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,9 @@ from ray.util.placement_group import (
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from skillweave.collecting.collector import Collected
-from skillweave.collecting.group import MakeCollector
 from skillweave.collecting.shipping import packed
 from skillweave.collecting.stationed import actor_class
-from skillweave.collecting.workers import WorkerCollectors, WorkerLost
+from skillweave.collecting.workers import MakeStanding, WorkerCollectors, WorkerLost, Workers
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
 
@@ -120,7 +119,23 @@ class Actors:
         self._waited, self._told = 0.0, False
 
 
-class RayCollectors(WorkerCollectors):
+class RayWorkers(Workers):
+    """Workers, each in an actor."""
+
+    tries = 5  # one may be made again on a node of which Ray does not know yet that it is lost
+    _workers: list[ActorWorker]  # type: ignore[assignment]
+
+    def close(self) -> None:
+        """Let the actors close their environments; end those that do not."""
+        self._workers[0].let_close()
+
+
+def ray_workers(actors: Actors, make: MakeStanding, count: int, name: str) -> Workers:
+    """``count`` workers in actors; ``make`` is given 1 and the worker's number."""
+    return RayWorkers(_workers(actors, make, 1, count, name), name)
+
+
+class RayCollectors(RayWorkers, WorkerCollectors):
     """W collectors, each in an actor.
 
     Args:
@@ -135,19 +150,10 @@ class RayCollectors(WorkerCollectors):
         SkillweaveError: a node has another version of Skillweave or Python, or there is no room.
     """
 
-    tries = 5  # one may be made again on a node of which Ray does not know yet that it is lost
-
     def __init__(
-        self, actors: Actors, make: MakeCollector, each: int, count: int, members: int, name: str
+        self, actors: Actors, make: MakeStanding, each: int, count: int, members: int, name: str
     ) -> None:
-        code = _put(packed(make, f"what collectors of {name} are made of"))
-        self._actors = actors
-        workers = [ActorWorker(actors, code, each, i) for i in range(count)]
-        super().__init__(workers, each, members, name)
-
-    def close(self) -> None:
-        """Let the actors close their environments; end those that do not."""
-        self._actors.let_close()
+        super().__init__(_workers(actors, make, each, count, name), each, members, name)
 
     def _shared(self, task: Any) -> Sequence[Any]:
         return [_put(task)] * len(self._workers)
@@ -205,10 +211,21 @@ class ActorWorker:
             raise SkillweaveError(error)
         return answer
 
+    def let_close(self) -> None:
+        """Let all actors close their environments."""
+        self._actors.let_close()
+
     def release(self) -> None:
         """End the actor."""
         self._due.clear()
         self._actors.end(self._number)
+
+
+def _workers(
+    actors: Actors, make: MakeStanding, each: int, count: int, name: str
+) -> list[ActorWorker]:
+    code = _put(packed(make, f"what collectors of {name} are made of"))
+    return [ActorWorker(actors, code, each, i) for i in range(count)]
 
 
 def _put(thing: Any) -> Any:

@@ -10,7 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from skillweave.collecting.group import Collectors, MakeCollector, MakeCollectors, share_of
+from skillweave.collecting.group import Collectors, MakeCollector, share_of
+from skillweave.collecting.where import Where
+from skillweave.collecting.workers import MakeStanding, Workers
 from skillweave.envs.make import cores
 from skillweave.messages import short, told, whole_number
 from skillweave.types import MissingExtra, SkillweaveError
@@ -37,8 +39,9 @@ class Ray:
     """
 
     collectors: int | None = None
-    """How many; the environments of a stage are shared out equally. None: as many as there would be
-    processes without Ray. A run keeps the number, as results depend on it."""
+    """How many; the environments of a stage are shared out equally, or the members of a population.
+    None: as many as there would be processes without Ray. A run keeps the number, as results depend
+    on it."""
     address: str | None = None
     """``host:port`` of a cluster's head, ``ray://host:port``, or ``auto``: the one that runs on
     this machine. None: what RAY_ADDRESS says, or else a new one of this machine alone."""
@@ -92,18 +95,18 @@ class Ray:
                 ray.shutdown()
 
     @contextmanager
-    def connected(self, most: int, tell: Callable[[str], None]) -> Iterator[MakeCollectors]:
-        """Be connected to the cluster; what makes collectors on it.
+    def connected(self, most: int, tell: Callable[[str], None]) -> Iterator[Where]:
+        """Be connected to the cluster; what makes collectors and other workers on it.
 
         Args:
-            most: collectors that will run at once.
+            most: workers that will run at once.
             tell: is told what people should know.
 
         Raises:
             SkillweaveError: as of ``joined``.
         """
         with self.joined(most):
-            from skillweave.collecting.actors import Actors, RayCollectors
+            from skillweave.collecting.actors import Actors, RayCollectors, ray_workers
 
             actors = Actors(most, self.cpus, self.patience, tell)
 
@@ -113,8 +116,11 @@ class Ray:
                 each = share_of(num_envs, workers, members, name)
                 return RayCollectors(actors, make, each, workers, members, name)
 
+            def make_workers(make: MakeStanding, count: int, name: str) -> Workers:
+                return ray_workers(actors, make, count, name)
+
             try:
-                yield make_collectors
+                yield Where(make_collectors, make_workers)
             finally:
                 actors.close()
 

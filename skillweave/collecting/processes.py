@@ -19,9 +19,14 @@ from typing import Any
 
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from skillweave.collecting.group import MakeCollector
 from skillweave.collecting.shared_columns import ColumnWriter, SharedColumns
-from skillweave.collecting.workers import Station, WorkerCollectors, WorkerLost
+from skillweave.collecting.workers import (
+    MakeStanding,
+    Station,
+    WorkerCollectors,
+    WorkerLost,
+    Workers,
+)
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
 
@@ -39,7 +44,7 @@ class ProcessWorker:
         number: of the worker.
     """
 
-    def __init__(self, make: MakeCollector, each: int, number: int) -> None:
+    def __init__(self, make: MakeStanding, each: int, number: int) -> None:
         self._make, self._each, self._number = make, each, number
         self._context = mp.get_context()
         self.process: Any = None
@@ -125,7 +130,22 @@ def close_all(workers: Sequence[ProcessWorker]) -> None:
         worker.forget()
 
 
-class ProcessCollectors(WorkerCollectors):
+class ProcessWorkers(Workers):
+    """Workers, each in a process."""
+
+    _workers: list[ProcessWorker]  # type: ignore[assignment]
+
+    def close(self) -> None:
+        """Let the workers close their environments; end those that do not."""
+        close_all(self._workers)
+
+
+def process_workers(make: MakeStanding, count: int, name: str) -> Workers:
+    """``count`` workers in processes; ``make`` is given 1 and the worker's number."""
+    return ProcessWorkers([ProcessWorker(make, 1, i) for i in range(count)], name)
+
+
+class ProcessCollectors(ProcessWorkers, WorkerCollectors):
     """W collectors, each in a process.
 
     Args:
@@ -136,16 +156,10 @@ class ProcessCollectors(WorkerCollectors):
         name: what messages call the environment.
     """
 
-    _workers: list[ProcessWorker]  # type: ignore[assignment]
-
-    def __init__(self, make: MakeCollector, each: int, count: int, members: int, name: str) -> None:
+    def __init__(self, make: MakeStanding, each: int, count: int, members: int, name: str) -> None:
         resource_tracker.ensure_running()  # one for all, so that memory is released once
         workers = [ProcessWorker(make, each, i) for i in range(count)]
         super().__init__(workers, each, members, name)
-
-    def close(self) -> None:
-        """Let the workers close their environments; end those that do not."""
-        close_all(self._workers)
 
 
 def _tasks(pipe: Connection, parent: int) -> Iterator[tuple[str, Any]]:

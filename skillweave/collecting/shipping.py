@@ -14,12 +14,13 @@ from typing import Any
 import cloudpickle
 import gymnasium as gym
 
+from skillweave.algorithms.config import add_registration, own_registrations
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
 
 
 def packed(thing: Any, who: str) -> bytes:
-    """Anything with the code that it needs: recipes, scripts, and environments they registered.
+    """Anything with the code that it needs: recipes, scripts, and what they registered.
 
     What is installed is only named, so it must be installed where this is unpacked.
 
@@ -31,7 +32,7 @@ def packed(thing: Any, who: str) -> bytes:
     """
     with _own_code():
         try:
-            found: bytes = cloudpickle.dumps((_registered(), thing))
+            found: bytes = cloudpickle.dumps((_registered(), own_registrations(), thing))
         except Exception as error:
             raise SkillweaveError(
                 f"{who} cannot be sent to another process: {told(error)}. Make what cannot be sent "
@@ -42,9 +43,11 @@ def packed(thing: Any, who: str) -> bytes:
 
 def unpacked(data: bytes) -> Any:
     """The inverse of ``packed``."""
-    registered, thing = pickle.loads(data)
+    registered, algorithms, thing = pickle.loads(data)
     for spec in registered:
         gym.registry.setdefault(spec.id, spec)
+    for algorithm in algorithms:
+        add_registration(algorithm)
     return thing
 
 

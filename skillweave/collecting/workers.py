@@ -7,18 +7,22 @@ finds the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected
-from skillweave.collecting.group import Collectors, MakeCollector, joined_states, split_states
+from skillweave.collecting.group import Collectors, joined_states, split_states
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError
 
 SNAPSHOT_EVERY = 16
 """Requests after which workers say where they stand, so that less need be done again."""
+
+
+MakeStanding = Callable[[int, int], Any]
+"""Makes what stands at a worker and does its tasks, as ``MakeCollector`` makes a collector."""
 
 
 class WorkerLost(Exception):
@@ -55,53 +59,44 @@ class Worker(Protocol):
 
 
 class Station:
-    """What stands where a worker runs: a collector that answers tasks.
+    """What stands where a worker runs: a collector, or another, that answers tasks.
 
     Args:
-        each: its environments.
+        each: its environments, if it is a collector.
         number: of the worker.
     """
 
-    def __init__(self, make: MakeCollector, each: int, number: int) -> None:
+    def __init__(self, make: MakeStanding, each: int, number: int) -> None:
         self.number, self.collector = number, make(each, number * each)
 
     def answer(self, what: str, task: Any) -> Any:
-        """Do what a method of ``Collectors`` asks for; all workers get the same task.
-
-        A state is of one worker alone.
-        """
+        """Do what a method of the collector does; a request is for all workers."""
         if what == "state":
             return self.collector.state()
         if what == "collect":
             task = task.of_collector(self.number)
-        elif what in ("start", "cut"):
-            task = task / self.number
         return getattr(self.collector, what)(task)
 
 
-class WorkerCollectors(Collectors):
-    """Collectors elsewhere, each with as many environments.
+class Workers:
+    """Workers that are asked side by side; those that are lost are made again.
 
     Args:
         workers: W of them.
-        each: environments of a worker.
-        members: P.
         name: what messages call the environment.
 
     Raises:
-        SkillweaveError: an environment failed, or a worker was lost again and again at the same
-            place; the message names it.
+        SkillweaveError: a task failed, or a worker was lost again and again at the same place; the
+            message names it.
     """
 
     tries = 1
     """How often lost workers are made again before a request fails."""
 
-    def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
-        self.members, self.num_envs, self.steps_made = members, each * len(workers), 0
-        self.parts = []
-        self._workers, self._each, self._name = list(workers), each, name
+    def __init__(self, workers: Sequence[Worker], name: str) -> None:
+        self._workers, self._name = list(workers), name
         self._past: list[tuple[str, Sequence[Any]]] = []
-        """What brings workers to where they stand: a start or states, then requests."""
+        """What brings workers to where they stand: a start or states, then tasks."""
         try:
             for worker in self._workers:
                 worker.begin()
@@ -110,49 +105,8 @@ class WorkerCollectors(Collectors):
             self.close()
             raise
 
-    def start(self, seeds: Seeds) -> None:
-        """Start every environment anew, unless they are under way."""
-        if not self._past:
-            self._ask("start", self._shared(seeds))
-
-    def collect(self, request: Request) -> Collected:
-        """``request.rows`` steps of each environment."""
-        found = self._joined(self._ask("collect", self._shared(request)))
-        if len(self._past) > SNAPSHOT_EVERY:
-            self._states()
-        return found
-
-    def cut(self, seeds: Seeds) -> Array:
-        """Make ready for ``state``; (k,) environments that begin anew."""
-        return self._columns(self._ask("cut", self._shared(seeds)))
-
-    def state(self) -> dict[str, Array]:
-        """All that ``restore`` needs, right after ``cut``."""
-        return joined_states(self._states())
-
-    def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says; (k,) environments that begin anew."""
-        states = split_states(state, len(self._workers))
-        self._past = []
-        return self._columns(self._ask("restore", states))
-
-    def close(self) -> None:
-        """End the workers."""
-        for worker in self._workers:
-            worker.release()
-
-    def _shared(self, task: Any) -> Sequence[Any]:
-        """A task for each worker, where all get the same."""
-        return [task] * len(self._workers)
-
-    def _states(self) -> list[dict[str, Array]]:
-        """Where each worker stands; lost ones need go back no further from now on."""
-        states: list[dict[str, Array]] = self._ask("state", self._shared(None), kept=False)
-        self._past = [("restore", states)]
-        return states
-
-    def _ask(self, what: str, tasks: Sequence[Any], kept: bool = True) -> list[Any]:
-        """What workers answer to their tasks; those that are lost are made again.
+    def ask(self, what: str, tasks: Sequence[Any], kept: bool = True) -> list[Any]:
+        """What workers answer, each to a task of its own; those that are lost are made again.
 
         Args:
             kept: the tasks change where workers stand.
@@ -161,6 +115,22 @@ class WorkerCollectors(Collectors):
         if kept:
             self._past = path
         return self._completed(self._asked(range(len(self._workers)), what, tasks), path)
+
+    def states(self) -> list[dict[str, Array]]:
+        """Where each worker stands; lost ones need go back no further from now on."""
+        states: list[dict[str, Array]] = self.ask("state", [None] * len(self._workers), kept=False)
+        self._past = [("restore", states)]
+        return states
+
+    def stand(self, states: Sequence[dict[str, Array]]) -> list[Array]:
+        """Stand where ``states`` say; of each, environments that begin anew."""
+        self._past = []
+        return self.ask("restore", states)
+
+    def close(self) -> None:
+        """End the workers."""
+        for worker in self._workers:
+            worker.release()
 
     def _completed(
         self, found: dict[int, Any], path: Sequence[tuple[str, Sequence[Any]]]
@@ -208,8 +178,63 @@ class WorkerCollectors(Collectors):
         return found
 
     def _failed(self, number: int, lost: WorkerLost) -> SkillweaveError:
-        first = number * self._each
         return SkillweaveError(
-            f"{self._name}: worker {number} (environments {first} to {first + self._each - 1}) "
-            f"{lost}, and again when it was made anew"
+            f"{self._name}: worker {number}{self._whose(number)} {lost}, and again when it was "
+            "made anew"
         )
+
+    def _whose(self, number: int) -> str:
+        """What a worker has, for messages."""
+        return ""
+
+
+class WorkerCollectors(Workers, Collectors):
+    """Collectors elsewhere, each with as many environments.
+
+    Args:
+        workers: W of them.
+        each: environments of a worker.
+        members: P.
+        name: what messages call the environment.
+    """
+
+    def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
+        self.members, self.num_envs, self.steps_made = members, each * len(workers), 0
+        self.parts, self._each = [], each
+        super().__init__(workers, name)
+
+    def start(self, seeds: Seeds) -> None:
+        """Start every environment anew, unless they are under way."""
+        if not self._past:
+            self.ask("start", self._divided(seeds))
+
+    def collect(self, request: Request) -> Collected:
+        """``request.rows`` steps of each environment."""
+        found = self._joined(self.ask("collect", self._shared(request)))
+        if len(self._past) > SNAPSHOT_EVERY:
+            self.states()
+        return found
+
+    def cut(self, seeds: Seeds) -> Array:
+        """Make ready for ``state``; (k,) environments that begin anew."""
+        return self._columns(self.ask("cut", self._divided(seeds)))
+
+    def state(self) -> dict[str, Array]:
+        """All that ``restore`` needs, right after ``cut``."""
+        return joined_states(self.states())
+
+    def restore(self, state: dict[str, Array]) -> Array:
+        """Stand where ``state`` says; (k,) environments that begin anew."""
+        return self._columns(self.stand(split_states(state, len(self._workers))))
+
+    def _shared(self, task: Any) -> Sequence[Any]:
+        """A task for each worker, where all get the same."""
+        return [task] * len(self._workers)
+
+    def _divided(self, seeds: Seeds) -> list[Seeds]:
+        """Seeds of each worker's own."""
+        return [seeds / number for number in range(len(self._workers))]
+
+    def _whose(self, number: int) -> str:
+        first = number * self._each
+        return f" (environments {first} to {first + self._each - 1})"

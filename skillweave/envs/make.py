@@ -52,7 +52,8 @@ class EnvSpec:
             changes (``PoolWrapper``). Evaluations play ``env``, and so does engine sync.
         workers: processes in which sync environments are stepped, and acted in, while they are
             trained in. None: measured when a run begins, one for each core if a step takes long
-            enough to be worth it; the run keeps the choice, as results depend on it.
+            enough to be worth it; the run keeps the choice, as results depend on it. The members of
+            a population are split among them; None: they stay in one.
 
     Raises:
         SkillweaveError: a field is of another kind, or fields do not fit each other; the message

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skillweave.algorithms.config import config_from_json
-from skillweave.collecting.group import MakeCollectors, make_collectors
+from skillweave.collecting.where import HERE, Where
 from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.stage import EvolvingPopulation
@@ -44,13 +44,11 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
         entry["budget"] *= how.population
 
 
-def make_learner(
-    stages: list[dict[str, Any]], evolve: Evolve, make_collectors: MakeCollectors = make_collectors
-) -> MakeLearner:
+def make_learner(stages: list[dict[str, Any]], evolve: Evolve, where: Where = HERE) -> MakeLearner:
     """Who learns in a stage: a population where its entry says so, else one agent.
 
     ``evolve`` holds selections of the user's own, which a run knows by name only.
-    ``make_collectors`` says where collectors run.
+    ``where`` collectors run, and parts of populations.
 
     Raises:
         SkillweaveError: ``evolve`` names a stage that is not among ``stages``.
@@ -59,9 +57,9 @@ def make_learner(
 
     def make(stage: StageRun) -> StageLearner:
         if stage.entry.get("evolution") is None:
-            return agents_of(stage, make_collectors)
+            return agents_of(stage, where.collectors)
         how = asked.get(stage.name)
-        return EvolvingPopulation(stage, None if how is None else how.selection)
+        return EvolvingPopulation(stage, None if how is None else how.selection, where)
 
     return make
 

@@ -17,13 +17,15 @@ from torch import Tensor
 
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
+from skillweave.collecting.where import HERE, Where
 from skillweave.evolution.config import evolution_from_json
 from skillweave.evolution.lineage import lineage_of, settings_of
-from skillweave.evolution.population import Population, score, spaces_of
+from skillweave.evolution.part import score, spaces_of
+from skillweave.evolution.population import Population
+from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
-from skillweave.training.episodes import Tick
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.trainer import StageRun
 from skillweave.types import Array, prefixed, unprefixed
@@ -47,6 +49,7 @@ class EvolvingPopulation:
 
     Args:
         selection: the user's own, which the run knows by name only.
+        where: parts of the population train, if the stage's entry says that there are several.
 
     Raises:
         SkillweaveError: the selection is missing or wrong.
@@ -54,23 +57,24 @@ class EvolvingPopulation:
 
     schema: Any = Generation
 
-    def __init__(self, stage: StageRun, selection: Any = None) -> None:
+    def __init__(self, stage: StageRun, selection: Any = None, where: Where = HERE) -> None:
         self.stage, self.run, self.seeds = stage, stage.run, stage.seeds
-        where = f"{stage.run.path}: stage {stage.name!r}"
-        self.evolution = evolution_from_json(stage.entry["evolution"], where, selection)
+        told = f"{stage.run.path}: stage {stage.name!r}"
+        self.evolution = evolution_from_json(stage.entry["evolution"], told, selection)
         self.config, self.budget, self.target = stage.config, stage.budget, stage.target
         self.best: Best | None = None
         self.done = 0
         """Complete generations."""
         self.fitness_steps = 0
         """Environment steps that the latest measurement of fitness took."""
-        self._open = ExitStack()
+        self._open, self._where = ExitStack(), where
 
     def open(self) -> None:
         """Make the environments where fitness is measured."""
         self.arena = self.stage.scene.collector(self.evolution.episodes, None)
         self._open.callback(self.arena.close)
         self.spaces = spaces_of(self.stage.scene)
+        self.parts = self._parts()
 
     def go_on(self, state: None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says: its members are in ``extra``."""
@@ -79,12 +83,22 @@ class EvolvingPopulation:
             self._restore(log.at, extra)
         else:
             self.population = Population.fresh(
-                self.config, self.evolution, self.stage.scene, self.seeds
+                self.config, self.evolution, self.stage.scene, self.seeds, self.parts
             )
         self._open.callback(self.population.close)
         if extra:
             self._resume_episodes(extra)
         self._started: float = time.perf_counter() - log.at["seconds"]
+
+    def _parts(self) -> Parts | None:
+        """Where members train, if not in this process."""
+        parts, evolution = int(self.stage.entry.get("workers", 1)), self.evolution
+        if parts <= 1:
+            return None
+        return Parts(
+            self._where.workers, self.stage.scene, self.config, self.seeds, evolution.population,
+            parts, evolution.episodes,
+        )  # fmt: skip
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Train generation after generation; the best policy, by the stage's name.
@@ -120,8 +134,7 @@ class EvolvingPopulation:
         """Train, compare, write down, evolve, and save."""
         before = self.log.at["steps"]
 
-        def on_tick(steps: int, tick: Tick) -> None:
-            metrics = tick.metrics
+        def on_tick(steps: int, metrics: dict[str, float]) -> None:
             if self.best is not None:
                 metrics |= {"fitness": self.best.fitness}
             update = self.log.at["update"] + 1
@@ -129,16 +142,21 @@ class EvolvingPopulation:
 
         seeds = self.seeds / "generation" / self.done
         self.population.train(*self._until(before), seeds, on_tick)
-        measured = self.arena.engine.steps_made
+        measured = self._measured
         fitness = self.population.fitness(self.arena, seeds / "fitness")
         self._keep_best(fitness, seeds / "fitness")
-        self.fitness_steps = self.arena.engine.steps_made - measured
+        self.fitness_steps = self._measured - measured
         self.log.at["steps"] += self.fitness_steps
         self._note(fitness)
         self.done += 1
         if not self.over:
             self.population.evolve(fitness, seeds)
         self._save()
+
+    @property
+    def _measured(self) -> int:
+        """Environment steps that measuring fitness has taken in this process's time."""
+        return self.arena.engine.steps_made + self.population.part.steps_elsewhere
 
     def _finish(self) -> AgentPolicy:
         """The policy that the stage ends with."""
@@ -205,12 +223,12 @@ class EvolvingPopulation:
         tensors = prefixed("collector", self.population.cut(self.seeds / "cut" / self.done))
         for i, member in enumerate(self.population.members):
             tensors |= prefixed(str(i), vars(member.state))
-        store = self.population.store
+        store = self.population.part.store
         if store is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
             tensors |= prefixed("store", store.state())
         header: dict[str, Any] = {
             "generation": self.done,
-            "rounds": self.population.rounds,
+            "rounds": self.population.part.rounds,
             "fitness_steps": self.fitness_steps,
             "next_number": self.population.next_number,
             "members": [_member_to_json(m) for m in self.population.members],
@@ -227,7 +245,7 @@ class EvolvingPopulation:
         population, saved = self.population, unprefixed("collector", tensors)
         store = unprefixed("store", tensors)
         ids = resumed(self.log, lambda: population.resume(saved, store))
-        self.log.tell_begun_anew(len(ids), len(population.places) * population.places[0].num_envs)
+        self.log.tell_begun_anew(len(ids), population.part.num_envs)
 
     def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
         """Stand where a checkpoint says."""
@@ -240,8 +258,10 @@ class EvolvingPopulation:
             self._restored(told, unprefixed(str(i), tensors), f"{where}: member {i}")
             for i, told in enumerate(at["members"])
         ]
-        self.population = Population(members, self.evolution, self.stage.scene, self.seeds)
-        self.population.rounds, self.population.next_number = at["rounds"], at["next_number"]
+        scene = self.stage.scene
+        self.population = Population(members, self.evolution, scene, self.seeds, self.parts)
+        self.population.part.rounds = at["rounds"]
+        self.population.next_number = at["next_number"]
 
     def _restored(self, told: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Member:
         """A member of a checkpoint.

@@ -217,18 +217,26 @@ def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> N
 def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
     """Write into each stage's entry how many processes are to step its environments.
 
-    A number that was measured is lowered to one that divides ``num_envs``; a population's
-    environments stay in this process.
+    Of a population it is the number of parts into which its members are split; where nobody said
+    one, they stay in this process. A number that was measured is lowered to one that divides
+    ``num_envs``.
 
     Raises:
-        SkillweaveError: a number that the user gave does not divide ``num_envs``.
+        SkillweaveError: a number that the user gave does not divide ``num_envs``, or a population
+            is to be split whose members learn on a GPU.
     """
     alone = any(entry.get("evolution") is None for entry in entries)
     workers = workers_for(spec) if alone else 1
     for entry in entries:
         num_envs = entry["algorithm"]["num_envs"]
         if entry.get("evolution") is not None:
-            entry["workers"] = 1
+            entry["workers"] = workers_of(entry, spec.workers or 1)
+            if entry["workers"] > 1 and entry["algorithm"].get("device") == "cuda":
+                raise SkillweaveError(
+                    f"stage {entry['name']!r}: device is 'cuda', but the parts of a population "
+                    "learn on processors alone: set device='cpu', or leave out the number of "
+                    "collectors (workers)"
+                )
         elif spec.workers is None:
             fitting = (k for k in range(workers, 0, -1) if num_envs % k == 0)
             entry["workers"] = next(fitting)
@@ -239,6 +247,12 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
             )
         else:
             entry["workers"] = workers
+
+
+def workers_of(entry: Mapping[str, Any], asked: int) -> int:
+    """How many workers a stage has where so many were asked for: a member is in one part."""
+    population = entry.get("evolution")
+    return asked if population is None or asked <= 1 else min(asked, int(population["population"]))
 
 
 def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
@@ -252,6 +266,13 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
     if algorithm.store != "replay":
         return
     members = int((entry.get("evolution") or {"population": 1})["population"])
+    if members > 1 and entry.get("workers", 1) > 1:
+        raise SkillweaveError(
+            f"stage {entry['name']!r}: it evolves, and all members of {type(config).__name__} "
+            f"learn from one replay buffer, so they cannot be split into {entry['workers']} parts. "
+            "Leave out the number of collectors (workers), take PPO, or name other stages: "
+            "evolve={...}"
+        )
     try:  # what is not written takes no memory
         store_of(algorithm, config.num_envs * members, members, shared=members > 1)
     except SkillweaveError as error:

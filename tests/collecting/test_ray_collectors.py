@@ -60,8 +60,8 @@ def on_ray(cluster):
 
     def of(make, count=2, each=3, **how):
         settings = Ray(**{"patience": 60.0} | how)
-        make_collectors = open_.enter_context(settings.connected(count, told.append))
-        made = make_collectors(make, each * count, count, 1, "Walk")
+        where = open_.enter_context(settings.connected(count, told.append))
+        made = where.collectors(make, each * count, count, 1, "Walk")
         open_.callback(made.close)
         return made
 

@@ -1,5 +1,6 @@
 """What is sent to other processes arrives as it was, whatever it is made of."""
 
+import importlib
 import subprocess
 import sys
 import threading
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from skillweave import SkillweaveError, from_onnx, recipes
+from skillweave.algorithms.config import _REGISTERED, config_to_json
 from skillweave.collecting.shipping import packed, unpacked
 
 SPACES = gym.spaces.Box(-1.0, 1.0, (4,), np.float32), gym.spaces.Discrete(2)
@@ -58,6 +60,45 @@ def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_pa
     command = [sys.executable, "-c", code]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["Own", "1.5"]
+
+
+OWN_ALGORITHM = """
+from dataclasses import dataclass
+import gymnasium as gym
+from skillweave import PPO, register_algorithm
+from skillweave.algorithms.ppo import PPOAlgorithm
+
+@dataclass(frozen=True)
+class Mine(PPO):
+    pass
+
+class MineAlgorithm(PPOAlgorithm):
+    action_spaces = (gym.spaces.Discrete,)
+
+register_algorithm(Mine, MineAlgorithm)
+"""
+
+
+def test_an_algorithm_of_the_users_own_is_known_where_it_arrives(tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text(OWN_ALGORITHM)
+    monkeypatch.syspath_prepend(tmp_path)
+    mine = importlib.import_module("mine")
+    file = tmp_path / "packed"
+    file.write_bytes(packed(SPACES, "they"))
+    code = (
+        "from skillweave.algorithms.config import config_from_json\n"
+        "from skillweave.algorithms.registry import make_algorithm\n"
+        "from skillweave.collecting.shipping import unpacked\n"
+        f"spaces = unpacked(open({str(file)!r}, 'rb').read())\n"
+        f"config = config_from_json({config_to_json(mine.Mine())!r})\n"
+        "print(type(make_algorithm(config, *spaces)).__name__)\n"
+    )
+    command = [sys.executable, "-c", code]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, check=True)
+    finally:
+        del _REGISTERED["Mine"], sys.modules["mine"]
+    assert found.stdout.split() == ["MineAlgorithm"]
 
 
 def test_an_onnx_file_arrives_as_the_same_policy(tmp_path):

@@ -33,7 +33,8 @@ from skillweave import (
     train_agent,
 )
 from skillweave.evolution import stage as evolving
-from skillweave.evolution.population import Population, has_diverged
+from skillweave.evolution.part import has_diverged
+from skillweave.evolution.population import Population
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
@@ -292,7 +293,7 @@ def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tm
     population = Population.fresh(config, Evolution(3, 1, 2), scene, Seeds(0))
     sick = population.members[1]
     sick.state.params.fill_(float("nan"))
-    population.train(256, 256, Seeds(1), lambda steps, tick: None)
+    population.train(256, 256, Seeds(1), lambda steps, metrics: None)
     assert [has_diverged(m) for m in population.members] == [False, True, False]
     fitness = population.fitness(scene.collector(2, None), Seeds(2))
     assert np.isfinite(fitness).tolist() == [True, False, True]
@@ -363,8 +364,8 @@ def test_members_go_on_with_the_open_episodes_of_their_places(name):
     ages = []
     for generation in range(4):
         until = population.steps // 3 + 6
-        population.train(until, 1000, Seeds(1) / generation, lambda steps, tick: None)
-        ages.append(population.places[0].kept["age"][0])
+        population.train(until, 1000, Seeds(1) / generation, lambda steps, metrics: None)
+        ages.append(population.part.places[0].kept["age"][0])
         population.evolve(np.arange(3.0), Seeds(2) / generation)
     rows = CONFIGS[name].n_steps if name == "ppo" else 3
     assert ages == [rows * (g + 1) % 10 for g in range(4)]
@@ -377,11 +378,11 @@ def test_the_steps_of_members_are_those_that_their_environments_made(name):
     evolution = Evolution(3, 3, 1, mutations=EVERYTHING)
     population, told = Population.fresh(CONFIGS[name], evolution, scene, Seeds(0)), []
     for generation in range(3):
-        before = [place.engine.steps_made for place in population.places]
+        before = [place.engine.steps_made for place in population.part.places]
         were, until = population.steps, population.steps // 3 + 50
         told.clear()
         population.train(until, 1000, Seeds(1) / generation, lambda n, tick: told.append(n))
-        made = sum(p.engine.steps_made for p in population.places) - sum(before)
+        made = sum(p.engine.steps_made for p in population.part.places) - sum(before)
         assert population.steps - were == made == told[-1]
         assert made >= 3 * 50 - 3 * 32
         population.evolve(np.arange(3.0), Seeds(2) / generation)
@@ -392,12 +393,12 @@ def test_the_steps_of_members_are_those_that_their_environments_made(name):
 def test_what_begins_anew_at_a_cut_ends_its_returns_too(name, monkeypatch):
     config = replace(CONFIGS[name], normalize_rewards=True)
     population = Population.fresh(config, Evolution(2, 2, 1), skill_scene(spec(name)), Seeds(0))
-    population.train(25, 100, Seeds(1), lambda steps, tick: None)
-    before = population._kept["returns"].clone()
+    population.train(25, 100, Seeds(1), lambda steps, metrics: None)
+    before = population.part._kept["returns"].clone()
     assert (before != 0).all()
     monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", -1)
     population.cut(Seeds(2))
-    assert not population._kept["returns"].any()
+    assert not population.part._kept["returns"].any()
     population.close()
 
 

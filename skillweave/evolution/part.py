@@ -1,0 +1,249 @@
+"""Where members of a population act and train between two comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.base import Algorithm, state_to
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.buffers.replay import ReplayStore
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.collector import Collector, joined_from, parted
+from skillweave.collecting.group import Collectors
+from skillweave.envs.joined import JoinedEngines
+from skillweave.evolution.stacks import Member, grouped, join, split
+from skillweave.ops.device import resolve_device
+from skillweave.seeding import Seeds
+from skillweave.spaces import to_tensor
+from skillweave.training.arena import returns_of
+from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.learner import RolloutLearner, Stack
+from skillweave.training.loop import Progress, train
+from skillweave.training.replay_learner import ReplayLearner, store_of
+from skillweave.training.scene import Scene
+from skillweave.types import Array, prefixed, unprefixed
+
+NEVER = 2**62
+"""Steps between cuts: a generation is one piece."""
+OnGenerationTick = Callable[[int, dict[str, float]], None]
+"""Is told the steps of all members in this generation so far, and the metrics of an update."""
+
+
+class Part:
+    """Places of a population, and how members train there: all of them, or some of several parts.
+
+    A function of members, seeds and its state.
+
+    Args:
+        scene: where members learn.
+        config: settings of any member.
+        seeds: the stage's.
+        count: places.
+        first: the number of the first of them, in the population.
+    """
+
+    steps_elsewhere = 0
+    """Environment steps of measuring fitness that were made in other processes."""
+
+    def __init__(
+        self, scene: Scene, config: AlgorithmConfig, seeds: Seeds, count: int, first: int = 0
+    ) -> None:
+        self.spaces, self.row_steps = spaces_of(scene), scene.row_steps
+        self._seeds, self._first, each = seeds, first, config.num_envs
+        self.replays = make_algorithm(config, *self.spaces).store == "replay"
+        self.places = [
+            scene.collector(each, None, (first + i) * each, self.replays) for i in range(count)
+        ]
+        """Where members act: an heir goes on with its place's open episodes."""
+        self.num_envs = count * each
+        self.episodes = Episodes()
+        self.rounds = 0
+        """Of the loop in which all members learn from one store."""
+        self.store: ReplayStore | None = None
+        self._kept: dict[str, Tensor] = {}  # what its learner counts
+        self._made: dict[AlgorithmConfig, Algorithm] = {}
+
+    def train(
+        self,
+        members: Sequence[Member],
+        until: int,
+        schedule_steps: int,
+        seeds: Seeds,
+        on_tick: OnGenerationTick,
+    ) -> None:
+        """Train members, one for each place, until each has ``until`` steps."""
+        for i, place in enumerate(self.places):
+            place.start(self._seeds / "start" / (self._first + i))
+        groups = grouped(members, self.spaces)
+        if self.replays:
+            self._train_side_by_side(groups, until, schedule_steps, seeds, on_tick)
+        else:
+            self._train_one_by_one(groups, until, schedule_steps, seeds, on_tick)
+
+    def _train_one_by_one(
+        self,
+        groups: list[list[Member]],
+        until: int,
+        schedule_steps: int,
+        seeds: Seeds,
+        on_tick: OnGenerationTick,
+    ) -> None:
+        """A stack's rollouts are its own, so stacks learn one after another.
+
+        A recurrent member begins a generation without memory: another network made what there was.
+        """
+        first = spent = 0
+        for i, group in enumerate(groups, self._first):
+            stack = self._stack(group)
+            start, count = sum(m.steps for m in group), len(group)
+            places = self.places[first : first + count]
+            joined = self._together(places, [stack])
+            end = train(
+                RolloutLearner(stack, seeds / i), Collectors([joined], count), self.episodes,
+                seeds / i, until * count, resume_from=Progress(steps=start), cut_every=NEVER,
+                schedule_steps=schedule_steps * count, skip_diverged=True,
+                on_tick=_telling(on_tick, spent - start),
+            )  # fmt: skip
+            parted(joined, places)
+            self._unstack(stack, group)
+            spent, first = spent + end.steps - start, first + count
+            _count(group, end.steps - start)
+
+    def _train_side_by_side(
+        self,
+        groups: list[list[Member]],
+        until: int,
+        schedule_steps: int,
+        seeds: Seeds,
+        on_tick: OnGenerationTick,
+    ) -> None:
+        """All stacks act at once and learn from one store."""
+        members = [m for group in groups for m in group]
+        stacks = [self._stack(group) for group in groups]
+        start, count = sum(m.steps for m in members), len(members)
+        self.store = self.store or self._make_store(members)
+        learner = ReplayLearner(
+            stacks, self.store, seeds, row_steps=self.row_steps, goes_on_at=start
+        )
+        if self._kept:
+            learner.load(self._kept)
+        joined = self._together(self.places, stacks)
+        end = train(
+            learner, Collectors([joined], count), self.episodes, seeds, until * count,
+            resume_from=Progress(self.rounds, start), schedule_steps=schedule_steps * count,
+            skip_diverged=True, cut_every=NEVER, on_tick=_telling(on_tick, -start),
+        )  # fmt: skip
+        parted(joined, self.places)
+        for stack, group in zip(stacks, groups, strict=True):
+            self._unstack(stack, group)
+        self._kept = learner.counts()
+        self.rounds = end.update
+        _count(members, end.steps - start)
+
+    def _stack(self, group: list[Member]) -> Stack:
+        """Members as one stack, on the device that they learn on."""
+        algorithm, state = join(group, self.spaces, self._made)
+        return Stack(algorithm, state_to(state, resolve_device(algorithm.config.device)))
+
+    def _unstack(self, stack: Stack, group: list[Member]) -> None:
+        """Give each member its part of what a stack has learnt."""
+        split(stack.algorithm, state_to(stack.state, "cpu"), group, self.spaces)
+
+    def _together(self, places: Sequence[Collector], stacks: Sequence[Stack]) -> Collector:
+        """The places as one collector, in which the stacks act."""
+        engine: Any = JoinedEngines([place.engine for place in places])
+        acting = Acting([(s.algorithm, s.members) for s in stacks], engine.num_envs)
+        return joined_from(places, engine, acting)
+
+    def _make_store(self, members: Sequence[Member]) -> ReplayStore:
+        algorithm, count = members[0].algorithm(self.spaces), len(self.places)
+        return store_of(algorithm, count * self.places[0].num_envs, count, shared=True)
+
+    def fitness(self, members: Sequence[Member], arena: Collector, seeds: Seeds) -> Array:
+        """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
+        return np.array([
+            -np.inf if has_diverged(m) else score(policy_of(m, self.spaces), arena, seeds)
+            for m in members
+        ])  # fmt: skip
+
+    def cut(self, seeds: Seeds) -> Array:
+        """Make ready for ``state``; (k,) environments that begin anew."""
+        cuts = [place.cut(seeds / i) for i, place in enumerate(self.places, self._first)]
+        return self._begun_anew(cuts)
+
+    def state(self) -> dict[str, Tensor]:
+        """What resuming from a clean cut needs of the environments, and of what was counted."""
+        found = prefixed("episodes", self.episodes.state())
+        for i, place in enumerate(self.places):
+            found |= prefixed(str(i), place.state())
+        return {k: to_tensor(np.array(v)) for k, v in found.items()} | prefixed("kept", self._kept)
+
+    def restore(
+        self, saved: dict[str, Tensor], members: Sequence[Member], store: dict[str, Tensor]
+    ) -> Array:
+        """Stand where ``state`` was asked; (k,) environments that begin anew.
+
+        Args:
+            store: what the replay buffer kept; empty where there is none.
+        """
+        self._kept = unprefixed("kept", saved)
+        arrays = {k: v.numpy() for k, v in saved.items()}
+        self.episodes.load(unprefixed("episodes", arrays))
+        if store:
+            self.store = self._make_store(members)
+            self.store.load(store)
+        return self._begun_anew([
+            place.restore(unprefixed(str(i), arrays)) for i, place in enumerate(self.places)
+        ])  # fmt: skip
+
+    def _begun_anew(self, ids: Sequence[Array]) -> Array:
+        """Environments of each place, as columns; their open trajectories end here."""
+        columns = np.concatenate([own + i * self.places[0].num_envs for i, own in enumerate(ids)])
+        if self.store is not None:
+            self.store.cut(columns)
+        if "returns" in self._kept:
+            self._kept["returns"][columns] = 0.0
+        return columns
+
+    def close(self) -> None:
+        """Release the environments."""
+        for place in self.places:
+            place.close()
+
+
+def spaces_of(scene: Scene) -> tuple[Any, Any]:
+    """What algorithms are made for: (observation space, action space)."""
+    return scene.observation_space, scene.action_space
+
+
+def _telling(on_tick: OnGenerationTick, before: int) -> Callable[[Tick], None]:
+    """Tells the ticks of one loop in terms of the generation, ``before`` steps later."""
+    return lambda tick: on_tick(before + tick.steps, tick.metrics)
+
+
+def _count(members: Sequence[Member], steps: int) -> None:
+    """Give each of the members its part of the steps that they took together."""
+    for i, member in enumerate(members):
+        member.steps += (steps + i) // len(members)
+
+
+def policy_of(member: Member, spaces: tuple[Any, Any]) -> AgentPolicy:
+    """What a member has learnt."""
+    return AgentPolicy.of(member.algorithm(spaces), member.state)
+
+
+def score(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> float:
+    """Mean return of an episode in each environment; −inf if it is not finite."""
+    returns = returns_of(policy, arena, seeds)
+    return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
+
+
+def has_diverged(member: Member) -> bool:
+    """Whether a number that it has learnt is not finite."""
+    return not all(bool(torch.isfinite(v).all()) for v in vars(member.state).values())
