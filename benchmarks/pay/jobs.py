@@ -38,7 +38,7 @@ def run_all(jobs: list[tuple[str, bool, Path, str, int, list[str] | None]], proc
     """Do all jobs, so many side by side; F1's weights are chosen first, as all its seeds need them.
 
     Raises:
-        Exception: of the first job that failed, when all others are done.
+        Exception: of a job that failed; all others are ended then.
     """
     if processes == 1:
         for job in jobs:

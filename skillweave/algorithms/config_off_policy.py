@@ -130,8 +130,8 @@ class OffPolicy:
     """Checkpoints hold the replay buffer, so that resuming is exact; else it fills anew."""
     overlap: bool = False
     """Collect while learning, with the parameters of one update before: pays where environments
-    are slow. An update then follows each ``train_freq`` steps of every environment, so these are
-    the lag."""
+    are slow. The lag is ``train_freq`` steps of every environment. Where several learn together,
+    only if all of them have it."""
     threads: int = 1
     """Torch threads while learning."""
     compile: bool = False

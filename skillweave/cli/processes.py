@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 from typing import Any
 
 from skillweave.types import SkillweaveError
@@ -51,8 +52,12 @@ class Processes:
             self._running.append(child)
         sender.close()
         try:
+            # A process that the job has begun may still hold the pipe when the job is no more.
+            wait([receiver, child.sentinel])
+            if not receiver.poll():
+                raise EOFError
             result, error = receiver.recv()
-        except EOFError:
+        except (EOFError, OSError):
             child.join()
             raise ProcessEnded(
                 f"a process was ended before its job was done (exit code {child.exitcode}), "
@@ -60,9 +65,9 @@ class Processes:
             ) from None
         finally:
             receiver.close()
+            child.join()
             with self._lock:
                 self._running.remove(child)
-        child.join()
         if error is not None:
             raise error
         return result
@@ -103,7 +108,10 @@ def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) ->
         problem = SkillweaveError(str(error))
     except Exception:  # any, as it comes from what a user wrote; not all errors can be sent
         problem = RuntimeError(traceback.format_exc())
-    sender.send((result, problem))
+    try:
+        sender.send((result, problem))
+    except Exception:  # a result that cannot be sent
+        sender.send((None, RuntimeError(traceback.format_exc())))
 
 
 def _end_with_parent() -> None:

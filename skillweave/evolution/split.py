@@ -80,7 +80,7 @@ class Parts:
         self.steps_elsewhere = 0
         """Environment steps of measuring fitness that were made in other processes."""
         make = partial(_stationed, scene, _alone(config), seeds, self._bounds, episodes)
-        self._workers = make_workers(make, parts, scene.name)
+        self._workers, self._closed = make_workers(make, parts, scene.name), False
 
     def train(
         self,
@@ -125,8 +125,10 @@ class Parts:
         return self._columns(self._workers.stand(states))
 
     def close(self) -> None:
-        """End the workers."""
-        self._workers.close()
+        """End the workers, once."""
+        if not self._closed:
+            self._closed = True
+            self._workers.close()
 
     def _divided(self, members: Sequence[Member]) -> list[Sequence[Member]]:
         return [members[first:end] for first, end in pairwise(self._bounds)]

@@ -75,6 +75,8 @@ class EvolvingPopulation:
         self._open.callback(self.arena.close)
         self.spaces = spaces_of(self.stage.scene)
         self.parts = self._parts()
+        if self.parts is not None:
+            self._open.callback(self.parts.close)
 
     def go_on(self, state: None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says: its members are in ``extra``."""

@@ -113,7 +113,8 @@ class Rooms(gym.Env[Any, Any]):
         """Draw a room, and begin there."""
         super().reset(seed=seed)
         self._now = self._envs[int(self.np_random.integers(len(self._envs)))]
-        obs, info = self._now.reset(seed=seed, options=options)
+        own = int(self.np_random.integers(2**31))
+        obs, info = self._now.reset(seed=own, options=options)
         return obs["image"], info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

@@ -69,7 +69,8 @@ class Flight(Skill):
     max_steps = 300
     prize = 300.0
     """For being at the point, where a call ends there. Going on for ever is worth up to 100, as a
-    step pays up to 1 and γ is 0.99: with a prize of 100 a skill puts its end off."""
+    step pays up to 1 and γ is 0.99 (on the pad 2, so 200): with a prize of 100 a skill puts its end
+    off."""
     point: Array
     half: Array
     """Half the width and height of the box around the point: the leg's own, as a call that ended
