@@ -196,8 +196,9 @@ WORKER = PPO(
 )
 SELECTOR = PPO(
     num_envs=32,
-    n_steps=128,
-    batch_size=256,
+    n_steps=256,
+    batch_size=64,  # a rollout has few decisions
+    update_epochs=8,
     gamma=0.995,
     gae_lambda=0.95,
     ent_coef=0.02,
