@@ -14,11 +14,12 @@ import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing.connection import wait
 from typing import Any
 
 from skillweave.types import SkillweaveError
 
+PATIENCE = 1.0
+"""Seconds between looks whether a job's process is still there."""
 _START = multiprocessing.get_context("spawn")
 
 
@@ -52,8 +53,9 @@ class Processes:
             self._running.append(child)
         sender.close()
         try:
-            # A process that the job has begun may still hold the pipe when the job is no more.
-            wait([receiver, child.sentinel])
+            # A process that the job has begun may hold its pipes when the job is no more: so look.
+            while not receiver.poll(PATIENCE) and child.exitcode is None:
+                pass
             if not receiver.poll():
                 raise EOFError
             result, error = receiver.recv()

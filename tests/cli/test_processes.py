@@ -1,0 +1,72 @@
+"""Jobs in processes of their own: what they return or raise, and how they end."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from skillweave.cli.processes import ProcessEnded, processes
+from skillweave.types import SkillweaveError
+
+
+def doubled(x: int) -> int:
+    return 2 * x
+
+
+def refused() -> None:
+    raise SkillweaveError("too small")
+
+
+def failed() -> None:
+    raise KeyError("not here")
+
+
+def unsendable() -> threading.Lock:
+    return threading.Lock()
+
+
+def ended_beside_a_child() -> None:
+    """Is killed while a process that it has begun still holds its pipe."""
+    multiprocessing.get_context("fork").Process(target=time.sleep, args=(30,)).start()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_jobs_return_or_raise_what_they_did_there():
+    with processes(2) as pool:
+        results = [pool.submit(doubled, i) for i in range(3)]
+        wrong = {job: pool.submit(job) for job in (refused, failed, unsendable)}
+        assert [r.result() for r in results] == [0, 2, 4]
+        with pytest.raises(SkillweaveError, match="too small"):
+            wrong[refused].result()
+        with pytest.raises(RuntimeError, match="KeyError: 'not here'"):
+            wrong[failed].result()
+        with pytest.raises(RuntimeError, match="lock"):
+            wrong[unsendable].result()
+
+
+def test_a_process_that_is_ended_is_told_at_once_though_another_holds_its_pipe():
+    started = time.monotonic()
+    with processes(1) as pool, pytest.raises(ProcessEnded, match="exit code -9"):
+        pool.submit(ended_beside_a_child).result()
+    assert time.monotonic() - started < 25  # its child sleeps for 30 s
+
+
+def test_an_error_here_ends_all_jobs_and_begins_no_other():
+    started, due = time.monotonic(), []
+
+    def failing() -> None:
+        with processes(1) as pool:
+            due.extend(pool.submit(time.sleep, 60) for _ in range(2))
+            raise ValueError("enough")
+
+    with pytest.raises(ValueError, match="enough"):
+        failing()
+    for future in due:
+        with pytest.raises(ProcessEnded):
+            future.result()
+    assert time.monotonic() - started < 50
