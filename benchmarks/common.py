@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import platform
@@ -11,14 +12,14 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-import numpy as np
+from unittest import mock
 
 from skillweave.cli.processes import processes
-from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.types import Array, SkillweaveError
 
 workers = processes
@@ -81,61 +82,46 @@ def median(values: Iterable[float]) -> float:
     return statistics.median(values)
 
 
-class Recorder:
-    """An engine that notes every call, so that the bare pool can be fed with the same ones."""
+class RecordedPool:
+    """A bare pool that notes every call, so that another one can be fed with the same."""
 
-    def __init__(self, engine: Any) -> None:
-        self.engine = engine
-        self.num_envs = engine.num_envs
-        self.observation_space, self.action_space = engine.observation_space, engine.action_space
-        self.calls: list[tuple[str, Any, Any]] = []
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self.make, self.pool = make, make()
+        self.calls: list[tuple[Array | None, Array]] = []  # the actions, if it is a step; the ids
 
-    def reset(self, seed: int) -> Array:
-        self.calls.append(("make", seed, None))
-        return self.engine.reset(seed)
+    def reset(self, ids: Array) -> Any:
+        self.calls.append((None, ids))
+        return self.pool.reset(ids)
 
-    def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
-        self.calls.append(("reset", None, ids.astype(np.int32)))
-        return self.engine.reset_some(ids, seeds)
-
-    def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        self.calls.append(
-            ("step", action.astype(np.int32), None if ids is None else ids.astype(np.int32))
-        )
-        return self.engine.step(action, ids)
-
-    def mask(self) -> Array | None:
-        return self.engine.mask()
-
-    def close(self) -> None:
-        self.engine.close()
+    def step(self, action: Array, ids: Array) -> Any:
+        self.calls.append((action, ids))
+        return self.pool.step(action, ids)
 
     def replay(self) -> tuple[int, float]:
-        """Feed EnvPool alone with the recorded calls; environment steps and seconds."""
-        pool: Any = None
-        steps = 0
+        """Feed a bare pool with the calls; environment steps and seconds."""
+        pool, steps = self.make(), 0
         started = time.perf_counter()
-        for kind, what, ids in self.calls:
-            if kind == "step":
-                pool.step(what, ids)
-                steps += len(what)
-            elif kind == "reset":
+        for action, ids in self.calls:
+            if action is None:
                 pool.reset(ids)
             else:
-                pool = self.engine.make_pool(what)
-                pool.reset()
+                pool.step(action, ids)
+                steps += len(ids)
         return steps, time.perf_counter() - started
 
 
-def engine_maker(record: list[Recorder]) -> Any:
-    """A stand-in for ``make_engine`` that records what it makes."""
-    from skillweave.envs.make import make_engine
+@contextmanager
+def recorded() -> Iterator[list[RecordedPool]]:
+    """The pools that are made in it."""
+    made: list[RecordedPool] = []
+    real = EnvPoolEngine.make_pool
 
-    def make(spec: Any, num_envs: int, threads: int | None = None) -> Engine:
-        record.append(Recorder(make_engine(spec, num_envs, threads)))
-        return record[-1]
+    def make_pool(engine: EnvPoolEngine, seed: int) -> RecordedPool:
+        made.append(RecordedPool(functools.partial(real, engine, seed)))
+        return made[-1]
 
-    return make
+    with mock.patch.object(EnvPoolEngine, "make_pool", make_pool):
+        yield made
 
 
 def warm_up() -> None:

@@ -12,11 +12,9 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
-from unittest import mock
 
-from benchmarks.common import Recorder, engine_maker, median, report, table, warm_up
+from benchmarks.common import median, recorded, report, table, warm_up
 from skillweave import Hierarchy, recipes
-from skillweave.hierarchy import training
 
 
 def stable_baselines3(steps: int, seed: int) -> float:
@@ -55,14 +53,12 @@ def selector(seed: int) -> tuple[float, float]:
 
 
 def trained(hierarchy: Hierarchy, seed: int, flat: bool) -> tuple[float, float]:
-    record: list[Recorder] = []
-    patched = mock.patch.object(training, "make_engine", engine_maker(record))
-    with tempfile.TemporaryDirectory() as folder, patched:
+    with tempfile.TemporaryDirectory() as folder, recorded() as pools:
         run = hierarchy.train(Path(folder) / "run", seed=seed, flat=flat, quiet=True)
         speed = run.info()["stages"][-1]["steps_per_second"]
-    record[-1].replay()  # once to warm up
-    steps, seconds = record[-1].replay()
-    return speed, steps / seconds
+    pools[0].replay()  # once to warm up
+    counted = [pool.replay() for pool in pools]
+    return speed, sum(steps for steps, _ in counted) / sum(seconds for _, seconds in counted)
 
 
 def main() -> None:

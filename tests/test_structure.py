@@ -63,16 +63,18 @@ LEAVES: dict[str, set[str]] = {
         "messages",
         "reading",
         "networks.config",
+        "algorithms.config_checks",
         "algorithms.config_off_policy",
     },
-    "algorithms.config_off_policy": {"types", "messages", "networks.config"},
+    "algorithms.config_checks": {"types", "messages", "networks.config"},
+    "algorithms.config_off_policy": {"types", "networks.config", "algorithms.config_checks"},
     "evolution.config": {
         "types",
         "messages",
         "reading",
         "networks.config",
         "algorithms.config",
-        "algorithms.config_off_policy",
+        "algorithms.config_checks",
     },
 }
 

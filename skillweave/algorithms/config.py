@@ -12,11 +12,7 @@ from typing import Any, Literal, TypeAlias
 
 import gymnasium as gym
 
-from skillweave.algorithms.config_off_policy import (
-    DQN,
-    SAC,
-    TD3,
-    OffPolicy,
+from skillweave.algorithms.config_checks import (
     check,
     check_networks,
     flags,
@@ -25,6 +21,7 @@ from skillweave.algorithms.config_off_policy import (
     positive,
     whole,
 )
+from skillweave.algorithms.config_off_policy import DQN, SAC, TD3, OffPolicy
 from skillweave.networks.config import Network
 from skillweave.reading import fit, shown
 from skillweave.types import SkillweaveError

@@ -1,87 +1,27 @@
-"""Settings of the algorithms that learn from a replay buffer, and the checks of all settings.
+"""Settings of the algorithms that learn from a replay buffer.
 
 This module does not import torch; see ``config``, which has the rest.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from skillweave.messages import short
+from skillweave.algorithms.config_checks import (
+    INFINITY,
+    check,
+    check_networks,
+    flags,
+    number,
+    one_of,
+    positive,
+    whole,
+)
 from skillweave.networks.config import Network
 from skillweave.types import SkillweaveError
 
 Schedule = Literal["constant", "linear"]
-INFINITY = float("inf")
-HUGE = 1e38
-"""No setting may be as large: it has to fit into a tensor, a whole number into 63 bits."""
-
-
-def check(config: object, field_name: str, ok: bool, asked: str) -> None:
-    """Raise a SkillweaveError that names a field and what it must be."""
-    if not ok:
-        value = getattr(config, field_name)
-        raise SkillweaveError(
-            f"{type(config).__name__}.{field_name} is {short(value)}; it must be {asked}"
-        )
-
-
-def whole(config: object, *names: str) -> None:
-    """Raise where a field is no whole number, or less than 1."""
-    for name in names:
-        value = getattr(config, name)
-        check(config, name, type(value) is int, "a whole number")
-        check(config, name, value >= 1, "at least 1")
-        _fits(config, name)
-
-
-def _fits(config: object, name: str) -> None:
-    value = getattr(config, name)
-    largest = 2**63 if isinstance(value, int) else HUGE
-    check(config, name, abs(value) < largest, f"below {largest:g}")
-
-
-def number(config: object, *names: str, low: float = 0.0, high: float = INFINITY) -> None:
-    """Raise where a field is no finite number between ``low`` and ``high``."""
-    asked = "at least 0 and finite" if high == INFINITY else f"between {low:g} and {high:g}"
-    if low == -INFINITY:
-        asked = "a finite number"
-    for name in names:
-        value = getattr(config, name)
-        ok = type(value) in (int, float) and abs(value) < INFINITY
-        check(config, name, ok and low <= value <= high, asked)
-        _fits(config, name)
-
-
-def positive(config: object, *names: str) -> None:
-    """Raise where a field is no finite number above 0."""
-    for name in names:
-        value = getattr(config, name)
-        ok = type(value) in (int, float) and 0.0 < value < INFINITY
-        check(config, name, ok, "positive and finite")
-        _fits(config, name)
-
-
-def one_of(config: object, field_name: str, known: tuple[str, ...]) -> None:
-    """Raise where a field is none of the known words."""
-    check(config, field_name, getattr(config, field_name) in known, f"one of {', '.join(known)}")
-
-
-def flags(config: Any) -> None:
-    """Raise where a field that is yes or no is something else."""
-    for f in fields(config):
-        if f.type in ("bool", bool):
-            check(config, f.name, isinstance(getattr(config, f.name), bool), "True or False")
-
-
-def check_networks(config: Any) -> None:
-    """Raise where ``network`` or ``critic`` is no architecture."""
-    check(config, "network", isinstance(config.network, Network), "a Network()")
-    critic = getattr(config, "critic", None)
-    check(config, "critic", isinstance(critic, Network | None), "a Network() or None")
-    if critic is not None:
-        check(config, "critic", critic.rnn is None, "without rnn")
 
 
 @dataclass(frozen=True)
@@ -132,6 +72,13 @@ class OffPolicy:
     """Collect while learning, with the parameters of one update before: pays where environments
     are slow. The lag is ``train_freq`` steps of every environment. Where several learn together,
     only if all of them have it."""
+    bouts: float = 0.0
+    """Chance that an environment, somewhere in ``bout_steps`` of its steps, takes one random action
+    again and again (as in εz-greedy exploration, Dabney et al. 2021). It finds what needs patience,
+    like resting on the ground with the engines off. Falls to 0 over the budget. Only where it acts
+    in every step: for plain agents, and skills that learn apart."""
+    bout_steps: int = 60
+    """Steps of the longest bout; shorter ones are as likely."""
     threads: int = 1
     """Torch threads while learning."""
     compile: bool = False
@@ -144,7 +91,8 @@ class OffPolicy:
         flags(self)
         check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
         whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
-        number(self, "gamma", "tau", "priority_alpha", "priority_beta", high=1.0)
+        whole(self, "bout_steps")
+        number(self, "gamma", "tau", "priority_alpha", "priority_beta", "bouts", high=1.0)
         positive(self, "learning_rate", "adam_eps", "update_ratio")
         if self.max_grad_norm is not None:
             positive(self, "max_grad_norm")
@@ -243,6 +191,8 @@ class ActorCritic(OffPolicy):
     """Share of the new weights in the target's at each target update."""
     normalize_obs: bool = True
     """Running zero mean, unit deviation of observations; saved with the policy."""
+    bouts: float = 0.2
+    """As of ``OffPolicy``."""
     network: Network = field(default_factory=lambda: Network((128, 128), "relu"))
     """The network that acts."""
     critic: Network | None = None

@@ -19,7 +19,7 @@ from torch import Tensor
 from skillweave.algorithms.actor_critic import ActorCriticAlgorithm, ActorCriticState, Critics
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import SAC
-from skillweave.algorithms.config_off_policy import check
+from skillweave.algorithms.config_checks import check
 from skillweave.algorithms.off_policy import normal
 from skillweave.experience import Sample
 from skillweave.networks.encoders import Inputs

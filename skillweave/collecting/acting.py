@@ -17,6 +17,21 @@ from skillweave.types import Array
 
 
 @dataclass(frozen=True)
+class Bouts:
+    """While one lasts, an environment takes one random action again and again.
+
+    Time is cut into spans of ``longest`` rows. In each, every environment has a chance of a bout,
+    which is as long as the span or shorter, and lies somewhere in it. So where bouts are follows
+    from ``seeds`` and the row, and nothing needs to be kept between requests.
+    """
+
+    at: int  # the request's first row, counted from the start of the stage
+    chance: float  # of a bout in a span
+    longest: int  # rows
+    seeds: Seeds  # the same for all requests of a stage
+
+
+@dataclass(frozen=True)
 class Request:
     """What a collector is asked for: so many rows, by these parameters.
 
@@ -30,11 +45,13 @@ class Request:
     at_random: bool = False  # act at random instead
     greedy: bool = False  # do not explore
     parts: tuple[Request, ...] = ()  # the same of skills that learn below a selector
+    bouts: Bouts | None = None
 
     def of_collector(self, number: int) -> Request:
         """The same for one of several collectors."""
         parts = tuple(part.of_collector(number) for part in self.parts)
-        return replace(self, seeds=self.seeds / number, parts=parts)
+        bouts = self.bouts and replace(self.bouts, seeds=self.bouts.seeds / number)
+        return replace(self, seeds=self.seeds / number, parts=parts, bouts=bouts)
 
 
 @dataclass
@@ -44,6 +61,17 @@ class Acted:
     action: Array  # (n, …) in policy units
     head: Array | None  # (n, H), of learners from rollouts
     memory: Array | None  # (n, M) afterwards, of learners with a memory
+
+
+@dataclass(frozen=True)
+class _Span:
+    """The bouts of N environments in some rows, and what is done in them."""
+
+    key: tuple[Seeds, int]
+    chance: Array  # (N,), a bout takes place where it is below the request's
+    first: Array  # (N,), its first row, counted from that of the span
+    after: Array  # (N,), the row after the last one
+    action: Array  # (N, …) in policy units
 
 
 class Acting:
@@ -60,6 +88,7 @@ class Acting:
         first = stacks[0][0]
         self.to_env, self.memory_size = first.to_env, first.memory_size
         self.keeps_head = first.store == "rollout"
+        self._span: _Span | None = None
 
     def begin(self, request: Request, every_step: bool = True) -> None:
         """Act by this request from now on.
@@ -80,7 +109,41 @@ class Acting:
     def all(self, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
         """Act in all environments, in the request's next step; obs (N, …), mask (N, A)."""
         at, self._at = self._at, self._at + 1
-        return self._act(lambda stack: self._noises[stack][at], obs, mask, memory)
+        acted = self._act(lambda stack: self._noises[stack][at], obs, mask, memory)
+        if (bouts := self._request.bouts) is not None and not self._request.at_random:
+            self._keep_on(acted.action, bouts, bouts.at + at, mask)
+        return acted
+
+    def _keep_on(self, action: Array, bouts: Bouts, row: int, mask: Array | None) -> None:
+        """Replace what environments do (N, …) that are in a bout, in place."""
+        span, place = divmod(row, bouts.longest)
+        if self._span is None or self._span.key != (bouts.seeds, span):
+            self._span = self._drawn(bouts, span)
+        drawn = self._span
+        now = (drawn.chance < bouts.chance) & (drawn.first <= place) & (place < drawn.after)
+        if mask is not None:
+            now &= mask[np.arange(len(mask)), drawn.action]
+        action[now] = drawn.action[now]
+
+    def _drawn(self, bouts: Bouts, span: int) -> _Span:
+        """The bouts of a span of rows."""
+        times: list[Array] = []  # of each member: chances, first rows, rows after the last one
+        actions: list[Array] = []
+        for algorithm, count in self.stacks:
+            first = len(times)
+            seeds = [bouts.seeds / span / "act" / (first + i) for i in range(count)]
+            for rng in (node.numpy() for node in seeds):
+                chance, length = (
+                    rng.random(self.each),
+                    rng.integers(1, bouts.longest + 1, self.each),
+                )
+                begins = rng.integers(0, bouts.longest - length + 1)
+                times.append(np.stack([chance, begins, begins + length]))
+            off_policy: Any = algorithm
+            drawn = off_policy.random_actions([node.torch() for node in seeds], self.each, None)
+            actions.append(_rows(drawn))
+        chances, first_rows, after = np.concatenate(times, axis=1)
+        return _Span((bouts.seeds, span), chances, first_rows, after, np.concatenate(actions))
 
     @torch.inference_mode()
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:

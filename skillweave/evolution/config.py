@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, TypedDict, get_args
 
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.config_off_policy import check, number, one_of, whole
+from skillweave.algorithms.config_checks import check, number, one_of, whole
 from skillweave.networks.config import Activation
 from skillweave.reading import fit
 from skillweave.types import SkillweaveError

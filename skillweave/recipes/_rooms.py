@@ -22,6 +22,8 @@ SMALL = (
     "UnlockPickup",
     "BlockedUnlockPickup",
     "PutNear-8x8-N3",
+    "SimpleCrossingS9N1",
+    "FourRooms",
 )
 """The rooms in which skills are learnt: each episode is in one of them."""
 TARGETS = {
@@ -39,7 +41,7 @@ EMPTY, WALL, FLOOR, DOOR, KEY, BALL, BOX, GOAL = 1, 2, 3, 4, 5, 6, 7, 8
 OPEN, CLOSED, LOCKED = 0, 1, 2
 """A door's state: the third."""
 LEFT, RIGHT, FORWARD, PICK_UP, DROP, TOGGLE = range(6)
-SPACE = gym.spaces.Box(0, 255, (7, 7, 3), np.uint8)
+SPACE, ACTIONS = gym.spaces.Box(0, 255, (7, 7, 3), np.uint8), gym.spaces.Discrete(7)
 
 
 def ahead(obs: Array) -> Array:
@@ -67,6 +69,13 @@ def in_view(obs: Array, *kinds: int, state: int | None = None) -> Array:
 def shut(cells: Array) -> Array:
     """A door that is closed or locked, for cells (n, 3), (n,) bool."""
     found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] != OPEN)
+    return found
+
+
+def opened(obs: Array) -> Array:
+    """The agent stands before an open door, (n,) bool."""
+    cells = ahead(obs)
+    found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
     return found
 
 
@@ -139,7 +148,7 @@ class RoomPool:
         rooms: what MiniGrid calls them, without ``MiniGrid-`` and ``-v0``.
     """
 
-    observation_space, action_space = SPACE, gym.spaces.Discrete(7)
+    observation_space, action_space = SPACE, ACTIONS
 
     def __init__(self, rooms: Sequence[str], num_envs: int, threads: int, seed: int) -> None:
         self._pools = [

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
+from skillweave.recipes._looking import LookAround
 from skillweave.recipes._rooms import (
     BALL,
     BOX,
@@ -26,16 +27,15 @@ from skillweave.recipes._rooms import (
     FORWARD,
     GOAL,
     KEY,
-    LEFT,
     LOCKED,
     OPEN,
-    RIGHT,
     TOGGLE,
     ahead,
     between_walls,
     free,
     holds,
     in_view,
+    opened,
     shut,
     spec,
 )
@@ -64,15 +64,11 @@ class Explore(Errand):
     """Go about until there is something to do: written by hand, nothing is learnt."""
 
     max_steps = 16
+    policy = LookAround()
 
     def initiation(self, obs: Array) -> Array:
         """There is nothing to do; but `drop` or `next_room` may start."""
         return ~something_to_do(obs)
-
-    def policy(self, obs: Array) -> Array:
-        """Straight on; where it cannot, to the right, or to the left if only that is free."""
-        only_left = free(obs[:, 2, 6]) & ~free(obs[:, 4, 6])
-        return np.where(free(ahead(obs)), FORWARD, np.where(only_left, LEFT, RIGHT))
 
     def success(self, step: Step) -> Array:
         """There is something to do."""
@@ -149,10 +145,16 @@ class OpenDoor(Errand):
         locked = in_view(obs, DOOR, state=LOCKED) & holds(obs, KEY)
         return in_view(obs, DOOR, state=CLOSED) | locked
 
+    def reward(self, step: Step) -> Array:
+        """To shut an open door costs as much: else it does so, and opens it again."""
+        shuts = (step.action == TOGGLE) & opened(step.obs) & shut(ahead(step.next_obs))
+        found: Array = super().reward(step) - shuts
+        return found
+
     def success(self, step: Step) -> Array:
         """The door before it is open now."""
-        opened = shut(ahead(step.obs)) & free(ahead(step.next_obs))
-        found: Array = opened & (step.action == TOGGLE)
+        now_open = shut(ahead(step.obs)) & opened(step.next_obs)
+        found: Array = now_open & (step.action == TOGGLE)
         return found
 
 
@@ -212,7 +214,7 @@ STEPS = {
     "get_key": 250_000,
     "open_door": 400_000,
     "next_room": 500_000,
-    "reach_goal": 500_000,
+    "reach_goal": 800_000,
     "pick_up": 800_000,
     "drop": 100_000,
     "open_box": 400_000,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from skillweave.buffers.replay import ReplayStore, replay_store
-from skillweave.collecting.acting import Request
+from skillweave.collecting.acting import Bouts, Request
 from skillweave.experience import Experience
 from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
@@ -69,7 +69,21 @@ class ReplayLearner:
         rows = int(self.config.train_freq) * self._row_steps
         at_random = self._acts_at_random and steps < self._random_until
         seeds = self._seeds / "collect" / update
-        return Request(rows, params, self._gamma(), seeds, at_random)
+        return Request(
+            rows,
+            params,
+            self._gamma(),
+            seeds,
+            at_random,
+            bouts=self._bouts(update * rows, progress),
+        )
+
+    def _bouts(self, at: int, progress: float) -> Bouts | None:
+        """When to take one action again and again, from row ``at`` on."""
+        cfg = self.config
+        if not cfg.bouts:
+            return None
+        return Bouts(at, cfg.bouts * (1.0 - progress), cfg.bout_steps, self._seeds / "bouts")
 
     def take(self, experience: Experience) -> None:
         """Put rows into the store, and keep the running scales of observations and returns."""

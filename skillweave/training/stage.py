@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.algorithms.config_off_policy import number, positive
+from skillweave.algorithms.config_checks import number, positive
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting import levels
 from skillweave.envs.make import EnvSpec, workers_for

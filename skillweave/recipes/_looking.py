@@ -1,0 +1,58 @@
+"""A policy by hand that goes about in MiniGrid's rooms until there is something to see."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from skillweave import Array, Step
+from skillweave.recipes._rooms import ACTIONS, FORWARD, LEFT, RIGHT, SPACE, ahead, free
+
+Memory = dict[str, Array]
+TURNS = 3
+"""After so many it has seen all four sides."""
+PACES = 5
+"""After so many it looks around again."""
+
+
+class LookAround:
+    """Look to all four sides, go straight on for some cells, and look again.
+
+    It remembers how often it has turned, and how far it has gone since: an agent that sees what is
+    before it alone cannot know whether it has looked behind itself.
+    """
+
+    observation_space, action_space = SPACE, ACTIONS
+    labels: tuple[str, ...] = ()
+
+    def start(self, n: int) -> Memory:
+        """It has not looked yet."""
+        return {"turns": np.zeros(n, np.int64), "paces": np.zeros(n, np.int64)}
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Turn right until it has seen all sides; then straight on, around what is in the way."""
+        turns, paces = memory["turns"], memory["paces"]
+        again = (paces >= PACES) | ((paces > 0) & ~free(ahead(obs)))
+        turns, paces = np.where(again, 0, turns), np.where(again, 0, paces)
+        looks, goes = turns < TURNS, free(ahead(obs))
+        only_left = free(obs[:, 2, 6]) & ~free(obs[:, 4, 6])
+        around = np.where(goes, FORWARD, np.where(only_left, LEFT, RIGHT))
+        after = {"turns": turns + looks, "paces": paces + (~looks & goes)}
+        return np.where(looks, RIGHT, around), after
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """There is nothing else to notice."""
+        return memory
+
+    def acting(self, memory: Memory) -> Any:
+        """It has no skills."""
+        return None
