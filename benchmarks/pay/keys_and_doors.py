@@ -37,8 +37,8 @@ def suite() -> Suite:
         source=source,
         further=further,
         skills=lambda: [skill() for skill in rooms.SKILLS],
-        # The skills' settings and network, and it sees the same; the reward is far away.
-        flat=replace(rooms.WORKER, n_steps=128, gamma=0.995),
+        # The skills' network, and it sees the same; the reward is far away.
+        flat=replace(rooms.WORKER, num_envs=32, n_steps=128, update_epochs=4, gamma=0.995),
         weights=(
             {s.name: 0.01 for s in rooms.SKILLS[1:]},
             {s.name: 0.05 for s in rooms.SKILLS[1:]},

@@ -37,6 +37,7 @@ def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
     declared.learn = told.get("learn", "apart")
     declared.reflexes_in_training = told.get("reflexes_in_training", True)
     declared.start_calls = told.get("start_calls")
+    declared.search_steps = told.get("search_steps")
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:

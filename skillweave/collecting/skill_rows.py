@@ -48,6 +48,8 @@ class SkillCollector(Collector):
         reflexes: in force while the skill acts.
         starters: skills that can act already; None: random actions lead to where it may start.
         start_calls: the most calls of theirs that come first; their number is drawn evenly.
+        search_steps: an episode in which the skill may not start so soon begins anew; None: none
+            does.
     """
 
     def __init__(
@@ -58,10 +60,12 @@ class SkillCollector(Collector):
         reflexes: tuple[Reflex, ...] = (),
         starters: SkillSet | None = None,
         start_calls: int = 0,
+        search_steps: int | None = None,
     ) -> None:
         super().__init__(engine, acting)
         self.skill, self.reflexes = skill, reflexes
         self._start_calls = 0 if starters is None else start_calls
+        self._search_steps = search_steps
         n = self.num_envs
         self._never = np.zeros(n, bool)
         self.kept["elapsed"] = np.zeros(n, np.int64)  # the skill's steps in the open episode
@@ -79,7 +83,13 @@ class SkillCollector(Collector):
         """The same over other environments."""
         starters = self._starters.skills if self._searches else None
         return SkillCollector(
-            engine, acting, self.skill, self.reflexes, starters, self._start_calls
+            engine,
+            acting,
+            self.skill,
+            self.reflexes,
+            starters,
+            self._start_calls,
+            self._search_steps,
         )
 
     def _collect(self, request: Request) -> Experience:
@@ -124,9 +134,10 @@ class SkillCollector(Collector):
             if playing is not None:
                 memory[~playing] = 0
         self.obs = raw.next_obs
-        over = (
-            ended if playing is None else np.where(playing, ended, raw.terminated | raw.truncated)
-        )
+        over = ended
+        if playing is not None:
+            no_longer = raw.terminated | raw.truncated | self._searched_enough()
+            over = np.where(playing, ended, no_longer)
         ids = np.flatnonzero(over)
         if len(ids):
             told = ids if playing is None else np.flatnonzero(playing & ended)
@@ -183,6 +194,13 @@ class SkillCollector(Collector):
                 "or put the skills that lead to where it holds before it in skills, as skills are "
                 "trained in that order; or give an environment that starts where it holds"
             )
+
+    def _searched_enough(self) -> Array:
+        """(N,) bool, where the open episode has lasted too long for a skill that may not start."""
+        if self._search_steps is None:
+            return self._never
+        enough: Array = self.kept["age"] >= self._search_steps
+        return enough
 
     def _given_up(self) -> Array:
         if not self._searches:

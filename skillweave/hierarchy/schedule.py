@@ -155,7 +155,12 @@ def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
             starters = declaration.skill_set([policy_of(s, policies) for s in others], others)
             led_by = starters if others else None
             return skill_scene(
-                declaration.spec, skill, reflexes, led_by, declaration.start_calls or 0
+                declaration.spec,
+                skill,
+                reflexes,
+                led_by,
+                declaration.start_calls or 0,
+                declaration.search_steps,
             )
 
         return Stage(skill.name, "skill", config, budget, scene, target)

@@ -233,5 +233,6 @@ def _hierarchy_entry(declaration: Declaration) -> dict[str, Any]:
         "reflexes_in_training": declaration.reflexes_in_training,
         "reflexes": [r.name for r in declaration.reflexes],
         "start_calls": declaration.start_calls,
+        "search_steps": declaration.search_steps,
         **_selector_entry(declaration),
     }

@@ -23,7 +23,7 @@ SMALL = (
     "BlockedUnlockPickup",
     "PutNear-8x8-N3",
     "SimpleCrossingS9N1",
-    "FourRooms",
+    "Empty-Random-6x6",
 )
 """The rooms in which skills are learnt: each episode is in one of them."""
 TARGETS = {
@@ -40,6 +40,10 @@ EMPTY, WALL, FLOOR, DOOR, KEY, BALL, BOX, GOAL = 1, 2, 3, 4, 5, 6, 7, 8
 """What may be in a cell: the first of its three numbers."""
 OPEN, CLOSED, LOCKED = 0, 1, 2
 """A door's state: the third."""
+STEPS = np.abs(np.arange(7) - 3)[:, None] + np.abs(np.arange(7) - 6)[None]
+"""From where the agent stands to each cell in view, (7, 7)."""
+FAR = 14
+"""More than to any of them."""
 LEFT, RIGHT, FORWARD, PICK_UP, DROP, TOGGLE = range(6)
 SPACE, ACTIONS = gym.spaces.Box(0, 255, (7, 7, 3), np.uint8), gym.spaces.Discrete(7)
 
@@ -56,13 +60,30 @@ def holds(obs: Array, *kinds: int) -> Array:
     return found
 
 
+def seen(obs: Array, *kinds: int, state: int | None = None) -> Array:
+    """Cells with one of these, but for what is in the agent's hands, (n, 7, 7) bool."""
+    found: Array = np.isin(obs[..., 0], kinds)
+    found[:, 3, 6] = False
+    return found if state is None else np.logical_and(found, obs[..., 2] == state)
+
+
 def in_view(obs: Array, *kinds: int, state: int | None = None) -> Array:
     """One of these is in view, and not in the agent's hands, (n,) bool."""
-    seen: Any = np.isin(obs[..., 0], kinds)
-    seen[:, 3, 6] = False
-    if state is not None:
-        seen = seen & (obs[..., 2] == state)
-    found: Array = seen.any(axis=(1, 2))
+    return anywhere(seen(obs, *kinds, state=state))
+
+
+def anywhere(cells: Array) -> Array:
+    """One of the cells is marked, of (n, 7, 7) bool, (n,) bool."""
+    found: Array = np.any(cells, axis=(1, 2))
+    return found
+
+
+def steps_to(cells: Array) -> Array:
+    """Steps to the nearest of the cells marked in (n, 7, 7), as the crow flies, (n,).
+
+    Of none it is ``FAR``.
+    """
+    found: Array = np.where(cells, STEPS, FAR).min(axis=(1, 2))
     return found
 
 

@@ -53,6 +53,7 @@ class NestedEntry(TypedDict):
     reflexes: NotRequired[list[str]]
     reflexes_in_training: NotRequired[bool]
     start_calls: NotRequired[int | None]
+    search_steps: NotRequired[int | None]
 
 
 class SkillEntry(TypedDict):

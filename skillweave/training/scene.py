@@ -60,19 +60,23 @@ def skill_scene(
     reflexes: Sequence[Reflex] = (),
     starters: SkillSet | None = None,
     start_calls: int = 0,
+    search_steps: int | None = None,
 ) -> Scene:
     """The environments seen through a skill; None: as they are.
 
     Args:
         starters: skills that can act already: they lead to where the skill may start.
         start_calls: an episode begins after up to so many calls of theirs.
+        search_steps: an episode in which it may not start so soon begins anew.
     """
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return SkillCollector(engine, acting, skill, tuple(reflexes), starters, start_calls)
+        return SkillCollector(
+            engine, acting, skill, tuple(reflexes), starters, start_calls, search_steps
+        )
 
     return Scene(spec.name, *_spaces(spec), collector)
 

@@ -77,11 +77,11 @@ class Anywhere(Skill):
     max_steps = 7
 
 
-def collector_of(*kinds, skill=Far, start_calls=0):
+def collector_of(*kinds, skill=Far, start_calls=0, search_steps=None):
     skills = tuple(kind() for kind in kinds)
     starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
     engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
-    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters, start_calls)
+    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters, start_calls, search_steps)
     found.start(Seeds(0))
     return found
 
@@ -135,13 +135,28 @@ def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill
     assert counts.sum() == 1.0
 
 
-@pytest.mark.parametrize(("rows", "start_calls"), [(7, 0), (50, 0), (7, 3), (50, 3)])
-def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(rows, start_calls):
-    first, asked = collector_of(Forward, start_calls=start_calls), requests(rows)
+def test_an_episode_in_which_it_may_not_start_begins_anew():
+    found = collector_of(search_steps=9).collect(next(requests(200))).experience
+    assert not found.valid.any()
+    assert set(np.unique(found.obs[:, :, T])) == set(range(9))
+    # Who has started is not disturbed.
+    found = collector_of(Forward, search_steps=22).collect(next(requests(200))).experience
+    assert set(np.unique(found.obs[:, :, T][found.valid])) == set(range(20, 25))
+
+
+@pytest.mark.parametrize(
+    ("rows", "start_calls", "search_steps"),
+    [(7, 0, None), (50, 0, None), (7, 3, None), (50, 3, None), (7, 3, 23)],
+)
+def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(
+    rows, start_calls, search_steps
+):
+    how = {"start_calls": start_calls, "search_steps": search_steps}
+    first, asked = collector_of(Forward, **how), requests(rows)
     for request in itertools.islice(asked, 3):
         first.collect(request)
     first.cut(Seeds(1))
-    again = collector_of(Forward, start_calls=start_calls)
+    again = collector_of(Forward, **how)
     assert not len(again.restore(first.state()))
     for request in itertools.islice(asked, 4):
         one, two = first.collect(request).experience, again.collect(request).experience

@@ -581,6 +581,17 @@ def test_where_no_skill_may_start_the_error_names_them():
         policy.act(policy.start(2), walk_obs(0, 2))
 
 
+def test_where_no_skill_may_start_a_large_observation_is_told_in_part():
+    class Never(Skill):
+        def initiation(self, obs):
+            return np.zeros(len(obs), bool)
+
+    with pytest.raises(SkillweaveError, match="no skill may start") as found:
+        skill_set(Never).mask(np.zeros((1, 7, 7, 3), np.uint8))
+    assert len(str(found.value)) < 400
+    assert "\n" not in str(found.value)
+
+
 def test_deterministic_is_about_the_selector_and_greedy_about_the_skills():
     asked = []
 

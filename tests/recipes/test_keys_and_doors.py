@@ -81,14 +81,26 @@ def test_a_skill_ends_where_it_is_done_and_is_paid_for_it(name, before, action, 
     skill, step = SKILLS[name], step_of(before, action, after)
     assert skill.success(step).all() == done
     assert skill.termination(step).all() == done
-    assert skill.reward(step) == pytest.approx(done - 0.02)
+    if done:
+        assert skill.reward(step) == pytest.approx(1 - 0.02)
 
 
 def test_a_skill_that_shuts_a_door_pays_for_it():
     shuts = step_of(view(OPEN), world.TOGGLE, view(CLOSED))
     turns = step_of(view(OPEN), world.LEFT, view(CLOSED))  # to another door, which is shut
-    assert SKILLS["open_door"].reward(shuts) == pytest.approx(-1.02)
-    assert SKILLS["open_door"].reward(turns) == pytest.approx(-0.02)
+    sees = 0.04 * (world.FAR - 1)  # a shut door is one step away now, and none was in view
+    assert SKILLS["open_door"].reward(shuts) == pytest.approx(sees - 1.02)
+    assert SKILLS["open_door"].reward(turns) == pytest.approx(sees - 0.02)
+
+
+def test_a_skill_is_paid_for_each_cell_that_it_comes_nearer():
+    far, near = view(far=GOAL), view(ahead=GOAL)  # two to the left and four ahead; one ahead
+    comes, goes = step_of(far, world.FORWARD, near), step_of(near, world.LEFT, far)
+    loses = step_of(near, world.LEFT, view())
+    reward = SKILLS["reach_goal"].reward
+    assert reward(comes) == pytest.approx(5 * 0.04 - 0.02)
+    assert reward(goes) == pytest.approx(-5 * 0.04 - 0.02)
+    assert reward(loses) == pytest.approx(-(world.FAR - 1) * 0.04 - 0.02)
 
 
 def test_explore_ends_where_there_is_something_to_do():
