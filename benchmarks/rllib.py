@@ -5,9 +5,9 @@
 
 PPO on MiniGrid's DoorKey-8x8 in Python: two collectors of 16 environments, rollouts of 128 steps,
 two separate networks of 64 and 64 units, 4 epochs, batches of 1,024; the learner is in this process
-for both. RLlib's new API, with its defaults for everything else. What comes before the second
-update is not counted for RLlib, and the start of collectors for neither. Rounds take turns; the
-median ratio counts.
+for both. RLlib's new API, with its defaults for everything else. For RLlib the first update is not
+counted. The time in which collectors start is not counted for either. Rounds take turns; the median
+ratio counts.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skillweave.types import SkillweaveError
+from skillweave.types import Array, SkillweaveError
 
 MOST = 10**12
 """The largest whole number that an argument may be: a million times it fits into 64 bits."""
@@ -26,6 +26,11 @@ def shortened(text: str, longest: int = 500) -> str:
     """Text for a message, its middle left out where it is long."""
     half = longest // 2
     return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
+
+
+def observed(obs: Array) -> str:
+    """An observation for a message, in one line, its middle left out where it is long."""
+    return shortened(" ".join(np.array2string(obs, precision=3).split()), 200)
 
 
 def told(error: BaseException) -> str:

@@ -64,6 +64,17 @@ def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monke
         hierarchy.train(tmp_path / "run", quiet=True)
 
 
+def test_a_skill_that_found_no_start_in_all_its_steps_is_told_in_the_end(tmp_path):
+    heard = Heard()
+    hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart", skill_steps=300)
+    hierarchy.selector_steps = 300
+    run = new_run(hierarchy, tmp_path / "run")
+    training.train(hierarchy, run, (heard,))
+    run.close()
+    (said,) = [text for text in heard.said if "learnt nothing" in text]
+    assert said.startswith("beyond: it learnt nothing in 3"), said
+
+
 def test_no_skill_may_start_where_learning_together_begins(tmp_path):
     with pytest.raises(
         SkillweaveError, match=r"no skill may start.*after 0 steps.*'beyond', 'unlock'"

@@ -273,6 +273,8 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
     if not isinstance(kind, str) or kind not in _REGISTERED:
         where = f"{file}: {path}: " if file else ""
         raise SkillweaveError(f"{where}{_not_registered(shown(kind))}")
+    if issubclass(_REGISTERED[kind].config, OffPolicy):
+        values.setdefault("bouts", 0.0)  # they were recorded before there were bouts
     config: AlgorithmConfig = fit(_REGISTERED[kind].config, values, file, path or kind)
     return config
 

@@ -225,7 +225,9 @@ class TD3(ActorCritic):
     @classmethod
     def ddpg(cls, **settings: Any) -> TD3:
         """DDPG (Lillicrap et al. 2016): one critic, no delay, no target noise; or ``settings``."""
-        return cls(**{"twin": False, "policy_delay": 1, "target_noise": 0.0, **settings})
+        return cls(
+            **{"twin": False, "policy_delay": 1, "target_noise": 0.0, "bouts": 0.0, **settings}
+        )
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,14 @@ class Bouts:
     """While one lasts, an environment takes one random action again and again.
 
     Time is cut into spans of ``longest`` rows. In each, every environment has a chance of a bout,
-    which is as long as the span or shorter, and lies somewhere in it. So where bouts are follows
-    from ``seeds`` and the row, and nothing needs to be kept between requests.
+    which is as long as the span or shorter, and lies somewhere in it. The place of each bout
+    follows from ``seeds`` and the row, so nothing needs to be kept between requests.
     """
 
-    at: int  # the request's first row, counted from the start of the stage
+    at: int  # the request's first row, counted from the start of the stage or generation
     chance: float  # of a bout in a span
     longest: int  # rows
-    seeds: Seeds  # the same for all requests of a stage
+    seeds: Seeds  # the same for all requests of a stage or generation
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Request:
     at_random: bool = False  # act at random instead
     greedy: bool = False  # do not explore
     parts: tuple[Request, ...] = ()  # the same of skills that learn below a selector
-    bouts: Bouts | None = None
+    bouts: Bouts | None = None  # None: there are none
 
     def of_collector(self, number: int) -> Request:
         """The same for one of several collectors."""
@@ -110,11 +110,12 @@ class Acting:
         """Act in all environments, in the request's next step; obs (N, …), mask (N, A)."""
         at, self._at = self._at, self._at + 1
         acted = self._act(lambda stack: self._noises[stack][at], obs, mask, memory)
-        if (bouts := self._request.bouts) is not None and not self._request.at_random:
-            self._keep_on(acted.action, bouts, bouts.at + at, mask)
+        request = self._request
+        if request.bouts is not None and not (request.at_random or request.greedy):
+            self._hold_actions(acted.action, request.bouts, request.bouts.at + at, mask)
         return acted
 
-    def _keep_on(self, action: Array, bouts: Bouts, row: int, mask: Array | None) -> None:
+    def _hold_actions(self, action: Array, bouts: Bouts, row: int, mask: Array | None) -> None:
         """Replace what environments do (N, …) that are in a bout, in place."""
         span, place = divmod(row, bouts.longest)
         if self._span is None or self._span.key != (bouts.seeds, span):

@@ -14,7 +14,7 @@ import numpy as np
 from skillweave.collecting.ends import ENDED, Interruption, Why, skill_step
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.infos import allowed_rows
-from skillweave.messages import shortened
+from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked, path_of
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
@@ -85,7 +85,7 @@ class SkillSet:
         if not mask.any(axis=1).all():
             row = int(np.flatnonzero(~mask.any(axis=1))[0])
             names = ", ".join(repr(path_of(s)) for s in self.skills)
-            where = shortened(" ".join(np.array2string(obs[row], precision=3).split()), 200)
+            where = observed(obs[row])
             where += "" if age is None else f", after {int(age[row])} steps of the episode"
             raise SkillweaveError(
                 f"no skill may start in observation {where}: the initiation() of {names} is False "

@@ -15,7 +15,7 @@ from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
 from skillweave.experience import Experience
-from skillweave.messages import shortened
+from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, SkillweaveError, Step
 
@@ -48,8 +48,8 @@ class SkillCollector(Collector):
         reflexes: in force while the skill acts.
         starters: skills that can act already; None: random actions lead to where it may start.
         start_calls: the most calls of theirs that come first; their number is drawn evenly.
-        search_steps: an episode in which the skill may not start so soon begins anew; None: none
-            does.
+        search_steps: an episode begins anew where the skill may not start after so many steps;
+            None: it goes on.
     """
 
     def __init__(
@@ -136,8 +136,7 @@ class SkillCollector(Collector):
         self.obs = raw.next_obs
         over = ended
         if playing is not None:
-            no_longer = raw.terminated | raw.truncated | self._searched_enough()
-            over = np.where(playing, ended, no_longer)
+            over = np.where(playing, ended, raw.terminated | raw.truncated)
         ids = np.flatnonzero(over)
         if len(ids):
             told = ids if playing is None else np.flatnonzero(playing & ended)
@@ -149,7 +148,7 @@ class SkillCollector(Collector):
             free = self._starters.observe(going_on, obs, action, raw)
             left = self.kept["calls_left"]
             left[free] = np.maximum(left[free] - 1, 0)
-            self._look(going_on)
+            self._give_up(self._look(going_on))
 
     def _draw_calls(self) -> None:
         """How many calls of others come first, where an episode has just begun."""
@@ -171,10 +170,14 @@ class SkillCollector(Collector):
             else:
                 self._look(ids)
 
-    def _look(self, ids: Array) -> None:
-        """Whether the skill may start now in environments ``ids`` (k,) that search."""
+    def _look(self, ids: Array) -> Array:
+        """Whether the skill may start now in environments ``ids`` (k,) that search.
+
+        Returns:
+            Those in which it may not.
+        """
         if not len(ids):
-            return
+            return ids
         assert self.skill is not None
         holds = np.ones(len(ids), bool)
         if self._restricted:
@@ -190,17 +193,16 @@ class SkillCollector(Collector):
             raise SkillweaveError(
                 f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps "
                 f"{self._sought()}, so there is nothing to train on; the latest observation was "
-                f"{shortened(np.array2string(self.obs[waiting[0]], precision=3), 300)}. Widen it; "
-                "or put the skills that lead to where it holds before it in skills, as skills are "
-                "trained in that order; or give an environment that starts where it holds"
+                f"{observed(self.obs[waiting[0]])}. Widen it; or put the skills that lead to where "
+                "it holds before it in skills, as skills are trained in that order; or give an "
+                "environment that starts where it holds"
             )
+        return waiting
 
-    def _searched_enough(self) -> Array:
-        """(N,) bool, where the open episode has lasted too long for a skill that may not start."""
-        if self._search_steps is None:
-            return self._never
-        enough: Array = self.kept["age"] >= self._search_steps
-        return enough
+    def _give_up(self, waiting: Array) -> None:
+        """Begin anew where the skill may not start, and has been waited for long enough."""
+        if self._search_steps is not None:
+            self._begin_anew(waiting[self.kept["age"][waiting] >= self._search_steps])
 
     def _given_up(self) -> Array:
         if not self._searches:
@@ -210,9 +212,12 @@ class SkillCollector(Collector):
 
     def _sought(self) -> str:
         """By whom a start was searched for."""
-        if self._starters.skills is None:
-            return "of random acting"
-        return f"of calling {', '.join(repr(s.name) for s in self._starters.skills.skills)}"
+        by = "random acting"
+        if (skills := self._starters.skills) is not None:
+            by = f"calling {', '.join(repr(s.name) for s in skills.skills)}"
+        if self._search_steps is None:
+            return f"of {by}"
+        return f"of {by}, begun anew after {self._search_steps:,} of them (search_steps)"
 
     def _judge(self, obs: Array, action: Array, raw: RawStep, playing: Array | None) -> Judged:
         """What a step was to the skill; anything where it did not play."""

@@ -82,8 +82,8 @@ class Declaration(Nestable):
     can act already, a number drawn for each: it learns where it will be called. None: it starts as
     soon as it may."""
     search_steps: int | None = None
-    """While a skill trains apart, an episode in which it may not start within so many steps begins
-    anew: for environments of several kinds, some of which have nothing for it. None: it goes on."""
+    """While a skill trains apart, an episode begins anew in which it may not start within so many
+    steps: for environments of several kinds, some of which have nothing for it. None: it goes on."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
     call_cost: float = 0.0

@@ -14,21 +14,23 @@ TURNS = 3
 """After so many it has seen all four sides."""
 PACES = 5
 """After so many it looks around again."""
+ENTERING = 3
+"""After so many it looks around for the first time: from a doorway it would not see much."""
 
 
 class LookAround:
-    """Look to all four sides, go straight on for some cells, and look again.
+    """Go straight on for some cells, look to all four sides, go on, and look again.
 
-    It remembers how often it has turned, and how far it has gone since: an agent that sees what is
-    before it alone cannot know whether it has looked behind itself.
+    It remembers how often it has turned, and how far it has gone since: an agent that
+    sees only what is in front of it cannot know whether it has looked behind itself.
     """
 
     observation_space, action_space = SPACE, ACTIONS
     labels: tuple[str, ...] = ()
 
     def start(self, n: int) -> Memory:
-        """It has not looked yet."""
-        return {"turns": np.zeros(n, np.int64), "paces": np.zeros(n, np.int64)}
+        """It goes some cells before it looks."""
+        return {"turns": np.full(n, TURNS), "paces": np.full(n, PACES - ENTERING)}
 
     def act(
         self,

@@ -40,7 +40,7 @@ EMPTY, WALL, FLOOR, DOOR, KEY, BALL, BOX, GOAL = 1, 2, 3, 4, 5, 6, 7, 8
 """What may be in a cell: the first of its three numbers."""
 OPEN, CLOSED, LOCKED = 0, 1, 2
 """A door's state: the third."""
-STEPS = np.abs(np.arange(7) - 3)[:, None] + np.abs(np.arange(7) - 6)[None]
+DISTANCE = np.abs(np.arange(7) - 3)[:, None] + np.abs(np.arange(7) - 6)[None]
 """From where the agent stands to each cell in view, (7, 7)."""
 FAR = 14
 """More than to any of them."""
@@ -79,11 +79,11 @@ def anywhere(cells: Array) -> Array:
 
 
 def steps_to(cells: Array) -> Array:
-    """Steps to the nearest of the cells marked in (n, 7, 7), as the crow flies, (n,).
+    """Steps to the nearest of the cells marked in (n, 7, 7), if nothing were in the way, (n,).
 
-    Of none it is ``FAR``.
+    ``FAR`` where none is marked.
     """
-    found: Array = np.where(cells, STEPS, FAR).min(axis=(1, 2))
+    found: Array = np.where(cells, DISTANCE, FAR).min(axis=(1, 2))
     return found
 
 
@@ -93,7 +93,7 @@ def shut(cells: Array) -> Array:
     return found
 
 
-def opened(obs: Array) -> Array:
+def at_open_door(obs: Array) -> Array:
     """The agent stands before an open door, (n,) bool."""
     cells = ahead(obs)
     found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
@@ -182,22 +182,22 @@ class RoomPool:
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
         """Draw rooms, and begin there."""
         self._room[ids] = [self._rngs[i].integers(len(self._pools)) for i in ids]
-        seen = np.empty((len(ids), *SPACE.shape), np.uint8)
+        found = np.empty((len(ids), *SPACE.shape), np.uint8)
         for pool, rows in self._by_room(ids):
             obs, _ = pool.reset(ids[rows])
-            seen[rows] = obs["image"]
-        return seen, {}
+            found[rows] = obs["image"]
+        return found, {}
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Act, each in its room."""
         n = len(ids)
-        seen, reward = np.empty((n, *SPACE.shape), np.uint8), np.empty(n, np.float32)
+        found, reward = np.empty((n, *SPACE.shape), np.uint8), np.empty(n, np.float32)
         terminated, truncated = np.empty(n, bool), np.empty(n, bool)
         for pool, rows in self._by_room(ids):
             obs, *told, _ = pool.step(action[rows], ids[rows])
-            seen[rows] = obs["image"]
+            found[rows] = obs["image"]
             reward[rows], terminated[rows], truncated[rows] = told
-        return seen, (reward > 0).astype(np.float32), terminated, truncated, {}
+        return found, (reward > 0).astype(np.float32), terminated, truncated, {}
 
     def _by_room(self, ids: Array) -> list[tuple[Any, Array]]:
         """Rooms that are in use, and which rows of ``ids`` are there."""

@@ -32,11 +32,11 @@ from skillweave.recipes._rooms import (
     TOGGLE,
     ahead,
     anywhere,
+    at_open_door,
     between_walls,
     free,
     holds,
     in_view,
-    opened,
     seen,
     shut,
     spec,
@@ -50,7 +50,10 @@ class Errand(Skill):
     max_steps = 32
 
     def reward(self, step: Step) -> Array:
-        """1 where it is done; before, 0.04 for each cell that it comes nearer; less 0.02 a step."""
+        """1 where it is done; before, 0.04 for each cell that it comes nearer; less 0.02 a step.
+
+        Nearer to what it aims at: a skill without an aim is paid for its end alone.
+        """
         before, after = steps_to(self.aim(step.obs)), steps_to(self.aim(step.next_obs))
         found: Array = np.where(self.success(step), 1.0, 0.04 * (before - after)) - 0.02
         return found
@@ -158,14 +161,14 @@ class OpenDoor(Errand):
         return seen(obs, DOOR, state=CLOSED) | locked
 
     def reward(self, step: Step) -> Array:
-        """To shut an open door costs as much: else it does so, and opens it again."""
-        shuts = (step.action == TOGGLE) & opened(step.obs) & shut(ahead(step.next_obs))
-        found: Array = super().reward(step) - shuts
+        """It loses 1 where it shuts a door: else it would do so to open it again."""
+        shuts = at_open_door(step.obs) & shut(ahead(step.next_obs)) & (step.action == TOGGLE)
+        found: Array = np.where(shuts, -1.02, super().reward(step))
         return found
 
     def success(self, step: Step) -> Array:
         """The door before it is open now."""
-        now_open = shut(ahead(step.obs)) & opened(step.next_obs)
+        now_open = shut(ahead(step.obs)) & at_open_door(step.next_obs)
         found: Array = now_open & (step.action == TOGGLE)
         return found
 

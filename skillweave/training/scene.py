@@ -67,7 +67,7 @@ def skill_scene(
     Args:
         starters: skills that can act already: they lead to where the skill may start.
         start_calls: an episode begins after up to so many calls of theirs.
-        search_steps: an episode in which it may not start so soon begins anew.
+        search_steps: an episode begins anew where it may not start after so many steps.
     """
 
     def collector(

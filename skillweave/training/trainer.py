@@ -215,7 +215,21 @@ class OneAgent:
             # What was collected since the update was made, too.
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
+        if self._learnt_nothing():
+            log.tell(
+                f"it learnt nothing in {log.at['steps']:,} steps, as too few of them were its own: "
+                "perhaps its initiation() seldom holds where the others lead. Widen it, or give "
+                "more steps"
+            )
         return self.policies()
+
+    def _learnt_nothing(self) -> bool:
+        """Whether its weights are those that it began with."""
+        (stack,) = self.learner.stacks
+        fresh = self.algorithm.init([self.stage.seeds / "member" / 0])
+        before = AgentPolicy.of(self.algorithm, fresh).weights
+        after = AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu")).weights
+        return all(torch.equal(after[name], before[name]) for name in before)
 
     def close(self) -> None:
         """Release the environments."""

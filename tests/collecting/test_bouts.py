@@ -6,10 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave import DQN, TD3, Network
+from skillweave import DQN, SAC, TD3, Network
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Bouts, Request
 from skillweave.seeding import Seeds
+from skillweave.training.learner import Stack
+from skillweave.training.replay_learner import learner_of
 
 N, LONGEST = 64, 12
 OBS = np.zeros((N, 3), np.float32)  # all see the same, so one who does not explore does the same
@@ -74,9 +76,44 @@ def test_a_falling_chance_leaves_out_bouts_and_moves_none(steering):
 def test_nobody_is_in_a_bout_who_acts_greedily(steering):
     acting, params = steering
     own = played(acting, params, 0, 1, chance=0.0)[0, 0]
-    # Evaluations are asked for without bouts.
-    acting.begin(Request(3, (params,), np.ones(1), Seeds(2), greedy=True))
-    np.testing.assert_array_equal(acting.all(OBS, None, None).action, np.tile(own, (N, 1)))
+    done = played(acting, params, 0, 2 * LONGEST, chance=1.0, greedy=True)
+    assert (done == own).all()
+
+
+def test_nobody_is_in_a_bout_who_acts_at_random(steering):
+    done = played(*steering, 0, 2 * LONGEST, chance=1.0, at_random=True)
+    assert (done[1:] != done[:-1]).any(-1).all()
+
+
+def test_members_of_a_stack_have_the_bouts_that_they_have_alone():
+    algorithm = make_algorithm(TD3(network=NET, exploration_noise=0.0), SPACE, STEER)
+    members = [algorithm.acting_params(algorithm.init([Seeds(m)]), 1.0) for m in range(3)]
+    three = algorithm.acting_params(algorithm.init([Seeds(m) for m in range(3)]), 1.0)
+    stacks = Acting([(algorithm, 3)], 3 * N), Acting([(algorithm, 1), (algorithm, 2)], 3 * N)
+    two = algorithm.acting_params(algorithm.init([Seeds(m) for m in (1, 2)]), 1.0)
+    obs, found = np.zeros((3 * N, 3), np.float32), []
+    for acting, params in zip(stacks, ((three,), (members[0], two)), strict=True):
+        bouts = Bouts(0, 1.0, LONGEST, Seeds(1))
+        acting.begin(Request(LONGEST, params, np.ones(3), Seeds(2), bouts=bouts))
+        found.append(np.stack([acting.all(obs, None, None).action for _ in range(LONGEST)]))
+    np.testing.assert_allclose(*found, atol=1e-6)
+    alone = played(Acting([(algorithm, 1)], N), members[0], 0, LONGEST, chance=1.0)
+    np.testing.assert_allclose(found[0][:, :N], alone, atol=1e-6)
+    assert (found[0][:, :N] != found[0][:, N : 2 * N]).any()
+
+
+def test_a_learner_counts_rows_from_the_start_of_its_stage_and_asks_for_fewer_bouts_in_the_end():
+    config = SAC(num_envs=4, train_freq=3, bouts=0.4, bout_steps=7, network=NET)
+    algorithm = make_algorithm(config, SPACE, STEER)
+    stack = Stack(algorithm, algorithm.init([Seeds(0)]))
+    learner = learner_of(stack, 4, Seeds(5))
+    asked = [learner.request(u, 0, progress).bouts for u, progress in ((0, 0.0), (1, 0.5), (9, 1))]
+    assert [b.at for b in asked] == [0, 3, 27]
+    assert [b.chance for b in asked] == pytest.approx([0.4, 0.2, 0.0])
+    assert {(b.longest, b.seeds) for b in asked} == {(7, asked[0].seeds)}
+    never = make_algorithm(SAC(bouts=0.0, network=NET), SPACE, STEER)
+    quiet = learner_of(Stack(never, never.init([Seeds(0)])), 8, Seeds(5))
+    assert quiet.request(0, 0, 0.0).bouts is None
 
 
 def test_a_forbidden_action_is_not_taken():

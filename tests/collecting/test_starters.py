@@ -139,9 +139,19 @@ def test_an_episode_in_which_it_may_not_start_begins_anew():
     found = collector_of(search_steps=9).collect(next(requests(200))).experience
     assert not found.valid.any()
     assert set(np.unique(found.obs[:, :, T])) == set(range(9))
-    # Who has started is not disturbed.
-    found = collector_of(Forward, search_steps=22).collect(next(requests(200))).experience
+    # The step that leads there counts still, and who has started is not disturbed.
+    found = collector_of(Forward, search_steps=20).collect(next(requests(200))).experience
     assert set(np.unique(found.obs[:, :, T][found.valid])) == set(range(20, 25))
+    with pytest.raises(SkillweaveError, match=r"begun anew after 19 of them \(search_steps\)"):
+        collector_of(Forward, search_steps=19).collect(next(requests(6_000)))
+
+
+def test_where_it_may_start_the_calls_that_come_first_take_their_time():
+    collector = collector_of(Five, skill=Anywhere, start_calls=6, search_steps=3)
+    found = collector.collect(next(requests(2_000))).experience
+    before = np.concatenate([np.zeros((1, N), bool), found.valid[:-1]])
+    began = found.valid & (~before | (found.obs[:, :, T] == 0))
+    assert set(np.unique(found.obs[:, :, X][began] / 5)) == set(range(7))
 
 
 @pytest.mark.parametrize(
