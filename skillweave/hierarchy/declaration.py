@@ -83,7 +83,7 @@ class Declaration(Nestable):
     soon as it may."""
     search_steps: int | None = None
     """While a skill trains apart, an episode begins anew in which it may not start within so many
-    steps: for environments of several kinds, some of which have nothing for it. None: it goes on."""
+    steps: for environments of several kinds, where some have nothing for it. None: it goes on."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
     call_cost: float = 0.0

@@ -258,7 +258,7 @@ def declare(rooms: str = "small", **how: Any) -> Hierarchy:
 
 def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """The hierarchy in these rooms with skills that are there already, by name."""
-    found = declare(rooms, **({"selector_steps": 1_000_000} | how))
+    found = declare(rooms, **({"selector_steps": 1_500_000} | how))
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found

@@ -137,6 +137,14 @@ class RolloutLearner:
             self.anchor.coef = coef.to(self.anchor.coef.device)
 
 
+def keep_to_guide(learner: Learner, nats: float | None) -> None:
+    """Let a selector stay near its guide, so many nats of KL; None: it need not."""
+    if nats is not None and isinstance(learner, RolloutLearner):
+        (stack,) = learner.stacks
+        coef = torch.ones(stack.members, device=stack.state.params.device)
+        learner.anchor = Anchor(None, coef, nats)
+
+
 def adapted(coef: Tensor, kl: Tensor, nats: float) -> Tensor:
     """What a nat of KL costs from now on, so that KL comes near ``nats``; (P,) each.
 

@@ -17,14 +17,13 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
-from skillweave.experience import Anchor
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.learner import Learner, RolloutLearner, Stack
+from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.loop import Progress, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import learner_of
@@ -238,14 +237,6 @@ class OneAgent:
 
 def _collector(scene: Scene, algorithm: Algorithm, num_envs: int, first: int) -> Collector:
     return scene.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
-
-
-def keep_to_guide(learner: Learner, nats: float | None) -> None:
-    """Let a selector stay near its guide, so many nats of KL; None: it need not."""
-    if nats is not None and isinstance(learner, RolloutLearner):
-        (stack,) = learner.stacks
-        coef = torch.ones(stack.members, device=stack.state.params.device)
-        learner.anchor = Anchor(None, coef, nats)
 
 
 class _TargetReached(Exception):

@@ -27,12 +27,12 @@ from skillweave.ops.threads import torch_threads
 from skillweave.runs.states import load_state
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
-from skillweave.training.learner import Learner, RolloutLearner, Stack
+from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
 from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.training.stage_log import StageLog
-from skillweave.training.trainer import OneAgent, StageRun, keep_to_guide
+from skillweave.training.trainer import OneAgent, StageRun
 from skillweave.training.woven_learner import WovenLearner, decides
 from skillweave.types import Array, prefixed, unprefixed
 

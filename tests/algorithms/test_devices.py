@@ -23,8 +23,7 @@ from skillweave.experience import Anchor, Rollout, Sample
 from skillweave.networks.config import CNN, RNN
 from skillweave.ops.device import Constant, all_false, on_host, resolve_device
 from skillweave.seeding import Seeds
-from skillweave.training.learner import RolloutLearner, Stack
-from skillweave.training.trainer import keep_to_guide
+from skillweave.training.learner import RolloutLearner, Stack, keep_to_guide
 
 P, T, B = 2, 4, 3
 SMALL: dict[str, Any] = {"network": Network((8,)), "normalize_obs": True}
