@@ -12,16 +12,15 @@ for PPO and 300,000 for the others.
 from __future__ import annotations
 
 import argparse
-import tempfile
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from benchmarks.common import median, report, table, workers
-from skillweave import DQN, PPO, SAC, TD3, EnvSpec, train_agent
+from benchmarks.learning import scored
+from skillweave import DQN, PPO, SAC, TD3, EnvSpec
 
 ALGORITHMS: dict[str, Any] = {"ppo": PPO(), "dqn": DQN(), "sac": SAC(), "td3": TD3()}
 EPISODES = 50
@@ -79,14 +78,8 @@ def at_random(name: str) -> float:
 def learn(case: Case, seed: int, compile: bool) -> dict[str, Any]:
     """One run, scored on Gymnasium's environment with seeds that training never saw."""
     algorithm = ALGORITHMS[case.algorithm]
-    if compile and case.algorithm != "ppo":
-        algorithm = replace(algorithm, compile=True)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "run"
-        run = train_agent(EnvSpec(case.env), algorithm, case.steps, path, seed=seed, quiet=True)
-        score = run.evaluate(EPISODES).mean
-        seconds = run.info()["stages"][0]["seconds"]
-    chance = at_random(case.env)
+    found, seconds = scored(EnvSpec(case.env), algorithm, case.steps, seed, EPISODES, compile)
+    score, chance = found.mean, at_random(case.env)
     share = (score - chance) / (case.reference - chance)
     return {
         "algorithm": case.algorithm, "env": case.env, "steps": case.steps, "seed": seed,

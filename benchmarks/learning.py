@@ -21,6 +21,7 @@ import gymnasium as gym
 
 from benchmarks.common import median, report, table, workers
 from skillweave import DQN, PPO, RNN, SAC, TD3, EnvSpec, Network, recipes, train_agent
+from skillweave.training.evaluation import Evaluation
 
 
 @dataclass(frozen=True)
@@ -169,17 +170,22 @@ FIGURES = {
 }
 
 
-def learn(name: str, seed: int, compile: bool = False) -> dict[str, Any]:
-    figure = FIGURES[name]
-    algorithm = figure.algorithm
+def scored(
+    env: EnvSpec, algorithm: Any, steps: int, seed: int, episodes: int, compile: bool
+) -> tuple[Evaluation, float]:
+    """Train one agent; its score in as many episodes, and the seconds of training."""
     if compile and isinstance(algorithm, DQN | SAC | TD3):
         algorithm = replace(algorithm, compile=True)
     with tempfile.TemporaryDirectory() as folder:
-        run = train_agent(
-            figure.env, algorithm, figure.steps, Path(folder) / "run", seed=seed, quiet=True
-        )
-        score = run.evaluate(figure.episodes)
-        seconds = run.info()["stages"][0]["seconds"]
+        run = train_agent(env, algorithm, steps, Path(folder) / "run", seed=seed, quiet=True)
+        return run.evaluate(episodes), run.info()["stages"][0]["seconds"]
+
+
+def learn(name: str, seed: int, compile: bool = False) -> dict[str, Any]:
+    figure = FIGURES[name]
+    score, seconds = scored(
+        figure.env, figure.algorithm, figure.steps, seed, figure.episodes, compile
+    )
     return {
         "figure": name,
         "seed": seed,

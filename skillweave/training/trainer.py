@@ -214,12 +214,13 @@ class OneAgent:
             # What was collected since the update was made, too.
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
-        if self._learnt_nothing():
-            log.tell(
-                f"it learnt nothing in {log.at['steps']:,} steps, as too few of them were its own: "
-                "perhaps its initiation() seldom holds where the others lead. Widen it, or give "
-                "more steps"
-            )
+        else:
+            if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
+                log.tell(
+                    f"it learnt nothing in {log.at['steps']:,} steps, as too few of them were its "
+                    "own: perhaps its initiation() seldom holds where the others lead. Widen it, "
+                    "or give more steps"
+                )
         return self.policies()
 
     def _learnt_nothing(self) -> bool:

@@ -189,10 +189,6 @@ class WovenAgents(OneAgent):
                 )
         return found
 
-    def _learnt_nothing(self) -> bool:
-        """They are told one by one."""
-        return False
-
     def policies(self) -> dict[str, AgentPolicy]:
         """By name, who learns, as they are now."""
         stacks = zip(self.algorithms, self.learner.stacks, strict=True)
