@@ -129,11 +129,11 @@ class Glide(Skill):
 
 def calls(random_lengths: bool, steps: int) -> float:
     skills = [type(name, (Glide,), {"ends": random_lengths})() for name in ("One", "Two", "Three")]
-    small = PPO(num_envs=64, n_steps=64, network=Network((64, 64), "tanh"))
+    small = PPO(num_envs=64, n_steps=64, update_epochs=4, network=Network((64, 64), "tanh"))
     hierarchy = Hierarchy(
         "LunarLander-v3", skills, call_steps=64 if random_lengths else 32, algorithm=small,
-        selector=PPO(num_envs=256, n_steps=256, network=NETWORK), skill_steps=5_000,
-        selector_steps=steps,
+        selector=PPO(num_envs=256, n_steps=256, update_epochs=4, network=NETWORK),
+        skill_steps=5_000, selector_steps=steps,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", quiet=True)

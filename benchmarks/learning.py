@@ -73,6 +73,7 @@ RECURRENT = PPO(
     num_envs=16,
     n_steps=64,
     batch_size=256,
+    update_epochs=4,
     learning_rate=2e-3,
     ent_coef=0.0,
     normalize_obs=False,
@@ -158,7 +159,14 @@ FIGURES = {
     ),
     "image": Figure(
         FREEWAY,
-        PPO(n_steps=128, batch_size=1024, gamma=0.99, gae_lambda=0.95, network=small(64)),
+        PPO(
+            n_steps=128,
+            batch_size=1024,
+            update_epochs=4,
+            gamma=0.99,
+            gae_lambda=0.95,
+            network=small(64),
+        ),
         2_000_000,  # after 1M: 45.6 (40.0 at worst)
         50.0,
         "Young & Tian 2019, DQN after 5M frames: about 50 (fig. 3)",

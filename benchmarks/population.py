@@ -51,7 +51,7 @@ def speed(members: int, config: PPO, steps: int, seed: int) -> float:
 
 def together_and_alone(seeds: list[int], steps: int) -> tuple[list[list[Any]], float]:
     """Figure 1: rows, and the median ratio."""
-    each = PPO(num_envs=ENVS, n_steps=64, batch_size=128)
+    each = PPO(num_envs=ENVS, n_steps=64, batch_size=128, update_epochs=4)
     whole = replace(each, num_envs=ENVS * MEMBERS, batch_size=128 * MEMBERS)
     rows = []
     for seed in seeds:

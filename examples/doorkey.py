@@ -94,8 +94,8 @@ class Goal(sw.Skill):
 def algorithm(**how: Any) -> sw.PPO:
     """Who learns. A cell's numbers are kinds of things, not brightnesses: ``encoder="cells"``."""
     return sw.PPO(
-        num_envs=16, n_steps=128, gamma=0.99, gae_lambda=0.95, learning_rate_schedule="constant",
-        network=sw.Network(hidden=(64,), encoder="cells"), **how,
+        num_envs=16, n_steps=128, update_epochs=4, gamma=0.99, gae_lambda=0.95,
+        learning_rate_schedule="constant", network=sw.Network(hidden=(64,), encoder="cells"), **how,
     )  # fmt: skip
 
 

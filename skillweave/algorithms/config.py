@@ -73,7 +73,7 @@ class PPO(OnPolicy):
 
     batch_size: int = 256
     """Samples of one gradient step (a minibatch), about; a smaller rollout is one minibatch."""
-    update_epochs: int = 4
+    update_epochs: int = 10
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
     """constant; linear: falls to 0 over the budget; kl: follows target_kl."""

@@ -82,6 +82,7 @@ LANDING = PPO(
     gamma=0.98,
     gae_lambda=0.95,
     batch_size=1024,
+    update_epochs=4,
     ent_coef=0.05,
     ent_coef_final=0.002,
     network=RELU,
@@ -90,12 +91,13 @@ SELECTOR = PPO(
     num_envs=128,  # fewer, longer steps of the engine: acting costs nearly the same for all
     n_steps=80,  # 8 calls
     batch_size=512,
+    update_epochs=4,
     gamma=0.999,
     gae_lambda=0.98,
     normalize_obs=False,
     network=RELU,
 )
-FLAT = PPO(gamma=0.999, gae_lambda=0.98, network=RELU)
+FLAT = PPO(gamma=0.999, gae_lambda=0.98, update_epochs=4, network=RELU)
 
 hierarchy = Hierarchy(
     env="LunarLander-v3",

@@ -90,6 +90,7 @@ LEARNER = PPO(
     gamma=0.995,
     gae_lambda=0.97,
     batch_size=1024,
+    update_epochs=4,
     network=Network(activation="relu"),
 )
 

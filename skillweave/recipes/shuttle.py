@@ -136,7 +136,15 @@ RUNNER = PPO(
     ent_coef=0.0,
     network=replace(RELU, encoder="half-cheetah's body"),
 )
-SELECTOR = PPO(num_envs=64, n_steps=64, batch_size=128, gamma=0.995, gae_lambda=0.95, network=RELU)
+SELECTOR = PPO(
+    num_envs=64,
+    n_steps=64,
+    batch_size=128,
+    update_epochs=4,
+    gamma=0.995,
+    gae_lambda=0.95,
+    network=RELU,
+)
 
 # At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort
 # costs, and would stand still; and skills learn to turn where others have run. In the end a few
