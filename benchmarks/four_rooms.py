@@ -69,7 +69,7 @@ VALUES = DQN(
 )  # fmt: skip
 JUDGED = PPO(
     num_envs=512, n_steps=16, gamma=GAMMA, network=Network(()), normalize_obs=False,
-    learning_rate=3e-3, batch_size=256, update_epochs=4,
+    learning_rate=3e-3, batch_size=256, update_epochs=4, gae_lambda=0.98,
 )  # fmt: skip
 CURVE: dict[str, Any] = {
     "num_envs": 1, "gamma": GAMMA, "network": Network(()), "learning_rate": 0.01, "loss": "mse",

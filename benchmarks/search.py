@@ -36,7 +36,12 @@ EVOLVED = Evolution(4, GENERATIONS, episodes=20, start="random", mutations=MUTAT
 # One generation: whoever is best at the end of training.
 RANDOM = {draws: replace(EVOLVED, population=draws, generations=1) for draws in (4, 8)}
 MEMBER = PPO(
-    num_envs=16, n_steps=64, batch_size=128, update_epochs=4, network=Network((64, 64), "relu")
+    num_envs=16,
+    n_steps=64,
+    batch_size=128,
+    update_epochs=4,
+    gae_lambda=0.98,
+    network=Network((64, 64), "relu"),
 )
 WAYS: dict[str, tuple[PPO, int, Evolution | None]] = {
     "evolution": (MEMBER, BUDGET // 4, EVOLVED),

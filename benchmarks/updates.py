@@ -37,7 +37,11 @@ def rollout(members: int, samples: int) -> Rollout:
 def seconds(members: int, samples: int, repeats: int) -> float:
     space = gym.spaces.Box(-np.inf, np.inf, (8,))
     config = PPO(
-        num_envs=1, n_steps=samples, batch_size=samples, network=Network(activation="relu")
+        num_envs=1,
+        n_steps=samples,
+        batch_size=samples,
+        update_epochs=4,
+        network=Network(activation="relu"),
     )
     algorithm = PPOAlgorithm(config, space, gym.spaces.Discrete(4))
     seeds = [Seeds(0) / m for m in range(members)]

@@ -103,7 +103,12 @@ def declare(steps: int = 150_000, **how: Any) -> sw.Hierarchy:
     """The hierarchy of both errands; ``how`` changes any setting of the upper one."""
     env = sw.EnvSpec(Errands, workers=1)
     learner = sw.PPO(
-        num_envs=16, n_steps=128, update_epochs=4, gamma=0.97, network=sw.Network(hidden=(64, 64))
+        num_envs=16,
+        n_steps=128,
+        update_epochs=4,
+        gamma=0.97,
+        gae_lambda=0.98,
+        network=sw.Network(hidden=(64, 64)),
     )
     settings = {"algorithm": learner, "selector": learner, "call_cost": 0.01}
     settings |= {"skill_steps": steps // 8, "selector_steps": steps // 8, "greedy_skills": False}

@@ -79,7 +79,7 @@ class PPO(OnPolicy):
     """constant; linear: falls to 0 over the budget; kl: follows target_kl."""
     adam_eps: float = 1e-5
     """Adam's ε."""
-    gae_lambda: float = 0.98
+    gae_lambda: float = 0.95
     """λ of generalised advantage estimation."""
     clip_coef: float = 0.2
     """ε of the clipped surrogate."""

@@ -203,7 +203,9 @@ class ActorCritic(OffPolicy):
 class TD3(ActorCritic):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
 
-    exploration_noise: float = 0.1
+    n_step: int = 3
+    """Steps of reward in a target before it bootstraps (Sutton 1988)."""
+    exploration_noise: float = 0.2
     """Deviation of the noise on actions, where a bounded range spans [−1, 1]."""
     policy_delay: int = 2
     """Critic updates for each update of the actor and the targets."""
@@ -213,7 +215,7 @@ class TD3(ActorCritic):
     """Largest noise on the target's actions."""
     twin: bool = True
     """The smaller of two critics is the target's; else there is one critic."""
-    actor_rate: float = 1.0
+    actor_rate: float = 0.3
     """The actor's learning rate, as a share of the critics'."""
 
     def __post_init__(self) -> None:
@@ -225,9 +227,11 @@ class TD3(ActorCritic):
     @classmethod
     def ddpg(cls, **settings: Any) -> TD3:
         """DDPG (Lillicrap et al. 2016): one critic, no delay, no target noise; or ``settings``."""
-        return cls(
-            **{"twin": False, "policy_delay": 1, "target_noise": 0.0, "bouts": 0.0, **settings}
-        )
+        plain = {
+            "twin": False, "policy_delay": 1, "target_noise": 0.0, "bouts": 0.0, "n_step": 1,
+            "exploration_noise": 0.1, "actor_rate": 1.0,
+        }  # fmt: skip
+        return cls(**{**plain, **settings})
 
 
 @dataclass(frozen=True)
