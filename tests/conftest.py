@@ -2,9 +2,11 @@
 
 import importlib.util
 import os
+from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # here, in each worker, and in what tests start
 
+import pytest
 import torch
 from hypothesis import settings
 
@@ -17,3 +19,14 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
 
     # Before anything else imports these: `from … import gae` then finds what is checked.
     check_shapes("returns", "losses", "distributions", "optim")
+
+
+@pytest.fixture(autouse=True)
+def forget_registered() -> Iterator[None]:
+    """Algorithms that a test registers are forgotten after it."""
+    from skillweave.algorithms import config
+
+    known = dict(config._REGISTERED)
+    yield
+    config._REGISTERED.clear()
+    config._REGISTERED.update(known)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -370,8 +371,8 @@ WRONG = {
         "inner: .*Acrobot-v1.*CartPole-v1",
     ),
     "other settings of it": (
-        lambda: declare(inside(env=EnvSpec("CartPole-v1", engine="sync"))),
-        "inner: .*workers",
+        lambda: declare(inside(env=EnvSpec("CartPole-v1", workers=1))),
+        "inner: .*engine",
     ),
     "itself": (itself, "inner/loop is a hierarchy that contains itself"),
     "itself later": (gains_itself, "again is a hierarchy that contains itself"),
@@ -402,6 +403,12 @@ def test_bad_declarations_are_told_by_path(case):
     make, told = WRONG[case]
     with pytest.raises(SkillweaveError, match=told):
         make()
+
+
+def test_how_many_processes_step_the_environments_is_said_by_the_outermost():
+    found = declare(learn="together")
+    found.env = replace(found.spec, workers=2)
+    found.check_spaces()
 
 
 def test_errors_of_skills_below_name_their_path(tmp_path):

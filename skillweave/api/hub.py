@@ -27,6 +27,7 @@ def push_run(path: Path, name: str, private: bool = False) -> dict[str, Any]:
     """Put the run at ``path`` on the hub; see ``Run.push``."""
     hub.hub()  # a missing extra is said first
     run, name = RunDirectory.open(path), hub.check_name(name)
+    hub.must_be_own(run.path)
     hub.check_whole(run)
     files: dict[str, Path | bytes] = {}
     own, stays = hub.run_files(run)
@@ -56,7 +57,8 @@ def from_hub(
 
     Only data comes from there: safetensors and JSON, checked like any run's files. It needs the
     extra ``hub``. The files are kept where ``huggingface_hub`` keeps its own (``HF_HOME``), and
-    without a network a run is loaded from there.
+    without a network a run is loaded from there. Nothing is written into that copy: to save an
+    evaluation or a report in the run, take a copy of your own (``skillweave pull``).
 
     Args:
         name: ``owner/name``.
@@ -87,12 +89,13 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
     if path.exists():
         raise SkillweaveError(f"{path} is there already; choose another folder")
     found = hub.download(hub.check_name(name), revision)
-    RunDirectory.open(found)
+    manifest = hub.public(RunDirectory.open(found).manifest)  # older versions pushed all of it
     part = path.with_name(f".{path.name}.part")
     try:
         (part / "policies").mkdir(parents=True)
         for file in (f for pattern in hub.WANTED for f in found.glob(pattern)):
             shutil.copy(file, part / file.relative_to(found))
+        RunDirectory(part, manifest).save()
         part.rename(path)
     except OSError as error:
         raise SkillweaveError(f"could not write {path}: {error.strerror or error}") from error

@@ -16,6 +16,7 @@ from skillweave.messages import as_path, whole_number
 from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import render_policy
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import must_be_own
 from skillweave.runs.trackers import track_film
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
@@ -80,11 +81,13 @@ class Run:
             Returns, lengths, and what each skill did.
 
         Raises:
-            SkillweaveError: there is no such skill, or it was asked to save the evaluation of one
-                skill alone.
+            SkillweaveError: there is no such skill; or it was asked to save the evaluation of one
+                skill alone, or in a run of ``from_hub``.
         """
         if save and skill is not None:
             raise SkillweaveError("save keeps an evaluation of the whole policy: leave out skill")
+        if save:
+            must_be_own(self.path)  # said before anything is played
         found = evaluate(
             self._policy(skill),
             self.declaration.spec,
@@ -121,6 +124,7 @@ class Run:
             ``path``, and what was filmed, as plain JSON.
         """
         policy, path = self._policy(skill), as_path(path, "path")
+        must_be_own(path.parent)
         seed = whole_number(seed, "seed", 0)
         plain = isinstance(self.declaration, PlainAgent)
         skills = () if plain else self.hierarchy.skills

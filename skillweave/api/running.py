@@ -18,6 +18,7 @@ from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, short
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
 from skillweave.runs.trackers import make_trackers
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
@@ -111,6 +112,7 @@ def go_on(
     cluster: Ray | None,
 ) -> Run:
     """Train what is left of a run."""
+    must_be_own(run.path)
     with ExitStack() as stack:
         stack.callback(run.close)
         run.begin()

@@ -10,9 +10,10 @@ import itertools
 import platform
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from skillweave.api.running import begun, finish
 from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.processes import ProcessEnded, processes
+from skillweave.cli.sweep_code import MARK, must_be_same_code
 from skillweave.cli.sweep_table import summary
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.shipping import packed, unpacked
@@ -33,10 +35,10 @@ from skillweave.types import SkillweaveError
 
 MOST = 10_000
 """Runs of a sweep."""
-MARK = ".sweep"
-"""An empty file in the sweep's directory, by which a machine knows that it sees it."""
 RETRIES = 20
 """How often Ray begins a run again whose machine was lost; it goes on from its checkpoint."""
+EVALUATION_SEED = 0
+"""Picks the episodes of each run's evaluation, which is greedy."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,10 @@ class Job:
                 )
             hierarchy = unpacked(code)
             trained = finish(hierarchy, self._manifest(hierarchy), self.path)
-            return float(trained.evaluate(self.evaluate, save=True).mean)
+            found = trained.evaluate(
+                self.evaluate, seed=EVALUATION_SEED, deterministic=True, save=True
+            )
+            return float(found.mean)
         except SkillweaveError as error:
             return str(error)
         except Exception as error:
@@ -75,9 +80,11 @@ class Job:
             saved = load_evaluation(run)
         except SkillweaveError as error:
             return str(error)
-        if saved is None or len(saved.evaluation.returns) != self.evaluate:
+        if saved is None:
             return None
-        return float(saved.evaluation.mean)
+        ours = saved.deterministic and saved.seed == EVALUATION_SEED
+        whole = len(saved.evaluation.returns) == self.evaluate
+        return float(saved.evaluation.mean) if ours and whole else None
 
     def _manifest(self, hierarchy: Hierarchy) -> dict[str, Any]:
         return training.manifest(hierarchy, seed=self.seed, flat=self.flat)
@@ -98,12 +105,12 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
     out = (command.out or Path("runs") / f"{name}-sweep").absolute()
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / MARK).touch()
     except OSError as error:
         raise SkillweaveError(f"could not write {out}: {error.strerror}") from error
     found: dict[Job, float | str] = {}
     jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
     for settings, hierarchy in _hierarchies(command, choices):
+        must_be_same_code(out, command.recipe)  # each time, as the recipe was read anew
         code = packed(hierarchy, command.recipe)
         for seed in seeds:
             path = out / _file_name(settings, seed)
@@ -192,30 +199,56 @@ def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, 
             try:
                 yield due[future], future.result()
             except ProcessEnded as error:
-                raise SkillweaveError(
-                    f"{error}; runs that are finished are kept, and the same command goes on "
-                    "(fewer at once: --jobs)"
-                ) from None
+                says = f"{error}; the same command goes on with it (fewer at once: --jobs)"
+                yield due[future], says
 
 
 def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
     """Each run as a task of Ray; one whose machine is lost goes on elsewhere."""
     cluster = Ray(address=command.ray or None)
     with cluster.joined(command.jobs or cores()) as ray:
-        kind = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_run)
+        from skillweave.collecting.actors import LOST, check_versions
+
+        kind = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_task())
+        good = [(metadata.version("skillweave"), platform.python_version())]
         codes = {code: ray.put(code) for code in {code for code, _ in tasks}}
-        waiting, due = list(reversed(tasks)), dict[Any, Job]()
+        waiting, due = list(reversed(tasks)), dict[Any, tuple[bytes, Job]]()
         while waiting or due:
             while waiting and len(due) < (command.jobs or MOST):
                 code, job = waiting.pop()
-                due[kind.remote(job, codes[code])] = job
+                due[kind.remote(astuple(job), codes[code], good)] = code, job
             (ref, *_), _ = ray.wait(list(due))
-            job = due.pop(ref)
+            code, job = due.pop(ref)
             try:
-                yield job, ray.get(ref)
-            except ray.exceptions.RayError as error:
+                there, result = ray.get(ref)
+            except LOST as error:
                 yield job, f"its process was lost again and again: {told(error)}"
+            except ray.exceptions.RayError as error:
+                yield job, told(error)
+            else:
+                if there is None:
+                    yield job, result
+                    continue
+                check_versions(there)  # Python's last digit may be another
+                good.append((there["Skillweave"], there["Python"]))
+                waiting.append((code, job))
 
 
-def _run(job: Job, code: bytes) -> float | str:
-    return job.run(code)
+def _task() -> Callable[..., Any]:
+    """A run as Ray does it: what runs on a node, or None where that is good; and the result.
+
+    It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
+    """
+    from skillweave.collecting.stationed import actor_class
+
+    place = actor_class()()
+
+    def task(job: tuple[Any, ...], code: bytes, good: Sequence[tuple[str, str]]) -> Any:
+        there = place.versions()
+        if (there["Skillweave"], there["Python"]) not in good:
+            return there, None
+        from skillweave.cli.sweep import Job
+
+        return None, Job(*job).run(code)
+
+    return task

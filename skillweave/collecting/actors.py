@@ -199,7 +199,7 @@ class ActorWorker:
             if self._versions is not None:
                 self._actors.wait_for(self._versions)
                 self.place = ray.get(self._versions)
-                _check_versions(self.place)
+                check_versions(self.place)
                 self._versions = None
             error, answer = ray.get(ref)
         except LOST as lost:
@@ -243,7 +243,7 @@ def _full(error: Exception) -> SkillweaveError:
     )
 
 
-def _check_versions(there: dict[str, Any]) -> None:
+def check_versions(there: dict[str, Any]) -> None:
     """Raise a SkillweaveError where a node runs something else."""
     here = {"Skillweave": metadata.version("skillweave"), "Python": platform.python_version()}
     for name, mine in here.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,9 @@ class Collected:
 
     experience: Experience
     episodes: Array  # (K, 4) float64, those that ended; NaN where there is no such number
+    stands: Array | None = None  # (N,) checksums of what the environments show now; of workers
+    begun_anew: Array = field(default_factory=lambda: np.empty(0, np.int64))
+    """(k,) environments whose first row here does not follow from their last row before."""
 
 
 class Collector:

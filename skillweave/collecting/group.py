@@ -31,6 +31,8 @@ class Collectors:
         self.num_envs = sum(part.num_envs for part in parts)
         self.steps_made = 0
         """Environment steps that were made together."""
+        self.begun_anew = 0
+        """Environments that were lost with their worker, and did not repeat themselves."""
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment anew, unless they are under way."""

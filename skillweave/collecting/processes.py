@@ -7,7 +7,6 @@ back in shared memory. One that dies is made again (``workers``).
 from __future__ import annotations
 
 import multiprocessing as mp
-import os
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -17,9 +16,8 @@ from multiprocessing.shared_memory import SharedMemory
 from time import monotonic
 from typing import Any
 
-from gymnasium.vector.utils import CloudpickleWrapper
-
 from skillweave.collecting.shared_columns import ColumnWriter, SharedColumns
+from skillweave.collecting.shipping import packed, unpacked
 from skillweave.collecting.workers import (
     MakeStanding,
     Station,
@@ -34,6 +32,19 @@ PATIENCE = 1.0
 """Seconds that workers have to end by themselves when they are closed."""
 LOOK = 1.0
 """Seconds between looks of a waiting worker at whether its parent lives."""
+
+
+class _Maker:
+    """What makes a collector; a process that is not forked gets it with the user's own code."""
+
+    def __init__(self, make: MakeStanding) -> None:
+        self.make = make
+
+    def __getstate__(self) -> bytes:
+        return packed(self.make, "what a worker's collector is made of")
+
+    def __setstate__(self, data: bytes) -> None:
+        self.make = unpacked(data)
 
 
 class ProcessWorker:
@@ -54,8 +65,7 @@ class ProcessWorker:
     def begin(self) -> None:
         """Start the process, which makes the collector."""
         ours, theirs = self._context.Pipe()
-        make: Any = CloudpickleWrapper(self._make)  # type: ignore[arg-type]
-        about = self._number, make, self._each, theirs, ours, os.getpid()
+        about = self._number, _Maker(self._make), self._each, theirs, ours
         self.pipe = ours
         name = f"collector-{self._number}"
         self.process = self._context.Process(target=_work, args=about, name=name, daemon=True)
@@ -162,11 +172,13 @@ class ProcessCollectors(ProcessWorkers, WorkerCollectors):
         super().__init__(workers, each, members, name)
 
 
-def _tasks(pipe: Connection, parent: int) -> Iterator[tuple[str, Any]]:
+def _tasks(pipe: Connection) -> Iterator[tuple[str, Any]]:
     """What the parent asks for, until it closes, or is no more."""
+    parent = mp.parent_process()
+    assert parent is not None
     while True:
         while not pipe.poll(LOOK):
-            if os.getppid() != parent:
+            if not parent.is_alive():
                 return
         what, task = pipe.recv()
         if what == "close":
@@ -174,9 +186,7 @@ def _tasks(pipe: Connection, parent: int) -> Iterator[tuple[str, Any]]:
         yield what, task
 
 
-def _work(
-    number: int, make: Any, each: int, pipe: Connection, other_end: Connection, parent: int
-) -> None:
+def _work(number: int, maker: _Maker, each: int, pipe: Connection, other_end: Connection) -> None:
     """The life of a worker: answer (error, result) to every (what, task)."""
     import torch
 
@@ -185,10 +195,10 @@ def _work(
     other_end.close()
     station: Station | None = None
     try:
-        station = Station(make.fn, each, number)
+        station = Station(maker.make, each, number)
         pipe.send((None, None))
         writer = ColumnWriter()
-        for what, task in _tasks(pipe, parent):
+        for what, task in _tasks(pipe):
             answer = station.answer(what, task)
             pipe.send((None, writer.write(answer) if what == "collect" else answer))
     except (EOFError, BrokenPipeError):

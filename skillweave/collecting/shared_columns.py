@@ -21,6 +21,7 @@ class SharedColumns:
     places: dict[str, tuple[int, Any, tuple[int, ...]]]
     spent: int
     episodes: Array
+    stands: Array | None
 
     def read(self, memory: SharedMemory | None) -> tuple[SharedMemory, Collected]:
         """The memory, and the experience: views of it, good until the next request.
@@ -38,7 +39,7 @@ class SharedColumns:
             k: np.ndarray(shape, dtype, memory.buf, at)
             for k, (at, dtype, shape) in self.places.items()
         }
-        return memory, Collected(_experience(found, self.spent), self.episodes)
+        return memory, Collected(_experience(found, self.spent), self.episodes, self.stands)
 
 
 def _experience(found: dict[str, Array], spent: int = 0) -> Experience:
@@ -85,7 +86,7 @@ class ColumnWriter:
                 np.ndarray(a.shape, a.dtype, self.memory.buf, at)[...] = a
                 where[id(a)], at = at, at + _room(a)
             places[k] = (where[id(a)], a.dtype, a.shape)
-        return SharedColumns(name, places, experience.spent, collected.episodes)
+        return SharedColumns(name, places, experience.spent, collected.episodes, collected.stands)
 
 
 def _room(array: Array) -> int:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pickle
+import site
 import sys
 import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -32,7 +34,7 @@ def packed(thing: Any, who: str) -> bytes:
     """
     with _own_code():
         try:
-            found: bytes = cloudpickle.dumps((_registered(), own_registrations(), thing))
+            found: bytes = cloudpickle.dumps((dict(gym.registry), own_registrations(), thing))
         except Exception as error:
             raise SkillweaveError(
                 f"{who} cannot be sent to another process: {told(error)}. Make what cannot be sent "
@@ -44,24 +46,17 @@ def packed(thing: Any, who: str) -> bytes:
 def unpacked(data: bytes) -> Any:
     """The inverse of ``packed``."""
     registered, algorithms, thing = pickle.loads(data)
-    for spec in registered:
-        gym.registry.setdefault(spec.id, spec)
+    gym.registry.update(registered)  # an id that Gymnasium knows may mean another environment
     for algorithm in algorithms:
         add_registration(algorithm)
     return thing
-
-
-def _registered() -> list[Any]:
-    """The environments that Gymnasium would not know by itself."""
-    own = "gymnasium."
-    return [s for s in gym.registry.values() if not str(s.entry_point).startswith(own)]
 
 
 @contextmanager
 def _own_code() -> Iterator[None]:
     """Pickle modules by their content where they are not installed."""
     known = cloudpickle.list_registry_pickle_by_value()
-    found = [m for m in list(sys.modules.values()) if _is_own(m) and m.__name__ not in known]
+    found = [m for m in list(sys.modules.values()) if is_own_code(m) and m.__name__ not in known]
     for module in found:
         cloudpickle.register_pickle_by_value(module)
     try:
@@ -73,16 +68,27 @@ def _own_code() -> Iterator[None]:
 
 _INSTALLED = tuple(
     Path(path).resolve()
-    for name in ("stdlib", "platstdlib", "purelib", "platlib")
-    if (path := sysconfig.get_path(name))
+    for path in (
+        *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+        *site.getsitepackages(),
+        site.getusersitepackages(),
+    )
+    if path
 )
+_PACKAGES = {"site-packages", "dist-packages"}  # of another environment, or of the system
 
 
-def _is_own(module: ModuleType) -> bool:
+def is_own_code(module: ModuleType) -> bool:
+    """Whether a module is the user's own: no other machine has it installed."""
     name, file = getattr(module, "__name__", "__main__"), getattr(module, "__file__", None)
     if not isinstance(file, str) or name == "__main__" or sys.modules.get(name) is not module:
         return False
-    if name.partition(".")[0] == "skillweave":
+    top = name.partition(".")[0]
+    if top == "skillweave":
         return False
+    if PathFinder.find_spec(top) is None:
+        return True  # loaded from its file, as recipes are: nobody else finds it by its name
     path = Path(file).resolve()
+    if _PACKAGES & set(path.parts):
+        return False
     return not any(path.is_relative_to(place) for place in _INSTALLED)

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, Protocol
+
+import numpy as np
 
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected
 from skillweave.collecting.group import Collectors, joined_states, split_states
+from skillweave.envs.engine import checksums
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError
 
@@ -73,9 +77,11 @@ class Station:
         """Do what a method of the collector does; a request is for all workers."""
         if what == "state":
             return self.collector.state()
-        if what == "collect":
-            task = task.of_collector(self.number)
-        return getattr(self.collector, what)(task)
+        if what != "collect":
+            return getattr(self.collector, what)(task)
+        found = self.collector.collect(task.of_collector(self.number))
+        found.stands = checksums(self.collector.obs)
+        return found
 
 
 class Workers:
@@ -150,9 +156,14 @@ class Workers:
         for i in numbers:
             self._workers[i].begin()
         found = self._received(numbers, must)
-        for what, tasks in path:
+        for at, (what, tasks) in enumerate(path, 1):
             found = self._asked(found, what, tasks, must)
+            if at < len(path):
+                self._did_again(what, found)
         return found
+
+    def _did_again(self, what: str, found: dict[int, Any]) -> None:
+        """What workers answered that did again what others had done."""
 
     def _asked(
         self, numbers: Iterable[int], what: str, tasks: Sequence[Any], must: bool = False
@@ -199,8 +210,12 @@ class WorkerCollectors(Workers, Collectors):
     """
 
     def __init__(self, workers: Sequence[Worker], each: int, members: int, name: str) -> None:
-        self.members, self.num_envs, self.steps_made = members, each * len(workers), 0
+        self.members, self.num_envs = members, each * len(workers)
+        self.steps_made = self.begun_anew = 0
         self.parts, self._each = [], each
+        none = np.empty(0, np.int64)
+        self._stands = [none] * len(workers)  # of each, after what was collected last
+        self._differ = [none] * len(workers)  # of each, environments that did not repeat themselves
         super().__init__(workers, name)
 
     def start(self, seeds: Seeds) -> None:
@@ -210,14 +225,17 @@ class WorkerCollectors(Workers, Collectors):
 
     def collect(self, request: Request) -> Collected:
         """``request.rows`` steps of each environment."""
-        found = self._joined(self.ask("collect", self._shared(request)))
+        answers: list[Collected] = self.ask("collect", self._shared(request))
+        self._stands = [answer.stands for answer in answers]  # type: ignore[misc]
+        found = replace(self._joined(answers), begun_anew=self._differing())
         if len(self._past) > SNAPSHOT_EVERY:
             self.states()
         return found
 
     def cut(self, seeds: Seeds) -> Array:
         """Make ready for ``state``; (k,) environments that begin anew."""
-        return self._columns(self.ask("cut", self._divided(seeds)))
+        begun_anew = self._columns(self.ask("cut", self._divided(seeds)))
+        return np.union1d(begun_anew, self._differing())
 
     def state(self) -> dict[str, Array]:
         """All that ``restore`` needs, right after ``cut``."""
@@ -226,6 +244,23 @@ class WorkerCollectors(Workers, Collectors):
     def restore(self, state: dict[str, Array]) -> Array:
         """Stand where ``state`` says; (k,) environments that begin anew."""
         return self._columns(self.stand(split_states(state, len(self._workers))))
+
+    def _did_again(self, what: str, found: dict[int, Any]) -> None:
+        for i, answer in found.items():
+            if what == "restore":
+                self._differ[i] = answer
+            elif what == "collect":
+                self._differ[i] = np.flatnonzero(answer.stands != self._stands[i])
+
+    def _differing(self) -> Array:
+        """Columns whose environments are not where they were before a worker was lost.
+
+        Learners have seen them elsewhere, so what was open there must not go on.
+        """
+        found, none = self._columns(self._differ), np.empty(0, np.int64)
+        self._differ = [none] * len(self._differ)
+        self.begun_anew += len(found)
+        return found
 
     def _shared(self, task: Any) -> Sequence[Any]:
         """A task for each worker, where all get the same."""

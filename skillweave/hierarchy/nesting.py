@@ -7,6 +7,7 @@ is in it has a path: ``inner/skill``, ``inner/selector``.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from skillweave.messages import short
@@ -98,7 +99,8 @@ def check_nested(declared: Declaration) -> None:
     """
     _check_ends((declared,), "")
     for skill, inner in inner_hierarchies(declared.skills):
-        if inner.spec != declared.spec:
+        # How many processes step it is said by the outermost one, for all.
+        if replace(inner.spec, workers=None) != replace(declared.spec, workers=None):
             raise SkillweaveError(
                 f"{skill.name}: this hierarchy is a skill of another one, so both act in the same "
                 f"environment; but it is declared on {_shown(inner, declared)}, and the other on "

@@ -27,6 +27,11 @@ def source(name: str) -> Path:
     return _HERE / f"{name.replace('-', '_')}.py"
 
 
+def file_of(recipe: str) -> Path:
+    """The file of a recipe: of a shipped one its source, else ``recipe`` itself."""
+    return source(recipe) if recipe in names() else Path(recipe)
+
+
 def load(recipe: str) -> Hierarchy:
     """The hierarchy of a shipped recipe, or of a Python file that defines one.
 
@@ -37,9 +42,7 @@ def load(recipe: str) -> Hierarchy:
     """
     from skillweave.api import Hierarchy
 
-    path = Path(recipe)
-    if recipe in names():
-        path = source(recipe)
+    path = file_of(recipe)
     if path.suffix == ".py" and path.is_file():
         spec = importlib.util.spec_from_file_location(f"skillweave_recipe_{path.stem}", path)
         assert spec is not None

@@ -14,6 +14,7 @@ from skillweave.reporting.report.curves import reached_steps, read_curves
 from skillweave.reporting.report.facts import facts, plain, settings, stage_rows
 from skillweave.reporting.report.skills_table import WHY, percent, skill_rows
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import public
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
 
@@ -29,7 +30,7 @@ def write_card(
     Raises:
         SkillweaveError: a file of the run is damaged.
     """
-    saved = load_evaluation(run)
+    run, saved = RunDirectory(run.path, public(run.manifest)), load_evaluation(run)
     parts = [
         _header(run, name, saved),
         f"# {name.partition('/')[2]}",
@@ -68,14 +69,7 @@ def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
 def _about(run: RunDirectory) -> str:
     what = "hierarchy of skills" if run.manifest["kind"] == "hierarchy" else "plain agent"
     rows = [f"| {text(k)} | {text(v)} |" for k, v in facts(run)]
-    rows = [row if not row.startswith("| Recipe ") else _recipe(run) for row in rows]
     return "\n".join([f"A {what}, trained with Skillweave.", "", "| | |", "|---|---|", *rows])
-
-
-def _recipe(run: RunDirectory) -> str:
-    """A recipe by its name alone: where it lies on somebody's machine is nobody's business."""
-    recipe = run.manifest.get("recipe")
-    return f"| Recipe | {text(PurePosixPath(recipe).name if recipe else 'declared in Python')} |"
 
 
 def _shown(path: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 from skillweave.reporting.lineage import Born, Lineage, read_lineage
 from skillweave.reporting.palette import color_of
 from skillweave.runs.directory import RunDirectory, file_name
+from skillweave.runs.hub import must_be_own
 from skillweave.types import MissingExtra, SkillweaveError
 
 FAINT, TEXT = "#c9c9cf", "#4a4a52"
@@ -33,6 +34,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     except ImportError as error:
         raise MissingExtra("plotting", "plot") from error
     folder, written = out or run.path / "plots", []
+    must_be_own(folder)
     metrics = list(run.metrics())
     for i, stage in enumerate(run.manifest["stages"]):
         name, color = stage["name"], _hex(i)

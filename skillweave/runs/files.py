@@ -114,9 +114,14 @@ def _sync(directory: Path) -> None:
 
 def write_json(path: Path, data: Mapping[str, Any], *, make_directories: bool = True) -> None:
     """Replace a JSON file; ``schema`` and a checksum of it all are added."""
+    write_bytes(path, json_bytes(path, data), make_directories=make_directories)
+
+
+def json_bytes(path: Path, data: Mapping[str, Any]) -> bytes:
+    """What ``write_json`` writes."""
     plain = json.loads(_json(path, {"schema": SCHEMA, **data}))
     text = _json(path, plain | {"sha256": _json_digest(plain)}, indent=2)
-    write_bytes(path, text.encode() + b"\n", make_directories=make_directories)
+    return text.encode() + b"\n"
 
 
 def read_json(

@@ -6,14 +6,16 @@ The hub's own library talks to it (``huggingface_hub``, the extra 'hub'): it kno
 
 from __future__ import annotations
 
+import copy
 import importlib
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from skillweave.messages import short, shortened
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import json_bytes
 from skillweave.runs.hub_errors import asking, status_of
 from skillweave.types import MissingExtra, SkillweaveError
 
@@ -86,12 +88,31 @@ def check_whole(run: RunDirectory) -> None:
             pass
 
 
-def run_files(run: RunDirectory) -> tuple[dict[str, Path], list[str]]:
+def public(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of ``run.json`` without what is its owner's alone; its id stays what it is.
+
+    That is where files lie on the owner's machine, and which trackers are told of the run: who
+    loads it must not tell theirs.
+    """
+    told = copy.deepcopy(dict(manifest))
+    if told.get("track"):
+        told["track"] = []
+    policies = [skill.get("policy", {}) for skill in told.get("skills", ())]
+    for holder, key in ((told, "recipe"), *((policy, "file") for policy in policies)):
+        if holder.get(key):
+            holder[key] = PureWindowsPath(holder[key]).name  # it knows both kinds of slashes
+    return told
+
+
+def run_files(run: RunDirectory) -> tuple[dict[str, Path | bytes], list[str]]:
     """The files of a run that go up, by their names there; and files that must stay here.
 
     What stays are copies of policies that are neither safetensors nor JSON.
     """
-    found = {name: run.path / name for name in LINES if (run.path / name).exists()}
+    found: dict[str, Path | bytes] = {
+        name: run.path / name for name in LINES if (run.path / name).exists()
+    }
+    found["run.json"] = json_bytes(run.path / "run.json", public(run.manifest))
     stays = []
     for path in sorted((run.path / "policies").glob("[!.]*")):
         if path.suffix == ".safetensors":
@@ -164,6 +185,22 @@ def _of_a_run(path: str) -> bool:
 
 
 # Down
+
+
+def must_be_own(folder: Path) -> None:
+    """Raise a SkillweaveError where a folder is in the cache of the hub's library.
+
+    What is written there would be loaded the next time as if its owner had pushed it.
+    """
+    found = folder.resolve()
+    for place in (found, *found.parents):
+        kind, *name = place.parent.parent.name.split("--")
+        if place.parent.name == "snapshots" and kind == "models" and len(name) == 2:
+            raise SkillweaveError(
+                f"{folder} is the copy of {'/'.join(name)} that huggingface_hub keeps: nothing is "
+                "written there or pushed from there, as it would be taken for its owner's. Take a "
+                f"copy of your own, and use that: skillweave pull {'/'.join(name)}"
+            )
 
 
 def download(name: str, revision: str | None = None) -> Path:

@@ -9,6 +9,7 @@ from typing import Any, NotRequired, TypedDict
 from skillweave.reading import Count, fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
+from skillweave.runs.hub import must_be_own
 from skillweave.runs.trackers import steps_of, trackers_of
 from skillweave.training.evaluation import Evaluation
 from skillweave.types import SkillweaveError
@@ -48,8 +49,10 @@ def save_evaluation(
     """Write it into the run, in place of the one before, and send it to the run's trackers.
 
     Raises:
-        SkillweaveError: the disk is full or cannot be written; what was there is intact.
+        SkillweaveError: the disk is full or cannot be written; what was there is intact. Or the
+            run is one of ``from_hub``.
     """
+    must_be_own(run.path)
     found = EvaluationFile(
         made=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         seed=seed,

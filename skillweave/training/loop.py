@@ -117,6 +117,8 @@ class _Loop:
         over = at.steps >= budget
         cut = crossed(cut_every, before, at.steps) or over
         self.episodes.extend(collected.episodes)
+        if len(collected.begun_anew):
+            learner.cut(collected.begun_anew)
         learner.take(collected.experience)
         if learner.overlap and not cut:
             self.ask()  # before the parameters change

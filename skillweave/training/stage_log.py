@@ -77,6 +77,14 @@ class StageLog:
                 "not repeat itself"
             )
 
+    def tell_learnt_nothing(self) -> None:
+        """Its weights are still those that it began with."""
+        self.tell(
+            f"it learnt nothing in {self.at['steps']:,} steps, as too few of them were its own: "
+            "perhaps its initiation() seldom holds where the others lead. Widen it, or give more "
+            "steps"
+        )
+
     def save(self, state: Any | None, extra: Mapping[str, Tensor] | None, **more: Any) -> None:
         """Write a checkpoint: a state, what else resuming needs, and ``more`` in its header."""
         kept = ("update", "steps", "evaluation_steps", "seconds", "metrics")

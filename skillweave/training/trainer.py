@@ -193,6 +193,8 @@ class OneAgent:
         target, made = self.stage.target, self.collectors.steps_made
 
         def on_tick(tick: Tick) -> None:
+            log.tell_begun_anew(self.collectors.begun_anew, self.collectors.num_envs)
+            self.collectors.begun_anew = 0
             found = self.evaluation.due(tick.steps, self.play)
             log.at["evaluation_steps"] += self.evaluation.spent()
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
@@ -216,11 +218,7 @@ class OneAgent:
             log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
         else:
             if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
-                log.tell(
-                    f"it learnt nothing in {log.at['steps']:,} steps, as too few of them were its "
-                    "own: perhaps its initiation() seldom holds where the others lead. Widen it, "
-                    "or give more steps"
-                )
+                log.tell_learnt_nothing()
         return self.policies()
 
     def _learnt_nothing(self) -> bool:

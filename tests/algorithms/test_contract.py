@@ -46,8 +46,8 @@ BUFFERED: dict[str, Any] = {
     "learning_rate_schedule": "constant", "update_ratio": 1.0,
 }  # fmt: skip
 ON = PPO(
-    num_envs=8, n_steps=16, batch_size=32, learning_rate=1e-2, gamma=0.5, ent_coef=0.0,
-    normalize_obs=False, network=Network((32,)),
+    num_envs=8, n_steps=16, batch_size=32, update_epochs=4, learning_rate=1e-2, gamma=0.5,
+    gae_lambda=0.98, ent_coef=0.0, normalize_obs=False, network=Network((32,)),
 )  # fmt: skip
 OWN = own_algorithm().A2C(
     num_envs=8, n_steps=8, gamma=0.5, learning_rate=2e-2, normalize_obs=False, ent_coef=0.0,

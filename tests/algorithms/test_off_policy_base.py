@@ -40,7 +40,7 @@ RANGES: list[tuple[type, str, object, str]] = [
     (OffPolicy, "device", "tpu", "one of cpu, cuda, auto"),
     (PPO, "device", "tpu", "one of cpu, cuda, auto"),
     (OffPolicy, "buffer_size", 0, "at least 1"),
-    (OffPolicy, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)"),
+    (OffPolicy, "buffer_size", 15, r"at least (16|32) \(num_envs·\(n_step\+1\)\)"),
     *((OffPolicy, "bouts", bad, "between 0 and 1") for bad in (-0.1, 1.1, NAN)),
     (OffPolicy, "bout_steps", 0, "at least 1"),
     (OffPolicy, "learning_starts", -1, "at least 0 and finite"),

@@ -2,14 +2,18 @@
 
 import json
 import re
+import sys
 
 import pytest
 from small_runs import interrupt_at_checkpoint
 
 from skillweave.cli import main, sweep
 from skillweave.cli.main import _with_addresses
+from skillweave.cli.sweep_code import code_files
 from skillweave.cli.sweep_table import summary
+from skillweave.recipes import load, source
 from skillweave.runs.directory import RunDirectory
+from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import SkillweaveError
 
 RECIPE = '''
@@ -100,6 +104,116 @@ def test_runs_of_other_settings_are_not_taken_for_these(capsys, asked, trained):
     assert code == 1
     assert "holds a run of other settings" in found["failed"][0]["error"]
     assert found["groups"] == [{"settings": "as declared", "runs": 0}]
+
+
+@pytest.mark.parametrize("how", [{"seed": 7}, {"deterministic": False}])
+def test_an_evaluation_made_otherwise_is_not_taken_for_the_sweeps(
+    capsys, asked, trained, tmp_path, how
+):
+    words = asked("--seeds", "0:1")
+    first = answer(capsys, words)
+    run = load(words[1]).load(tmp_path / "runs/s0")
+    run.evaluate(3, save=True, **how)
+    trained.clear()
+    assert answer(capsys, words) == first
+    assert trained == ["s0"]
+    saved = load_evaluation(RunDirectory.open(run.path))
+    assert (saved.seed, saved.deterministic) == (0, True)
+
+
+EDITED = RECIPE.replace("-abs(", "-2 * abs(")
+
+
+@pytest.fixture
+def helper(tmp_path, monkeypatch):
+    """A module of the user's own, from which the recipe takes a number and nothing else."""
+    file = tmp_path / "helper_of_sweep/__init__.py"
+    file.parent.mkdir()
+    file.write_text("from .weights import WEIGHT\n")
+    (file.parent / "weights.py").write_text("WEIGHT = 1\n")
+    recipe = tmp_path / "still.py"
+    recipe.write_text(f"from helper_of_sweep import WEIGHT\n{recipe.read_text()}")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield file.parent / "weights.py"
+    for name in ("helper_of_sweep", "helper_of_sweep.weights"):
+        sys.modules.pop(name, None)
+
+
+def refused(capsys, words, *said):
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    for text in said:
+        assert text in error
+
+
+def test_an_edited_recipe_does_not_go_on_with_a_sweep(capsys, asked, trained, tmp_path):
+    recipe = tmp_path / "still.py"
+    first = answer(capsys, asked("--seeds", "0:1"))
+    recipe.write_text(EDITED)
+    names = str(recipe), str(tmp_path / "runs"), "--out"
+    refused(capsys, asked("--seeds", "0:2"), *names)
+    refused(capsys, asked("--seeds", "0:2", "--flat"), *names)
+    assert trained == ["s0"]
+    recipe.write_text(RECIPE)
+    assert answer(capsys, asked("--seeds", "0:1")) == first
+    moved = tmp_path / "elsewhere" / "still.py"
+    moved.parent.mkdir()
+    moved.write_text(RECIPE)
+    words = [str(moved) if w == str(recipe) else w for w in asked("--seeds", "0:1")]
+    assert answer(capsys, words) == first
+    moved.write_text(EDITED)
+    refused(capsys, words, str(moved), str(recipe))
+    assert trained == ["s0"]
+
+
+def test_nor_does_one_whose_module_was_edited(capsys, asked, helper, trained, tmp_path):
+    first = answer(capsys, asked("--seeds", "0:1"))
+    helper.write_text("WEIGHT = 2\n")
+    refused(capsys, asked("--seeds", "0:1"), str(tmp_path / "still.py"))
+    helper.write_text("WEIGHT = 1\n")
+    assert answer(capsys, asked("--seeds", "0:1")) == first
+
+
+def test_of_a_shipped_recipe_its_parts_count_and_nothing_else_of_the_library():
+    load("mazes")
+    found = code_files(source("mazes"))
+    assert set(found) == {"", "skillweave.recipes._mazes"}
+    assert found[""] == source("mazes")
+
+
+def test_a_sweep_of_an_older_version_goes_on_and_knows_its_code_from_then_on(
+    capsys, asked, trained, tmp_path
+):
+    first = answer(capsys, asked("--seeds", "0:1"))
+    (tmp_path / "runs/.sweep").write_text("")  # as older versions left it
+    assert answer(capsys, asked("--seeds", "0:1")) == first
+    (tmp_path / "still.py").write_text(EDITED)
+    refused(capsys, asked("--seeds", "0:2"), str(tmp_path / "still.py"))
+
+
+DYING = """
+import os
+
+class Dying(Still):
+    def reward(self, step):
+        try:
+            os.close(os.open(__file__ + ".once", os.O_CREAT | os.O_EXCL))
+        except FileExistsError:
+            return super().reward(step)
+        os._exit(3)
+"""
+DYING_RECIPE = RECIPE.replace("\nsmall", f"{DYING}\nsmall", 1).replace("[Still()]", "[Dying()]")
+
+
+def test_a_run_whose_process_dies_is_named_and_the_others_are_trained(capsys, asked, tmp_path):
+    (tmp_path / "still.py").write_text(DYING_RECIPE)
+    code, found = answer(capsys, asked("--seeds", "0:2", "--jobs", "1"))
+    assert code == 1
+    assert [run["seed"] for run in found["runs"]] == [1]
+    assert found["failed"][0]["run"].endswith("s0")
+    assert "exit code 3" in found["failed"][0]["error"]
+    code, found = answer(capsys, asked("--seeds", "0:2"))
+    assert (code, [run["seed"] for run in found["runs"]]) == (0, [0, 1])
 
 
 def test_a_run_in_a_process(capsys, asked):

@@ -1,6 +1,7 @@
 """Collectors in processes find what collectors in this thread find, whatever happens to them."""
 
 import itertools
+import multiprocessing
 import os
 import signal
 import time
@@ -8,7 +9,7 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
-from reference_calls import Counter, Left, Right, Zigzag
+from reference_calls import EPISODE, Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, Mortal, requests
 
 from skillweave.collecting import processes
@@ -67,6 +68,8 @@ def equal(one, two):
         np.testing.assert_array_equal(getattr(one.experience, name), getattr(two.experience, name))
     assert one.experience.spent == two.experience.spent
     np.testing.assert_array_equal(one.episodes, two.episodes)
+    assert not len(one.begun_anew)
+    assert not len(two.begun_anew)
 
 
 @pytest.mark.parametrize("kind", [deciding, stepping])
@@ -98,6 +101,39 @@ def test_killed_workers_are_made_again_and_find_the_same(in_processes, kind):
             np.testing.assert_array_equal(plain.cut(seeds), apart.cut(seeds))
 
 
+class Restless(Again):
+    """Every episode shows a number that does not follow from the seed."""
+
+    def reset(self, **how):
+        self.number = int.from_bytes(os.urandom(3), "big")
+        return super().reset(**how)
+
+    def _obs(self):
+        obs = super()._obs()
+        obs[EPISODE] = self.number
+        return obs
+
+
+@pytest.mark.parametrize("after", ["collect", "state"])
+def test_environments_that_do_not_repeat_themselves_are_told_where_a_worker_was_lost(
+    in_processes, after
+):
+    apart = in_processes(stepping(Restless))
+    apart.start(Seeds(3))
+    asked = requests(2)
+    for _ in range(2):
+        assert not len(apart.collect(next(asked)).begun_anew)
+    if after == "state":
+        apart.cut(Seeds(4))
+        apart.state()
+    victim = apart._workers[1].process
+    os.kill(victim.pid, signal.SIGKILL)
+    victim.join()
+    np.testing.assert_array_equal(apart.collect(next(asked)).begun_anew, [3, 4, 5])
+    assert not len(apart.collect(next(asked)).begun_anew)
+    assert apart.begun_anew == 3
+
+
 def test_one_that_dies_in_the_middle_of_a_step_is_made_again(in_processes, tmp_path):
     fuse = tmp_path / "fuse"
     kind = type("Fused", (Mortal,), {"fuse": fuse})
@@ -110,6 +146,22 @@ def test_one_that_dies_in_the_middle_of_a_step_is_made_again(in_processes, tmp_p
         one, two = plain.collect(request), apart.collect(request)
         equal(one, two)
     assert not fuse.exists(), "it did not die"
+
+
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_processes_that_are_not_forked_get_the_users_code_and_stay(
+    in_processes, method, monkeypatch
+):
+    context = multiprocessing.get_context(method)
+    monkeypatch.setattr(processes.mp, "get_context", lambda: context)
+    ours, theirs = here(stepping()), in_processes(stepping())
+    pids = [worker.process.pid for worker in theirs._workers]
+    for collectors in (ours, theirs):
+        collectors.start(Seeds(3))
+    for i, request in enumerate(itertools.islice(requests(2), 2)):
+        time.sleep(1.5 * processes.LOOK * i)  # they look whether their parent lives
+        equal(ours.collect(request), theirs.collect(request))
+    assert [worker.process.pid for worker in theirs._workers] == pids
 
 
 def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):

@@ -219,9 +219,9 @@ def test_no_room_is_told_while_it_waits_and_when_it_stops(on_ray, monkeypatch):
 def test_a_node_with_another_version_is_refused(other, says):
     there = {"node": "10.0.0.7", "Python": platform.python_version()}
     there |= {"Skillweave": metadata.version("skillweave")}
-    actors._check_versions(there)
+    actors.check_versions(there)
     with pytest.raises(SkillweaveError, match=says):
-        actors._check_versions(there | other)
+        actors.check_versions(there | other)
 
 
 def test_what_cannot_be_sent_is_told(on_ray):

@@ -4,6 +4,7 @@ import importlib
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 
 from skillweave import SkillweaveError, from_onnx, recipes
 from skillweave.algorithms.config import _REGISTERED, config_to_json
+from skillweave.collecting import shipping
 from skillweave.collecting.shipping import packed, unpacked
 
 SPACES = gym.spaces.Box(-1.0, 1.0, (4,), np.float32), gym.spaces.Discrete(2)
@@ -60,6 +62,58 @@ def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_pa
     command = [sys.executable, "-c", code]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["Own", "1.5"]
+
+
+def test_a_recipe_that_lies_where_packages_are_installed_is_sent_as_well(tmp_path, monkeypatch):
+    places = (*shipping._INSTALLED, recipes.source("lunar-lander").parent.resolve())
+    monkeypatch.setattr(shipping, "_INSTALLED", places)
+    file = tmp_path / "packed"
+    file.write_bytes(packed(recipes.load("lunar-lander"), "it"))
+    code = (
+        "from skillweave.collecting.shipping import unpacked\n"
+        f"print(*[s.name for s in unpacked(open({str(file)!r}, 'rb').read()).skills])\n"
+    )
+    command = [sys.executable, "-c", code]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["stabilize", "center", "landing"]
+
+
+@pytest.mark.parametrize("folder", ["site-packages", "dist-packages"])
+def test_packages_of_other_places_are_only_named(folder, tmp_path, monkeypatch):
+    (tmp_path / folder).mkdir()
+    (tmp_path / folder / "a_package_elsewhere.py").write_text("class Thing: pass\n")
+    monkeypatch.syspath_prepend(tmp_path / folder)
+    module = importlib.import_module("a_package_elsewhere")
+    try:
+        data = packed(module.Thing(), "it")
+        assert b"a_package_elsewhere" in data
+        del sys.modules["a_package_elsewhere"], module
+        monkeypatch.undo()
+        with pytest.raises(ModuleNotFoundError):
+            unpacked(data)
+    finally:
+        sys.modules.pop("a_package_elsewhere", None)
+
+
+def test_environments_arrive_as_they_are_registered_here_whatever_they_are_called(tmp_path):
+    known, kind = gym.registry["CartPole-v1"], "gymnasium.envs.classic_control:CartPoleEnv"
+    file = tmp_path / "packed"
+    try:
+        gym.register("ShortPole-v0", kind, max_episode_steps=7)
+        gym.registry["CartPole-v1"] = replace(known, max_episode_steps=20)
+        file.write_bytes(packed(None, "it"))
+    finally:
+        del gym.registry["ShortPole-v0"]
+        gym.registry["CartPole-v1"] = known
+    code = (
+        "import gymnasium as gym\n"
+        "from skillweave.collecting.shipping import unpacked\n"
+        f"unpacked(open({str(file)!r}, 'rb').read())\n"
+        "print(*[gym.spec(n).max_episode_steps for n in ('ShortPole-v0', 'CartPole-v1')])\n"
+    )
+    command = [sys.executable, "-c", code]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["7", "20"]
 
 
 OWN_ALGORITHM = """

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from hub_server import Hub, go_to, serve
+from hub_server import Hub, go_to
+from shared_runs import NAME, SMALL, Left, Right, declare, files_of, same_actions
 
 import skillweave as sw
 from skillweave.cli import main
@@ -20,24 +19,8 @@ from skillweave.types import MissingExtra, SkillweaveError
 
 pytest.importorskip("huggingface_hub")
 
-NAME = "ada/cart"
-SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 NOWHERE = "http://127.0.0.1:9"
 """A port at which nothing listens: no network."""
-
-
-class Left(sw.Skill):
-    max_steps = 10
-
-    def reward(self, step):
-        return -step.next_obs[:, 0]
-
-    def success(self, step):
-        return step.next_obs[:, 0] < 0
-
-
-class Right(sw.Skill):
-    max_steps = 10
 
 
 class Careful(sw.Skill):
@@ -45,50 +28,6 @@ class Careful(sw.Skill):
 
     def termination(self, step):
         return np.abs(step.next_obs[:, 0]) > 0.5
-
-
-def declare(*skills: sw.Skill) -> sw.Hierarchy:
-    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
-    how: dict[str, Any] = {"call_steps": 5, "algorithm": SMALL, "selector": SMALL}
-    return sw.Hierarchy(env, skills, skill_steps=100, selector_steps=100, **how)
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> sw.Run:
-    """A run with an evaluation and a film."""
-    path = tmp_path_factory.mktemp("trained") / "run"
-    run = declare(Left(), Right()).train(path, quiet=True)
-    run.evaluate(episodes=4, save=True)
-    (path / "hierarchy.gif").write_bytes(b"GIF89a, as far as the hub knows")
-    return run
-
-
-@pytest.fixture
-def run(trained: sw.Run, tmp_path: Path) -> sw.Run:
-    """A copy of it, which a test may change; without curves, which take long to draw."""
-    shutil.copytree(trained.path, tmp_path / "run")
-    (tmp_path / "run/metrics.jsonl").unlink()
-    return sw.Run(trained.declaration, tmp_path / "run", trained.policy)
-
-
-@pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
-    with serve() as found:
-        go_to(found.url, tmp_path / "cache", monkeypatch)
-        yield found
-
-
-def files_of(path: Path) -> dict[str, bytes]:
-    """A run's files as they are on the hub."""
-    names = ("run.json", "metrics.jsonl", "evaluation.json")
-    found = {name: (path / name).read_bytes() for name in names if (path / name).exists()}
-    return found | {f"policies/{p.name}": p.read_bytes() for p in (path / "policies").iterdir()}
-
-
-def same_actions(a: sw.Run, b: sw.Run) -> bool:
-    obs = np.random.default_rng(0).normal(size=(200, 4)).astype(np.float32)
-    acts = [run.policy.act(run.policy.start(200), obs)[0] for run in (a, b)]
-    return bool((acts[0] == acts[1]).all())
 
 
 # There and back

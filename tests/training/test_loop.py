@@ -42,8 +42,8 @@ from skillweave.training.scene import skill_scene
 from skillweave.types import SkillweaveError
 
 CONFIG = PPO(
-    num_envs=16, n_steps=16, batch_size=64, learning_rate=5e-3, gamma=0.9, ent_coef=0.0,
-    network=Network((32,)),
+    num_envs=16, n_steps=16, batch_size=64, update_epochs=4, learning_rate=5e-3, gamma=0.9,
+    gae_lambda=0.98, ent_coef=0.0, network=Network((32,)),
 )  # fmt: skip
 RECURRENT = replace(CONFIG, network=Network((8,), rnn=RNN("gru", 4)))
 REPLAY = DQN(
@@ -348,6 +348,26 @@ def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_
     here = weights(Collectors([collector(2, 0), collector(2, 2)]))
     assert torch.equal(here, weights(ProcessCollectors(collector, 2, 2, 1, "CartPole-v1")))
     assert torch.equal(here, weights(ProcessCollectors(collector, 2, 2, 1, "CartPole-v1"), True))
+
+
+def test_transitions_into_what_a_lost_worker_did_not_repeat_are_not_learnt():
+    env = Identity(16)
+    algorithm = make_algorithm(REPLAY, env.observation_space, env.action_space)
+    found = training(algorithm, env)
+    collect, called = found.collectors.collect, []
+
+    def collected(request):
+        answer = collect(request)
+        lost = np.array([2, 5]) if called.count("collect") == 3 else np.empty(0, np.int64)
+        called.append("collect")
+        return replace(answer, begun_anew=lost)
+
+    cut, take = found.learner.cut, found.learner.take
+    found.collectors.collect = collected
+    found.learner.cut = lambda columns: (called.append(columns.tolist()), cut(columns))
+    found.learner.take = lambda experience: (called.append("take"), take(experience))
+    found.run(16 * 6)
+    assert called == ["collect", "take"] * 3 + ["collect", [2, 5], "take"] + ["collect", "take"] * 2
 
 
 # Clean cuts

@@ -37,6 +37,7 @@ from skillweave.reporting.report.skills_table import (
     transitions,
 )
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import must_be_own
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
@@ -121,6 +122,7 @@ def write_report(
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     filmed = whole_number(filmed, "films", 0)
     library()  # a missing extra is said before anything is played
+    must_be_own(path.parent)
     all_curves = read_curves(run)
     reached = reached_steps(all_curves)
     missing = facts.missing_stages(run, reached)

@@ -1,0 +1,106 @@
+"""By which code the runs of a sweep are trained, kept in a file of the sweep's directory.
+
+A run's identity covers settings, not code. So without this file an edited recipe would go on with
+the sweep of the recipe as it was, and one table would mix both.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from importlib.util import resolve_name
+from pathlib import Path
+from types import ModuleType
+from typing import TypedDict
+
+from skillweave import recipes
+from skillweave.collecting.shipping import is_own_code
+from skillweave.reading import fit, shown
+from skillweave.runs.files import read_json, write_json
+from skillweave.types import SkillweaveError
+
+MARK = ".sweep"
+"""A file in the sweep's directory, by which a machine knows that it sees it; older versions left it
+empty."""
+
+
+class Mark(TypedDict):
+    """What the file holds."""
+
+    recipe: str
+    """As it was given."""
+    code: str
+    """A checksum of its code."""
+
+
+def must_be_same_code(out: Path, recipe: str) -> None:
+    """Write into a sweep's directory by which code its runs are trained, or compare with that.
+
+    The recipe must be loaded, so that the modules that it imports are known.
+
+    Raises:
+        SkillweaveError: the runs there are trained by other code; or the directory cannot be
+            written.
+    """
+    file, code = out / MARK, _checksum(code_files(recipes.file_of(recipe)))
+    if not file.exists() or not file.stat().st_size:
+        write_json(file, Mark(recipe=recipe, code=code), make_directories=False)
+        return
+    told: Mark = fit(Mark, read_json(file), str(file))
+    if told["code"] != code:
+        raise SkillweaveError(
+            f"{out} holds runs of the recipe {shown(told['recipe'], 500)}, which were not trained "
+            f"by the code of {recipe} as it is now: it is another recipe, or it was edited since, "
+            "or a module of yours that it imports was. One table would mix both. Choose another "
+            f"directory (--out), or delete {out}. If what was edited cannot change results, as a "
+            f"comment cannot, delete {file} alone"
+        )
+
+
+def code_files(recipe: Path) -> dict[str, Path]:
+    """A recipe's file, and the modules that it imports by their names: files of the user's own.
+
+    Of a shipped recipe these are its parts.
+    """
+    files, due = {"": recipe}, [(recipe, "")]
+    while due:
+        file, package = due.pop()
+        if file.suffix != ".py":  # compiled
+            continue
+        for name in _imported(file.read_bytes(), package):
+            module = sys.modules.get(name)
+            if module is None or name in files or not _is_part(module):
+                continue
+            files[name] = Path(str(module.__file__))
+            due.append((files[name], module.__package__ or ""))
+    return files
+
+
+def _checksum(files: Mapping[str, Path]) -> str:
+    """Of the names of modules and the contents of their files, wherever these lie."""
+    sums = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
+    return hashlib.sha256(json.dumps(sums, sort_keys=True).encode()).hexdigest()
+
+
+def _is_part(module: ModuleType) -> bool:
+    return is_own_code(module) or module.__name__.startswith("skillweave.recipes._")
+
+
+def _imported(source: bytes, package: str) -> Iterator[str]:
+    """The modules that a file of a package names, and the packages that they are in."""
+    for node in ast.walk(ast.parse(source)):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            with suppress(ImportError):  # `from . import x` in a file that is in no package
+                base = resolve_name(base, package)
+                names = [f"{base}.{alias.name}" for alias in node.names]
+        for name in names:
+            parts = name.split(".")
+            yield from (".".join(parts[: i + 1]) for i in range(len(parts)))
