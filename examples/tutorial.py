@@ -57,7 +57,7 @@ hierarchy = Hierarchy(
     skills=[Stabilize(), Center(), Landing()],
     call_steps=40,
     reflexes=[Reflex(landed, action=0, name="engines off")],
-    algorithm=PPO(learning_rate=1e-3, gamma=0.99, gae_lambda=0.95),
+    algorithm=PPO(update_epochs=4, learning_rate=1e-3, gamma=0.99, gae_lambda=0.95),
     skill_steps=500_000,
     selector_steps=1_000_000,
 )

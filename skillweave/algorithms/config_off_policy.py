@@ -226,7 +226,10 @@ class TD3(ActorCritic):
 
     @classmethod
     def ddpg(cls, **settings: Any) -> TD3:
-        """DDPG (Lillicrap et al. 2016): one critic, no delay, no target noise; or ``settings``."""
+        """DDPG (Lillicrap et al. 2016): one critic, no delay, no noise on targets, one step.
+
+        Actor and critic learn at one rate, and there are no bouts; ``settings`` override.
+        """
         plain = {
             "twin": False, "policy_delay": 1, "target_noise": 0.0, "bouts": 0.0, "n_step": 1,
             "exploration_noise": 0.1, "actor_rate": 1.0,

@@ -110,8 +110,8 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
     found: dict[Job, float | str] = {}
     jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
     for settings, hierarchy in _hierarchies(command, choices):
-        must_be_same_code(out, command.recipe)  # each time, as the recipe was read anew
         code = packed(hierarchy, command.recipe)
+        must_be_same_code(out, command.recipe)  # each time, as the recipe was read anew
         for seed in seeds:
             path = out / _file_name(settings, seed)
             job = Job(settings, seed, path, command.flat, command.evaluate)

@@ -40,14 +40,16 @@ class Mark(TypedDict):
 def must_be_same_code(out: Path, recipe: str) -> None:
     """Write into a sweep's directory by which code its runs are trained, or compare with that.
 
-    The recipe must be loaded, so that the modules that it imports are known.
+    The recipe must be loaded, so that the modules that it imports are known. It may be mended where
+    no run has learnt yet, for example where it failed at its first step.
 
     Raises:
         SkillweaveError: the runs there are trained by other code; or the directory cannot be
             written.
     """
     file, code = out / MARK, _checksum(code_files(recipes.file_of(recipe)))
-    if not file.exists() or not file.stat().st_size:
+    learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
+    if not learnt or not file.exists() or not file.stat().st_size:
         write_json(file, Mark(recipe=recipe, code=code), make_directories=False)
         return
     told: Mark = fit(Mark, read_json(file), str(file))

@@ -57,6 +57,13 @@ class Collectors:
         states = split_states(state, len(self.parts))
         return self._columns([p.restore(s) for p, s in zip(self.parts, states, strict=True)])
 
+    def differing(self) -> Array:
+        """(k,) environments that are not where they were, since they were lost with a worker.
+
+        Learners have seen them elsewhere, so what was open there must not go on. Told once.
+        """
+        return np.empty(0, np.int64)
+
     def close(self) -> None:
         """Release the environments."""
         for part in self.parts:

@@ -7,6 +7,7 @@ back in shared memory. One that dies is made again (``workers``).
 from __future__ import annotations
 
 import multiprocessing as mp
+import os
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -174,11 +175,13 @@ class ProcessCollectors(ProcessWorkers, WorkerCollectors):
 
 def _tasks(pipe: Connection) -> Iterator[tuple[str, Any]]:
     """What the parent asks for, until it closes, or is no more."""
-    parent = mp.parent_process()
+    parent, first = mp.parent_process(), os.getppid()
     assert parent is not None
     while True:
         while not pipe.poll(LOOK):
-            if not parent.is_alive():
+            # The first is late where later workers were forked with the pipe that tells it; the
+            # second is never true where a server forks.
+            if not parent.is_alive() or os.getppid() != first:
                 return
         what, task = pipe.recv()
         if what == "close":

@@ -1,4 +1,4 @@
-"""The user's own code on its way to other machines, which do not have its files."""
+"""The user's own code on its way to processes and machines that do not have its files."""
 
 from __future__ import annotations
 

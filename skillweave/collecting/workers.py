@@ -80,7 +80,9 @@ class Station:
         if what != "collect":
             return getattr(self.collector, what)(task)
         found = self.collector.collect(task.of_collector(self.number))
-        found.stands = checksums(self.collector.obs)
+        kept = self.collector.kept  # where few observations are possible, they alone tell little
+        about = np.column_stack([kept["age"], kept["sums"]])
+        found.stands = checksums(self.collector.obs) + checksums(about)
         return found
 
 
@@ -227,7 +229,7 @@ class WorkerCollectors(Workers, Collectors):
         """``request.rows`` steps of each environment."""
         answers: list[Collected] = self.ask("collect", self._shared(request))
         self._stands = [answer.stands for answer in answers]  # type: ignore[misc]
-        found = replace(self._joined(answers), begun_anew=self._differing())
+        found = replace(self._joined(answers), begun_anew=self.differing())
         if len(self._past) > SNAPSHOT_EVERY:
             self.states()
         return found
@@ -235,7 +237,7 @@ class WorkerCollectors(Workers, Collectors):
     def cut(self, seeds: Seeds) -> Array:
         """Make ready for ``state``; (k,) environments that begin anew."""
         begun_anew = self._columns(self.ask("cut", self._divided(seeds)))
-        return np.union1d(begun_anew, self._differing())
+        return np.union1d(begun_anew, self.differing())
 
     def state(self) -> dict[str, Array]:
         """All that ``restore`` needs, right after ``cut``."""
@@ -252,11 +254,8 @@ class WorkerCollectors(Workers, Collectors):
             elif what == "collect":
                 self._differ[i] = np.flatnonzero(answer.stands != self._stands[i])
 
-    def _differing(self) -> Array:
-        """Columns whose environments are not where they were before a worker was lost.
-
-        Learners have seen them elsewhere, so what was open there must not go on.
-        """
+    def differing(self) -> Array:
+        """(k,) environments that are not where they were, since they were lost with a worker."""
         found, none = self._columns(self._differ), np.empty(0, np.int64)
         self._differ = [none] * len(self._differ)
         self.begun_anew += len(found)

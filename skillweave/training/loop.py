@@ -177,6 +177,7 @@ class _Loop:
             self._pending.result()
         self.learner.cut(self.collectors.cut(self.seeds / "cut" / self.at.update))
         found = self.collectors.state() | prefixed("episodes", self.episodes.state())
+        self.learner.cut(self.collectors.differing())
         tensors = {k: to_tensor(np.array(v)) for k, v in found.items()}
         return prefixed("collector", tensors) | prefixed("learner", self.learner.kept())
 

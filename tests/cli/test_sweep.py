@@ -166,6 +166,22 @@ def test_an_edited_recipe_does_not_go_on_with_a_sweep(capsys, asked, trained, tm
     assert trained == ["s0"]
 
 
+@pytest.mark.parametrize("wrong", ["return lock", "raise NameError('lok')"])
+def test_a_recipe_that_failed_before_anything_was_learnt_may_be_mended(
+    capsys, asked, trained, tmp_path, wrong
+):
+    recipe = tmp_path / "still.py"
+    broken = RECIPE.replace("return -abs(step.next_obs[:, 1])", wrong)
+    held = "import threading\nlock = threading.Lock()\n"  # it cannot be sent to a process
+    recipe.write_text(held + broken if "lock" in wrong else broken)
+    assert main(asked("--seeds", "0:1")) == 1
+    capsys.readouterr()
+    recipe.write_text(RECIPE)
+    code, found = answer(capsys, asked("--seeds", "0:1"))
+    assert code == 0
+    assert isinstance(found["runs"][0]["return"], float)
+
+
 def test_nor_does_one_whose_module_was_edited(capsys, asked, helper, trained, tmp_path):
     first = answer(capsys, asked("--seeds", "0:1"))
     helper.write_text("WEIGHT = 2\n")

@@ -1,9 +1,12 @@
 """Collectors in processes find what collectors in this thread find, whatever happens to them."""
 
+import importlib.util
 import itertools
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import gymnasium as gym
@@ -114,7 +117,7 @@ class Restless(Again):
         return obs
 
 
-@pytest.mark.parametrize("after", ["collect", "state"])
+@pytest.mark.parametrize("after", ["collect", "cut", "state"])
 def test_environments_that_do_not_repeat_themselves_are_told_where_a_worker_was_lost(
     in_processes, after
 ):
@@ -129,6 +132,10 @@ def test_environments_that_do_not_repeat_themselves_are_told_where_a_worker_was_
     victim = apart._workers[1].process
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
+    if after == "cut":
+        np.testing.assert_array_equal(apart.cut(Seeds(4)), [3, 4, 5])
+        assert not len(apart.collect(next(asked)).begun_anew)
+        return
     np.testing.assert_array_equal(apart.collect(next(asked)).begun_anew, [3, 4, 5])
     assert not len(apart.collect(next(asked)).begun_anew)
     assert apart.begun_anew == 3
@@ -150,11 +157,17 @@ def test_one_that_dies_in_the_middle_of_a_step_is_made_again(in_processes, tmp_p
 
 @pytest.mark.parametrize("method", ["spawn", "forkserver"])
 def test_processes_that_are_not_forked_get_the_users_code_and_stay(
-    in_processes, method, monkeypatch
+    in_processes, method, monkeypatch, tmp_path
 ):
+    file = tmp_path / "own_walk.py"  # as a recipe, it cannot be imported by its name
+    file.write_text("from toy_acting import Again\n\n\nclass Own(Again):\n    pass\n")
+    spec = importlib.util.spec_from_file_location("own_walk", file)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "own_walk", module)
+    spec.loader.exec_module(module)
     context = multiprocessing.get_context(method)
     monkeypatch.setattr(processes.mp, "get_context", lambda: context)
-    ours, theirs = here(stepping()), in_processes(stepping())
+    ours, theirs = here(stepping(module.Own)), in_processes(stepping(module.Own))
     pids = [worker.process.pid for worker in theirs._workers]
     for collectors in (ours, theirs):
         collectors.start(Seeds(3))
@@ -162,6 +175,40 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
         time.sleep(1.5 * processes.LOOK * i)  # they look whether their parent lives
         equal(ours.collect(request), theirs.collect(request))
     assert [worker.process.pid for worker in theirs._workers] == pids
+
+
+PARENT = """
+import os, signal, time
+from test_process_collectors import ProcessCollectors, stepping
+found = ProcessCollectors(stepping(), 1, 3, 1, "Walk")
+pids = [worker.process.pid for worker in found._workers]
+os.kill(pids[-1], signal.SIGSTOP)
+print(*pids, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_workers_end_where_their_parent_is_killed_though_one_of_them_hangs():
+    command = [sys.executable, "-c", PARENT]
+    paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    found = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ | paths)
+    *others, stopped = map(int, found.stdout.split())
+    try:
+        until = time.monotonic() + 20
+        while any(alive(pid) for pid in others) and time.monotonic() < until:
+            time.sleep(0.1)
+        assert not any(alive(pid) for pid in others)
+        assert alive(stopped)
+    finally:
+        os.kill(stopped, signal.SIGKILL)
+
+
+def alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):

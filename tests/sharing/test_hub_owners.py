@@ -117,6 +117,8 @@ def test_elsewhere_a_run_of_the_hub_writes_what_it_is_asked_to(
 ) -> None:
     pytest.importorskip("PIL")
     loaded = sw.from_hub(NAME)
+    before = contents(loaded.path)
     loaded.render(tmp_path / "film.gif", max_steps=3)
     loaded.save_weights(tmp_path / "all.safetensors")
     assert {p.name for p in tmp_path.iterdir()} >= {"film.gif", "all.safetensors"}
+    assert contents(loaded.path) == before

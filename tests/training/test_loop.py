@@ -350,7 +350,7 @@ def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_
     assert torch.equal(here, weights(ProcessCollectors(collector, 2, 2, 1, "CartPole-v1"), True))
 
 
-def test_transitions_into_what_a_lost_worker_did_not_repeat_are_not_learnt():
+def test_what_a_lost_worker_did_not_repeat_is_cut_before_rows_of_it_are_kept():
     env = Identity(16)
     algorithm = make_algorithm(REPLAY, env.observation_space, env.action_space)
     found = training(algorithm, env)
