@@ -191,9 +191,11 @@ os.kill(os.getpid(), signal.SIGKILL)
 def test_workers_end_where_their_parent_is_killed_though_one_of_them_hangs():
     command = [sys.executable, "-c", PARENT]
     paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
-    found = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ | paths)
-    *others, stopped = map(int, found.stdout.split())
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | paths)
+    with parent.stdout as said:  # the worker that hangs holds its other end: one line is all
+        *others, stopped = map(int, said.readline().split())
     try:
+        assert parent.wait(20) == -signal.SIGKILL
         until = time.monotonic() + 20
         while any(alive(pid) for pid in others) and time.monotonic() < until:
             time.sleep(0.1)
