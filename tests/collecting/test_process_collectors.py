@@ -178,7 +178,7 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
 
 
 PARENT = """
-import os, signal, time
+import os, signal
 from test_process_collectors import ProcessCollectors, stepping
 found = ProcessCollectors(stepping(), 1, 3, 1, "Walk")
 pids = [worker.process.pid for worker in found._workers]

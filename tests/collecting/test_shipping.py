@@ -38,6 +38,12 @@ hierarchy = Hierarchy("OwnPole-v0", [Still()])
 '''
 
 
+def printed_elsewhere(code):
+    """The words that ``code`` prints in a new Python."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+
 @pytest.fixture
 def recipe(tmp_path, monkeypatch):
     (tmp_path / "helper_of_recipe.py").write_text("def half(x):\n    return x / 2\n")
@@ -59,9 +65,7 @@ def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_pa
         f"own = unpacked(open({str(file)!r}, 'rb').read())\n"
         "print(type(own.spec.make().unwrapped).__name__, own.skills[0].reward(S(reward=3.0)))\n"
     )
-    command = [sys.executable, "-c", code]
-    found = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert found.stdout.split() == ["Own", "1.5"]
+    assert printed_elsewhere(code) == ["Own", "1.5"]
 
 
 def test_a_recipe_that_lies_where_packages_are_installed_is_sent_as_well(tmp_path, monkeypatch):
@@ -73,9 +77,7 @@ def test_a_recipe_that_lies_where_packages_are_installed_is_sent_as_well(tmp_pat
         "from skillweave.collecting.shipping import unpacked\n"
         f"print(*[s.name for s in unpacked(open({str(file)!r}, 'rb').read()).skills])\n"
     )
-    command = [sys.executable, "-c", code]
-    found = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert found.stdout.split() == ["stabilize", "center", "landing"]
+    assert printed_elsewhere(code) == ["stabilize", "center", "landing"]
 
 
 @pytest.mark.parametrize("folder", ["site-packages", "dist-packages"])
@@ -111,9 +113,7 @@ def test_environments_arrive_as_they_are_registered_here_whatever_they_are_calle
         f"unpacked(open({str(file)!r}, 'rb').read())\n"
         "print(*[gym.spec(n).max_episode_steps for n in ('ShortPole-v0', 'CartPole-v1')])\n"
     )
-    command = [sys.executable, "-c", code]
-    found = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert found.stdout.split() == ["7", "20"]
+    assert printed_elsewhere(code) == ["7", "20"]
 
 
 OWN_ALGORITHM = """
@@ -147,12 +147,10 @@ def test_an_algorithm_of_the_users_own_is_known_where_it_arrives(tmp_path, monke
         f"config = config_from_json({config_to_json(mine.Mine())!r})\n"
         "print(type(make_algorithm(config, *spaces)).__name__)\n"
     )
-    command = [sys.executable, "-c", code]
     try:
-        found = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert printed_elsewhere(code) == ["MineAlgorithm"]
     finally:
         del _REGISTERED["Mine"], sys.modules["mine"]
-    assert found.stdout.split() == ["MineAlgorithm"]
 
 
 def test_an_onnx_file_arrives_as_the_same_policy(tmp_path):
