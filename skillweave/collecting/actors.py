@@ -27,7 +27,7 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from skillweave.collecting.collector import Collected
 from skillweave.collecting.shipping import packed
-from skillweave.collecting.stationed import actor_class
+from skillweave.collecting.stationed import COMPUTING, actor_class
 from skillweave.collecting.workers import MakeStanding, WorkerCollectors, WorkerLost, Workers
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
@@ -61,6 +61,7 @@ class Actors:
         self._group = placement_group([{"CPU": cpus}] * count)
         self._actors: dict[int, Any] = {}
         self._waited, self._told = 0.0, False
+        self._told_versions = set[str]()
 
     def get(self, number: int) -> Any:
         """An actor; it is made where it does not exist."""
@@ -88,6 +89,16 @@ class Actors:
             self.end(number)
         with suppress(Exception):
             remove_placement_group(self._group)
+
+    def tell_versions(self, there: dict[str, Any]) -> None:
+        """Say once for each node what runs there in another version than here."""
+        found = differing_versions(there)
+        if found and there["node"] not in self._told_versions:
+            self._told_versions.add(there["node"])
+            self.tell(
+                f"node {there['node']} of the Ray cluster has {found}: where the same versions are "
+                "on all nodes, a run gives the same weights again"
+            )
 
     def wait_for(self, ref: Any) -> None:
         """Until an actor has answered.
@@ -200,6 +211,7 @@ class ActorWorker:
                 self._actors.wait_for(self._versions)
                 self.place = ray.get(self._versions)
                 check_versions(self.place)
+                self._actors.tell_versions(self.place)
                 self._versions = None
             error, answer = ray.get(ref)
         except LOST as lost:
@@ -259,6 +271,19 @@ def check_versions(there: dict[str, Any]) -> None:
                 f"node {there['node']} of the Ray cluster has {name} {theirs}, but here is {mine}: "
                 "all nodes need the same"
             )
+
+
+def differing_versions(there: dict[str, Any]) -> str:
+    """Packages that a node has in another version, as people say it; empty where there are none."""
+    found = []
+    for package in COMPUTING:
+        try:
+            here = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+        if there[package] not in (here, None):
+            found.append(f"{package} {there[package]} (here {here})")
+    return ", ".join(found)
 
 
 def _how(lost: Exception) -> str:

@@ -88,6 +88,8 @@ class Ray:
         begun = not ray.is_initialized()
         if begun:
             self._connect(ray, most)
+        elif self.address is not None:
+            _must_be_joined(ray, self.address)
         try:
             yield ray
         finally:
@@ -165,6 +167,20 @@ def imported() -> Any:
     except ImportError as error:
         raise MissingExtra("Ray, for collectors on a cluster,", "ray") from error
     return ray
+
+
+def _must_be_joined(ray: Any, address: str) -> None:
+    """Raise a SkillweaveError where this process is joined to a cluster at another address."""
+    joined = ray.get_runtime_context().gcs_address
+    port = address.rpartition(":")[2]
+    # One machine has many names, so only ports are compared; a client's port is not the head's.
+    if address in ("local", "auto") or address.startswith("ray://"):
+        return
+    if port != joined.rpartition(":")[2]:
+        raise SkillweaveError(
+            f"Ray: address is {short(address)}, but this process is joined to the cluster at "
+            f"{joined} already. Leave the address out, or call ray.shutdown() before"
+        )
 
 
 def _must_listen(address: str) -> None:

@@ -17,6 +17,9 @@ from skillweave.collecting.workers import Station
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
 
+COMPUTING = "torch", "numpy", "gymnasium", "envpool", "mujoco"
+"""Packages of which another version may compute other numbers."""
+
 
 def actor_class() -> type:
     """The class of actors.
@@ -24,15 +27,19 @@ def actor_class() -> type:
     It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
     """
 
+    packages = COMPUTING
+
     class CollectorActor:
         def versions(self) -> dict[str, Any]:
             """What runs here, and where that is."""
             found: dict[str, Any] = {"node": ray.util.get_node_ip_address()}
             found |= {"process": os.getpid(), "Python": platform.python_version()}
-            try:
-                return found | {"Skillweave": metadata.version("skillweave")}
-            except metadata.PackageNotFoundError:
-                return found | {"Skillweave": None}
+            for package in (*packages, "skillweave"):
+                try:
+                    found[package] = metadata.version(package)
+                except metadata.PackageNotFoundError:
+                    found[package] = None
+            return found | {"Skillweave": found.pop("skillweave")}
 
         def make(self, code: bytes, each: int, number: int) -> Any:
             """Make the collector: (error, None)."""

@@ -34,7 +34,7 @@ ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
 
 from skillweave.collecting import actors  # noqa: E402
-from skillweave.collecting.stationed import Stationed  # noqa: E402
+from skillweave.collecting.stationed import COMPUTING, Stationed  # noqa: E402
 
 NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
 
@@ -222,6 +222,24 @@ def test_a_node_with_another_version_is_refused(other, says):
     actors.check_versions(there)
     with pytest.raises(SkillweaveError, match=says):
         actors.check_versions(there | other)
+
+
+def test_a_node_that_computes_with_another_version_is_told_once(on_ray):
+    there = {"node": "10.0.0.7"} | dict.fromkeys(COMPUTING)
+    told = on_ray(stepping())._workers[0]._actors
+    for _ in range(2):
+        told.tell_versions(there | {"torch": metadata.version("torch")})
+        told.tell_versions(there | {"torch": "1.0.1", "numpy": "1.2"})
+    [line] = [line for line in on_ray.told if "10.0.0.7" in line]
+    assert re.search(r"has torch 1\.0\.1 \(here .*\), numpy 1\.2 \(here", line)
+
+
+def test_an_address_is_refused_where_another_cluster_is_joined(cluster):
+    port = int(cluster.address.rpartition(":")[2])
+    with pytest.raises(SkillweaveError, match=rf"joined to the cluster at .*:{port} already"):
+        Ray(address=f"10.0.0.7:{port - 1}").joined(1).__enter__()
+    with Ray(address=f"localhost:{port}").joined(1) as found:
+        assert found is ray
 
 
 def test_what_cannot_be_sent_is_told(on_ray):
