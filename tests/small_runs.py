@@ -55,6 +55,20 @@ class Stopped(Exception):
     """What interrupts a run here."""
 
 
+class Heard:
+    """A listener that keeps messages."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def stage(self, *told: Any) -> None: ...
+    def tick(self, *told: Any) -> None: ...
+    def done(self, *told: Any) -> None: ...
+
+    def message(self, text: str) -> None:
+        self.said.append(text)
+
+
 class StopAt:
     """A listener that raises at its n-th tick."""
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, got_key
-from small_runs import ON, StopAt, Stopped, assert_same, new_run
+from small_runs import ON, Heard, StopAt, Stopped, assert_same, new_run
 from test_together import declare
 
 from skillweave import Automaton, SkillweaveError, Together
@@ -32,20 +32,6 @@ class Unlock(Skill):
 
     def initiation(self, obs):
         return obs[:, KEY] == 1
-
-
-class Heard:
-    """A listener that keeps messages."""
-
-    def __init__(self):
-        self.said = []
-
-    def stage(self, *told): ...
-    def tick(self, *told): ...
-    def done(self, *told): ...
-
-    def message(self, text):
-        self.said.append(text)
 
 
 def chain(*skills, **how):

@@ -11,11 +11,13 @@ from small_runs import (
     ON,
     SMALL,
     Balance,
+    Heard,
     Left,
     Push,
     Whole,
     assert_same,
     lines,
+    new_run,
     policies,
 )
 
@@ -30,6 +32,7 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
+from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 
 
@@ -143,6 +146,35 @@ def test_the_better_of_before_and_after_is_kept(whole):
     own = {f"{n}.safetensors" for n in names} | {f"together.{n}.safetensors" for n in names}
     assert set(policies(path)) == own, "nothing that was learnt is lost"
     assert "anchor_kl" in " ".join(lines(path)[-1])
+
+
+class Never(Left):
+    """Says of no call that it succeeded."""
+
+    def success(self, step):
+        return np.zeros(len(step.reward), bool)
+
+
+class Always(Left):
+    """Says so of all."""
+
+    def success(self, step):
+        return np.ones(len(step.reward), bool)
+
+
+def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_path):
+    hierarchy = declare(Never(), Always(), learn="apart, then together")
+    heard = Heard()
+    run = new_run(hierarchy, tmp_path / "run")
+    training.train(hierarchy, run, (heard,))
+    run.close()
+    said = [text for text in heard.said if "succe" in text]
+    assert [text.partition(":")[0] for text in said] == ["never", "together"]
+    assert "success() held at the end of none of its latest calls" in said[0]
+    assert "skill 'never' never succeeded" in said[1]
+    told = lines(tmp_path / "run")[-1]
+    assert "always.anchor_kl" in told
+    assert "never.anchor_kl" not in told
 
 
 class Right(Skill):

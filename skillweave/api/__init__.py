@@ -11,7 +11,7 @@ import gymnasium as gym
 from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.api.adoption import adopt, check_run, spec_of
+from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
 from skillweave.api.run import Run
 from skillweave.api.running import begin, declared_of, go_on
 from skillweave.collecting.cluster import Ray
@@ -65,7 +65,7 @@ class Agent(PlainAgent):
         """
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
-        return go_on(self, run, quiet, evolve, cluster)
+        return go_on(self, run, quiet, evolve, cluster, told_differences(self, run))
 
     def load(self, run_dir: str | Path) -> Run:
         """The finished run of this agent in ``run_dir``."""
@@ -78,7 +78,9 @@ class Agent(PlainAgent):
         """The agent of a run's ``manifest`` (``run.json``) that needs none of the user's code."""
         (stage,) = manifest["stages"]
         config = config_from_json(stage["algorithm"])
-        return cls(spec_of(manifest), config, int(stage["budget"]))
+        found = cls(spec_of(manifest), config, int(stage["budget"]))
+        found.recorded = True
+        return found
 
     def load_weights(self, path: str | Path) -> Run:
         """This agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
@@ -162,19 +164,22 @@ class Hierarchy(Declaration):
     ) -> Run:
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
+        The run's settings count, and the code of this hierarchy: methods, functions, conditions.
+        Settings that differ are told.
+
         ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
         selection of your own. ``cluster``: where its collectors run from now on; their number
         stays.
         """
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        adopt(self, run)
-        return go_on(self, run, quiet, evolve, cluster)
+        own = adopted(self, run)
+        return go_on(own, run, quiet, evolve, cluster, told_differences(self, run))
 
     def load(self, run_dir: str | Path) -> Run:
         """The finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        adopt(self, run)
-        return Run(declared_of(self, run), run.path, training.load(self, run))
+        own = adopted(self, run)
+        return Run(declared_of(own, run), run.path, training.load(own, run))
 
     def plain_agent(self) -> Agent:
         """The flat baseline: one agent on the task itself, without skills and reflexes."""
@@ -211,7 +216,9 @@ class Hierarchy(Declaration):
             if "hierarchy" in entry:
                 own["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
             skills.append(type(name, (RecordedSkill,), own)())
-        return cls(spec, skills, call_steps=calls_from_json(told))
+        found = cls(spec, skills, call_steps=calls_from_json(told))
+        found.recorded = True
+        return found
 
 
 def train_agent(

@@ -2,33 +2,66 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from typing import Any, TypeVar
 
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import adopt_guide
-from skillweave.hierarchy.nesting import every_hierarchy, every_skill, inner_of
+from skillweave.hierarchy.nesting import copied, every_hierarchy, every_skill, inner_of
+from skillweave.hierarchy.training import manifest
 from skillweave.hierarchy.weights import adopt_calls, check_selector
+from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
 
+MOST_NAMED = 3
+"""Settings that a message names."""
 
-def adopt(declared: Declaration, run: RunDirectory) -> None:
-    """Take over from a run how skills are called, here and in hierarchies below, if it fits.
+D = TypeVar("D", bound=Declaration)
+
+
+def adopted(declared: D, run: RunDirectory) -> D:
+    """A copy that calls its skills as a run does, here and in hierarchies below, if it fits.
 
     Raises:
         SkillweaveError: the run is not one of this declaration.
     """
     check_run(declared, run)
     if run.manifest["kind"] != "hierarchy":
-        return
+        return declared
+    found = copied(declared)
     entries = {s["name"]: s for s in run.manifest["skills"]}
-    for path, own in every_hierarchy(declared):
+    for path, own in every_hierarchy(found):
         if path:
             _adopt(own, entries[path]["hierarchy"], f"{run.path}: {path}")
         else:
             _adopt(own, run.manifest, str(run.path))
+    return found
+
+
+def told_differences(declared: Declaration | PlainAgent, run: RunDirectory) -> str:
+    """A sentence on settings that a run has otherwise than declared; empty if there are none."""
+    if declared.recorded:
+        return ""
+    seed, flat = run.manifest["seed"], run.manifest["kind"] == "agent"
+    if isinstance(declared, Declaration):
+        content = manifest(declared, seed=seed, flat=flat)
+    else:
+        content = declared.manifest(seed)
+    here, there = settings(content), settings(run.manifest)
+    evolve = tuple(f"{s['name']}." for s in run.manifest["stages"] if s.get("evolution"))
+    # Settings that older versions did not know are not in both; who evolves has others by plan.
+    both = [k for k in here if k in there and not k.startswith(evolve)]
+    differ = [k for k in both if plain(here[k]) != plain(there[k])]
+    if not differ:
+        return ""
+    named = [
+        f"{k} is {plain(there[k])} (declared now: {plain(here[k])})" for k in differ[:MOST_NAMED]
+    ]
+    more = f", and {len(differ) - MOST_NAMED} more differ" if len(differ) > MOST_NAMED else ""
+    return f"the run goes on with its own settings: {', '.join(named)}{more}"
 
 
 def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
@@ -65,12 +98,39 @@ def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
             if inner is not None:
                 where, ready = f"{run.path}: {entry['name']}", inner.ready_selector is not None
                 check_selector(ready, "selector" in entry["hierarchy"], where)
-    if run.manifest["env"] != declared.spec.name:
-        what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
+                _check_reflexes(inner, entry["hierarchy"], where)
+        _check_reflexes(declared, run.manifest, str(run.path))
+    _check_place(declared, run)
+
+
+def _check_reflexes(declared: Declaration, told: dict[str, Any], where: str) -> None:
+    """Raise a SkillweaveError where others are in force than those that were trained with."""
+    theirs: list[str] = told.get("reflexes", [])
+    mine = [str(r.name) for r in declared.reflexes]
+    if mine != theirs:
         raise SkillweaveError(
-            f"{run.path} was trained on {run.manifest['env']}, but this {what} is on "
-            f"{declared.spec.name}"
+            f"{where} was trained with {_reflexes(theirs)}, but this hierarchy has "
+            f"{_reflexes(mine)}: declare them as they were, or train anew"
         )
+
+
+def _reflexes(names: list[str]) -> str:
+    return f"the reflexes {', '.join(names)}" if names else "no reflexes"
+
+
+def _check_place(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
+    """Raise a SkillweaveError where a run was trained in another environment."""
+    theirs, kwargs = run.manifest["env"], run.manifest["env_kwargs"]
+    mine, own = declared.spec.name, json.loads(json.dumps(declared.spec.kwargs, default=str))
+    if (theirs, kwargs) == (mine, own):
+        return
+    if theirs == mine:
+        theirs, mine = f"{theirs} made with {kwargs}", f"one made with {own}"
+    what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
+    raise SkillweaveError(
+        f"{run.path} was trained on {theirs}, but this {what} is on {mine}. To try its policy "
+        "elsewhere: evaluate(run.policy, env)"
+    )
 
 
 def spec_of(told: dict[str, Any]) -> EnvSpec:

@@ -110,13 +110,16 @@ def go_on(
     quiet: bool,
     evolve: Evolve,
     cluster: Ray | None,
+    note: str = "",
 ) -> Run:
-    """Train what is left of a run."""
+    """Train what is left of a run; ``note``: what people should know first."""
     must_be_own(run.path)
     with ExitStack() as stack:
         stack.callback(run.close)
         run.begin()
         progress = stack.enter_context(Progress(quiet=quiet))
+        if note:
+            progress.message(note)
         trackers = make_trackers(run.manifest.get("track", ()), run)
         for tracker in trackers:
             stack.callback(tracker.close)

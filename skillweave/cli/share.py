@@ -9,6 +9,8 @@ from typing import Any
 from skillweave.api.hub import pull_run, push_run
 from skillweave.cli import commands
 from skillweave.cli.targets import free
+from skillweave.runs.command_words import command_words
+from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import check_name, hub
 
 
@@ -26,7 +28,8 @@ def pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
     _no_bars()
     name = check_name(command.name).partition("/")[2]
     path = pull_run(command.name, command.out or free(Path("runs") / name), command.revision)
-    return {"path": str(path)}, f"run     {path}  (skillweave info|evaluate|render {path})"
+    watch = command_words("evaluate|render|report", RunDirectory.open(path))
+    return {"path": str(path)}, f"run     {path}  ({watch})"
 
 
 def _no_bars() -> None:

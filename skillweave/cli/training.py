@@ -15,6 +15,7 @@ from skillweave.cli.targets import declared_by_run, free
 from skillweave.cli.telling import save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.evolution.config import Evolution
+from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.types import SkillweaveError
@@ -121,7 +122,8 @@ def _told(trained: Run, episodes: int, render: bool = False) -> tuple[dict[str, 
         film = trained.render(trained.path / f"{manifest['kind']}.gif")
         result["film"] = film
         lines.append(f"film    {film['path']}")
-    lines.append(f"run     {trained.path}  (skillweave info|evaluate|render {trained.path})")
+    watch = command_words("evaluate|render|report", RunDirectory.open(trained.path))
+    lines.append(f"run     {trained.path}  ({watch})")
     return result, lines
 
 
@@ -129,14 +131,11 @@ def _interrupted(path: Path, ray: str | None) -> KeyboardInterrupt:
     """The same interrupt, with what is saved and how to go on."""
     if not (path / "run.json").exists():
         return KeyboardInterrupt("nothing was trained yet")
-    manifest = RunDirectory.open(path).manifest
-    recipe, hint = manifest.get("recipe"), ""
-    if manifest.get("resume_needs_recipe", True) and recipe not in recipes.names():
-        hint = f" --recipe {recipe or 'FILE.py'}"
-    hint += "" if ray is None else f" --ray {ray}".rstrip()
+    again = command_words("resume", RunDirectory.open(path))
+    again += "" if ray is None else f" --ray {ray}".rstrip()
     try:
         at = read_tensors(path / "checkpoint.safetensors")[1]
         saved = f"saved at {at['steps']:,} steps of {at['stage']}"
     except SkillweaveError:
         saved = "saved at the start"
-    return KeyboardInterrupt(f"{saved}; go on with: skillweave resume {path}{hint}")
+    return KeyboardInterrupt(f"{saved}; go on with: {again}")

@@ -55,7 +55,8 @@ class Declaration(Nestable):
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     skills: Sequence[Skill]
-    """What the selector chooses from; a hierarchy among them is trained inside."""
+    """What the selector chooses from; a hierarchy among them is trained inside, with its own
+    budgets."""
     call_steps: int | Lengths | None = 40
     """How long a skill acts before the selector decides again; None: until it stops by itself."""
     learn: Literal["apart", "together", "apart, then together"] = "apart"
@@ -106,11 +107,14 @@ class Declaration(Nestable):
     cut_every: int = 100_000
     """Environment steps between checkpoints."""
     eval_every: int | None = None
-    """Environment steps between evaluations of who trains, by its own reward; None: none."""
+    """Environment steps between evaluations of who trains, by its own reward; None: none. They are
+    ``eval_return`` and ``eval_success`` in ``metrics.jsonl``."""
     eval_episodes: int = 20
     """Episodes of each of these evaluations."""
     name: str = "hierarchy"
     """What it is named where it is a skill of another hierarchy."""
+    recorded = False
+    """It is of a run that was loaded without its code, and knows less than was declared."""
 
     def __post_init__(self) -> None:
         check_env(self.env)

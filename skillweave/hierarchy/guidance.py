@@ -36,6 +36,11 @@ def check_selection(declared: Declaration) -> None:
         check_algorithm(declared.selector, "selector", also="function, Automaton or tree")
         if declared.guide is not None:
             _check_guide(declared)
+        elif declared.guide_nats is not None:
+            raise SkillweaveError(
+                f"guide_nats is {short(declared.guide_nats)}, but there is no guide to stay near: "
+                "give one (guide=), or leave guide_nats out"
+            )
         return
     refused = {
         "selector_target_return is given": declared.selector_target_return is not None,

@@ -6,6 +6,7 @@ is in it has a path: ``inner/skill``, ``inner/selector``.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from skillweave.hierarchy.declaration import Declaration
 
 T = TypeVar("T")
+D = TypeVar("D", bound="Declaration")
 _ELSEWHERE = {
     "algorithm": "selector=",
     "steps": "selector_steps= and skill_steps=",
@@ -84,6 +86,18 @@ def every_hierarchy(declared: Declaration) -> Iterator[tuple[str, Declaration]]:
     for name, skill in every_skill(declared.skills):
         if (inner := inner_of(skill)) is not None:
             yield name, inner
+
+
+def copied(declared: D) -> D:
+    """The same hierarchy, and the same below it: what is changed there is not changed here."""
+    found, skills = copy.copy(declared), []
+    for skill in declared.skills:
+        if (inner := inner_of(skill)) is not None:
+            skill = copy.copy(skill)
+            skill.policy = copied(inner)
+        skills.append(skill)
+    found.skills = tuple(skills)
+    return found
 
 
 def below(found: Mapping[str, T], name: str) -> dict[str, T]:

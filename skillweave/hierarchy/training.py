@@ -19,6 +19,7 @@ from skillweave.hierarchy.nesting import (
 from skillweave.hierarchy.schedule import own_stages, stages_of
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
+from skillweave.runs.command_words import command_words
 from skillweave.runs.copies import keep_policy, recorded_policy
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
@@ -160,7 +161,7 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     if run.unjudged:
         raise SkillweaveError(
             f"{run.path}: all is learnt, but whether the hierarchy before or that after learning "
-            f"together is better was not judged yet; skillweave resume {run.path}"
+            f"together is better was not judged yet; {command_words('resume', run)}"
         )
     absent = [s.name for s in declaration.skills if not can_act(s, found)]
     if absent:

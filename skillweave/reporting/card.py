@@ -40,7 +40,7 @@ def write_card(
         _measured(saved),
         _training(run),
         *(_shown(path) for path in figures),
-        _folded("All settings", ("setting", "value"), settings(run)),
+        _folded("All settings", ("setting", "value"), settings(run.manifest)),
         _folded("Versions", ("of", "version"), run.manifest["versions"]),
     ]
     return "\n\n".join(parts) + "\n"

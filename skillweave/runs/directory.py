@@ -27,6 +27,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentPolicy, state_from
 from skillweave.reading import shown
 from skillweave.runs.checkpoints import Checkpoints
+from skillweave.runs.command_words import command_words
 from skillweave.runs.files import (
     TEMPORARY,
     make_directory,
@@ -250,7 +251,7 @@ class RunDirectory:
         entry = self.stage(stage)
         if entry["status"] != "done":
             raise SkillweaveError(
-                f"{self.path}: the stage {stage!r} is not finished; skillweave resume {self.path}"
+                f"{self.path}: the stage {stage!r} is not finished; {command_words('resume', self)}"
             )
         path = self.policy_path(stage, name)
         tensors, header, sha256 = read_signed(path)

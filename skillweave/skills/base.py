@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -78,7 +80,10 @@ class Skill:
         return np.zeros(len(step.reward), bool)
 
     def success(self, step: Step) -> Array:
-        """What counts as having succeeded, (N,) bool, by the last ``step`` before it stops."""
+        """What counts as having succeeded, (N,) bool, by the last ``step`` before it stops.
+
+        Default: none in evaluations; to automata and trees, that ``termination`` stopped it.
+        """
         return np.zeros(len(step.reward), bool)
 
     def defines(self, method: str) -> bool:
@@ -102,11 +107,37 @@ class Skill:
                 raise SkillweaveError(
                     f"{where}: {field} is {short(value)}; it must be at least 1, or None"
                 )
+        if self.color is not None and not _is_color(self.color):
+            raise SkillweaveError(
+                f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
+                "0 to 255: color = (230, 80, 60)"
+            )
+        for name, meant in self._misspelt():
+            warnings.warn(
+                f"{where} has {name!r}, which Skillweave does not know: is {meant!r} meant?",
+                stacklevel=2,
+            )
         for method in self.methods:
             if not callable(getattr(self, method)):
                 raise SkillweaveError(
                     f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
+
+    def _misspelt(self) -> Iterator[tuple[str, str]]:
+        """Names of the subclass that are nearly those of attributes, with these."""
+        meant = [*Skill.__annotations__.keys() - {"methods", "_path"}, *self.methods]
+        for kind in type(self).__mro__[: type(self).__mro__.index(Skill)]:
+            for name in vars(kind).keys() - set(dir(Skill)):
+                if name.startswith("_"):
+                    continue
+                if found := difflib.get_close_matches(name, meant, n=1, cutoff=0.8):
+                    yield name, found[0]
+
+
+def _is_color(value: object) -> bool:
+    """Whether a value is red, green and blue, each from 0 to 255."""
+    numbers = isinstance(value, tuple | list) and len(value) == 3
+    return numbers and all(type(v) is int and 0 <= v <= 255 for v in value)  # type: ignore[attr-defined]
 
 
 def path_of(skill: Skill) -> str:

@@ -48,6 +48,8 @@ class PlainAgent:
     """Environment steps between evaluations while it trains; None: none."""
     eval_episodes: int = 20
     """Episodes of each of these evaluations."""
+    recorded = False
+    """It is of a run that was loaded without its code, and knows less than was declared."""
 
     def __post_init__(self) -> None:
         check_env(self.env)

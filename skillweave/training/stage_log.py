@@ -37,6 +37,15 @@ class Listener(Protocol):
         ...
 
 
+def never_succeeded(entry: Mapping[str, Any]) -> bool:
+    """Whether a skill's stage has ended with none of its latest calls a success.
+
+    A skill without ``success`` is not judged.
+    """
+    found: bool = entry.get("kind") == "skill" and entry.get("final", {}).get("success") == 0.0
+    return found
+
+
 class StageLog:
     """A stage's entry in the manifest, its lines, its checkpoints, and who is told.
 
@@ -116,6 +125,12 @@ class StageLog:
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
         entry["final"] = at["metrics"]
         self.run.save()
+        if never_succeeded(entry):
+            self.tell(
+                "success() held at the end of none of its latest calls, so stages after this one "
+                "build on a skill that does not work. It may need more steps, a reward that leads "
+                "there step by step, or states nearer to it: start_calls, initiation()"
+            )
         self.run.drop_checkpoints()
         drop_states(self.run, entry["name"])
         for listener in self.listeners:

@@ -31,7 +31,7 @@ from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
 from skillweave.training.stage import CRITIC, SELECTOR, Together
-from skillweave.training.stage_log import StageLog
+from skillweave.training.stage_log import StageLog, never_succeeded
 from skillweave.training.trainer import OneAgent, StageRun
 from skillweave.training.woven_learner import WovenLearner, decides
 from skillweave.types import Array, prefixed, unprefixed
@@ -114,12 +114,12 @@ class WovenAgents(OneAgent):
             before, anchor = self.stage.policies.get(name), None
             if isinstance(before, AgentPolicy):
                 fresh = self._as_before(name, algorithm, fresh, before)
-                anchor = self._anchor(name, algorithm, fresh, device)
+                anchor = self._anchor(name, algorithm, fresh, device, log)
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
             part = self._part(name, Stack(algorithm, state_to(fresh, device)), log)
-            if isinstance(part, RolloutLearner):
-                part.anchor = anchor
+            if anchor is not None:
+                part.anchor = anchor  # type: ignore[attr-defined]
             keep_to_guide(part, self._nats(name))
             parts[name] = part
         found = WovenLearner(parts, self.node, self.together)
@@ -138,10 +138,17 @@ class WovenAgents(OneAgent):
         return found
 
     def _anchor(
-        self, name: str, algorithm: Algorithm, state: Any, device: torch.device
+        self, name: str, algorithm: Algorithm, state: Any, device: torch.device, log: StageLog
     ) -> Anchor | None:
         """What a skill that was trained before is to stay near: this state."""
-        if self.together.anchor_nats is None or decides(name):
+        rollouts = algorithm.store == "rollout"
+        if self.together.anchor_nats is None or decides(name) or not rollouts:
+            return None
+        if never_succeeded(self._latest_stage(name)):
+            log.tell(
+                f"skill {name!r} never succeeded when it was trained, so it moves freely here "
+                "(together.anchor_nats is not used for it)"
+            )
             return None
         params = algorithm.acting_params(state, device=device)
         return Anchor(params, torch.ones(1, device=device), self.together.anchor_nats)
@@ -163,10 +170,18 @@ class WovenAgents(OneAgent):
             found.act_from_the_start()
         return found
 
+    def _stages_of(self, name: str) -> list[dict[str, Any]]:
+        """The stages before in which ``name`` has learnt."""
+        stages = self.stage.run.manifest["stages"]
+        return [s for s in stages if name in s["learns"] and s["status"] == "done"]
+
+    def _latest_stage(self, name: str) -> dict[str, Any]:
+        """The latest of them; empty where there is none."""
+        return next(reversed(self._stages_of(name)), {})
+
     def _steps_of(self, name: str) -> int:
         """Environment steps that ``name`` has learnt from in earlier stages."""
-        stages = self.stage.run.manifest["stages"]
-        return sum(s.get("steps", 0) for s in stages if name in s["learns"])
+        return sum(s.get("steps", 0) for s in self._stages_of(name))
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Learn until the stage is over; skills that learnt nothing are told."""

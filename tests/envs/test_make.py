@@ -9,6 +9,7 @@ import pytest
 from skillweave.envs import make
 from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.training.stage import assign_workers
+from skillweave.types import SkillweaveError
 
 
 class Clock:
@@ -75,3 +76,23 @@ def test_a_measured_number_is_lowered_to_one_that_divides_the_environments(monke
     entries = [entry("one", 4, evolution={}), entry("two", 6), entry("three", 8, evolution=None)]
     assign_workers(entries, EnvSpec("CartPole-v1"))
     assert [e["workers"] for e in entries] == [1, 3, 4]
+
+
+class Unseen(gym.Env):
+    """Knows nothing of films."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self):
+        pass
+
+
+def test_a_registered_environment_need_not_know_how_it_is_rendered():
+    gym.register("Unseen-v0", Unseen)
+    try:
+        assert isinstance(EnvSpec("Unseen-v0").make().unwrapped, Unseen)
+        with pytest.raises(SkillweaveError, match=r"Unseen-v0.*render_mode"):
+            EnvSpec("Unseen-v0").make("rgb_array")
+    finally:
+        del gym.registry["Unseen-v0"]

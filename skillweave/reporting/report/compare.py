@@ -22,6 +22,7 @@ from skillweave.reporting.report.skills_table import (
     transition_rows,
     transitions,
 )
+from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 from skillweave.training.skill_report import levels_of
@@ -86,10 +87,12 @@ def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
     found = []
     for run in runs:
         if not run.finished:
-            found.append(f"{run.path} is not finished; to finish it: skillweave resume {run.path}")
+            found.append(
+                f"{run.path} is not finished; to finish it: {command_words('resume', run)}"
+            )
         elif saved[run.path] is None:
             found.append(
-                f"{run.path} has no evaluation; to make one: skillweave evaluate {run.path}"
+                f"{run.path} has no evaluation; to make one: {command_words('evaluate', run)}"
             )
     played = {
         (e.seed, e.deterministic, len(e.evaluation.returns))

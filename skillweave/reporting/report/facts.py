@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skillweave.reporting.report.skills_table import number
+from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import flat
 
@@ -91,14 +92,13 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     if found:
         found.append(
             "Only a finished run can be played, so there are no episodes and no film. To finish "
-            f"it: skillweave resume {run.path}"
+            f"it: {command_words('resume', run)}"
         )
     return found
 
 
-def settings(run: RunDirectory) -> dict[str, Any]:
-    """Every setting of a run by its dotted name; neither its seed nor what came of it."""
-    m = run.manifest
+def settings(m: Mapping[str, Any]) -> dict[str, Any]:
+    """Every setting in a run's manifest by its dotted name; not its seed, nor what came of it."""
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
     told: tuple[str, ...] = (
         "kind",

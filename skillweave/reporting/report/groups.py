@@ -34,7 +34,7 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
         raise SkillweaveError("no runs were given; name at least one run's directory")
     found: dict[str, Group] = {}
     for run in runs:
-        own = facts.settings(run)
+        own = facts.settings(run.manifest)
         key = json.dumps([run.manifest.get("recipe"), own], sort_keys=True, default=str)
         group = found.setdefault(key, Group(_letter(len(found)), _base(run), [], own))
         for other in group.runs:

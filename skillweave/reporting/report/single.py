@@ -189,7 +189,7 @@ def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) ->
         "env": m["env"],
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
-        "settings": [(k, facts.plain(v)) for k, v in facts.settings(run).items()],
+        "settings": [(k, facts.plain(v)) for k, v in facts.settings(m).items()],
         "versions": list(m["versions"].items()),
         "steps": sum(e.get("steps", reached.get(e["name"], 0)) for e in m["stages"]),
         "training_seconds": sum(entry.get("seconds", 0.0) for entry in m["stages"]),

@@ -1,0 +1,158 @@
+"""What a hierarchy takes over from a run, what it refuses, and what it tells."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_runs import ON, Balance, Left, Push, interrupt_at_checkpoint
+
+from skillweave import Agent, EnvSpec, Evolution, Hierarchy, Reflex, SkillweaveError
+from skillweave.runs.directory import RunDirectory
+
+pytestmark = pytest.mark.filterwarnings("ignore:Overwriting")
+
+
+def leans(obs):
+    return obs[:, 2] > 0.1
+
+
+def declare(**how):
+    options = {
+        "env": EnvSpec("CartPole-v1", engine="sync", workers=1),
+        "skills": [Left(), Balance(), Push()],
+        "call_steps": 6,
+        "algorithm": ON,
+        "selector": ON,
+        "skill_steps": 200,
+        "selector_steps": 200,
+        "cut_every": 100,
+    }
+    return Hierarchy(**options | how)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    path = tmp_path_factory.mktemp("done") / "run"
+    declare(reflexes=[Reflex(leans, 1, "tilt")]).train(path, seed=3, quiet=True)
+    return path
+
+
+def nested(call_steps, inner_steps):
+    inner = declare(skills=[Left(), Push()], call_steps=inner_steps)
+    skill = inner.as_skill("inner", max_steps=20)
+    return declare(skills=[Balance(), skill], call_steps=call_steps)
+
+
+def test_a_hierarchy_that_loads_a_run_stays_as_it_was_declared(tmp_path):
+    nested(6, 3).train(tmp_path / "run", quiet=True)
+    mine = nested(9, 5)
+    found = mine.load(tmp_path / "run").declaration
+    assert found.call_steps == 6
+    assert found.skills[1].policy.call_steps == 3
+    assert mine.call_steps == 9
+    assert mine.skills[1].policy.call_steps == 5
+    assert mine.resume(tmp_path / "run", quiet=True).declaration.call_steps == 6
+    assert mine.call_steps == 9
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ({}, "with the reflexes tilt, but this hierarchy has no reflexes"),
+        ({"reflexes": [Reflex(leans, 1, "other")]}, "this hierarchy has the reflexes other"),
+    ],
+)
+def test_other_reflexes_are_refused(done, how, says):
+    for use in (declare(**how).load, declare(**how).resume):
+        with pytest.raises(SkillweaveError, match=says):
+            use(done)
+
+
+def test_an_environment_that_was_made_otherwise_is_refused(tmp_path):
+    def made(told):
+        return Agent(EnvSpec("CartPole-v1", {"sutton_barto_reward": told}, engine="sync"), ON, 100)
+
+    made(True).train(tmp_path / "run", quiet=True)
+    made(True).load(tmp_path / "run")
+    for use in (made(False).load, made(False).resume):
+        with pytest.raises(SkillweaveError, match=r"made with .*True.*, but .*False.*evaluate\("):
+            use(tmp_path / "run")
+
+
+EVOLVE = Evolution(population=2, generations=2, episodes=2)
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "says"),
+    [
+        ({}, {}, ""),
+        (
+            {},
+            {"algorithm": replace(ON, gamma=0.9), "skill_steps": 300},
+            "left.algorithm.gamma is 0.995 (declared now: 0.9)",
+        ),
+        ({}, {"call_steps": 7}, "call_steps is 6 (declared now: 7)"),
+        ({"evolve": {"left": EVOLVE}}, {}, ""),
+    ],
+)
+def test_settings_that_differ_are_told_where_a_run_goes_on(
+    tmp_path, monkeypatch, capsys, first, then, says
+):
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt):
+            declare().train(tmp_path / "run", seed=3, **first)
+    capsys.readouterr()
+    run = declare(**then).resume(tmp_path / "run")
+    told = "".join(capsys.readouterr())
+    assert ("goes on with its own settings" in told) == bool(says)
+    assert says in told
+    assert run.info()["stages"][0]["algorithm"]["gamma"] == ON.gamma
+    assert RunDirectory.open(tmp_path / "run").finished
+
+
+def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, capsys):
+    agent = Agent("CartPole-v1", ON, 300, cut_every=100, target_return=1e6, eval_every=100)
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt):
+            agent.train(tmp_path / "run")
+    capsys.readouterr()
+    Agent.from_manifest(RunDirectory.open(tmp_path / "run").manifest).resume(tmp_path / "run")
+    assert "own settings" not in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize("nats", [0.05, "x", -3])
+def test_a_distance_from_no_guide_is_refused(nats):
+    with pytest.raises(SkillweaveError, match=r"guide_nats is .*, but there is no guide"):
+        declare(guide_nats=nats)
+
+
+@pytest.mark.parametrize("color", ["red", (1, 2), (1, 2, 300), (0.1, 0.2, 0.3), 7])
+def test_a_color_that_is_none_is_refused(color):
+    class Painted(Left):
+        pass
+
+    Painted.color = color
+    with pytest.raises(SkillweaveError, match=r"skill 'painted' .*color is .*red, green and blue"):
+        declare(skills=[Painted()])
+
+
+def test_names_that_are_nearly_those_of_a_skill_are_told():
+    class Odd(Left):
+        max_step = 4
+        far = 2.0
+
+        def rewards(self, step):
+            return np.zeros(len(step.reward))
+
+        def _success(self, step):
+            return step.terminated
+
+    with pytest.warns(UserWarning, match="'odd'") as found:
+        declare(skills=[Odd()])
+    told = sorted(str(w.message).partition("has ")[2] for w in found)
+    assert [line.partition(",")[0] for line in told] == ["'max_step'", "'rewards'"]
+    assert [line.rpartition(": is ")[2] for line in told] == [
+        "'max_steps' meant?", "'reward' meant?"
+    ]  # fmt: skip

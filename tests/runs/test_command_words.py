@@ -1,0 +1,27 @@
+"""What people are told to type works: it names the file with their code."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from skillweave.runs.command_words import command_words
+
+
+@pytest.mark.parametrize(
+    ("recipe", "needs", "resume_needs", "evaluate", "resume"),
+    [
+        ("lunar-lander", True, True, "", ""),  # a shipped one is found by its name
+        ("mine.py", True, True, " --recipe mine.py", " --recipe mine.py"),
+        ("mine.py", False, True, "", " --recipe mine.py"),
+        (None, True, True, " --recipe FILE.py", " --recipe FILE.py"),
+        (None, False, False, "", ""),
+    ],
+)
+def test_commands_name_the_users_file_where_it_is_needed(
+    recipe, needs, resume_needs, evaluate, resume
+):
+    told = {"recipe": recipe, "needs_recipe": needs, "resume_needs_recipe": resume_needs}
+    run = SimpleNamespace(path=Path("runs/a"), manifest=told)
+    assert command_words("evaluate|render", run) == f"skillweave evaluate|render runs/a{evaluate}"
+    assert command_words("resume", run) == f"skillweave resume runs/a{resume}"
