@@ -17,6 +17,7 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, short
 from skillweave.reporting.progress import Progress
+from skillweave.runs.command_words import saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
@@ -125,7 +126,11 @@ def go_on(
             stack.callback(tracker.close)
         make = _where(cluster, run, progress, stack)
         learner = make_learner(run.manifest["stages"], evolve, make)
-        policy = training.train(declared, run, (progress, *trackers), learner)
+        try:
+            policy = training.train(declared, run, (progress, *trackers), learner)
+        except KeyboardInterrupt:
+            again = f"resume({str(run.path)!r})"
+            raise KeyboardInterrupt(f"{saved_words(run)}; go on with: {again}") from None
     return Run(declared_of(declared, run), run.path, policy)
 
 

@@ -15,9 +15,8 @@ from skillweave.cli.targets import declared_by_run, free
 from skillweave.cli.telling import save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.evolution.config import Evolution
-from skillweave.runs.command_words import command_words
+from skillweave.runs.command_words import command_words, saved_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.files import read_tensors
 from skillweave.types import SkillweaveError
 
 
@@ -131,11 +130,7 @@ def _interrupted(path: Path, ray: str | None) -> KeyboardInterrupt:
     """The same interrupt, with what is saved and how to go on."""
     if not (path / "run.json").exists():
         return KeyboardInterrupt("nothing was trained yet")
-    again = command_words("resume", RunDirectory.open(path))
+    run = RunDirectory.open(path)
+    again = command_words("resume", run)
     again += "" if ray is None else f" --ray {ray}".rstrip()
-    try:
-        at = read_tensors(path / "checkpoint.safetensors")[1]
-        saved = f"saved at {at['steps']:,} steps of {at['stage']}"
-    except SkillweaveError:
-        saved = "saved at the start"
-    return KeyboardInterrupt(f"{saved}; go on with: {again}")
+    return KeyboardInterrupt(f"{saved_words(run)}; go on with: {again}")

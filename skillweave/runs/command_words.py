@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Protocol
 
+from skillweave.runs.files import read_tensors
+from skillweave.types import SkillweaveError
+
 
 class Told(Protocol):
     """A run: where it is, and what it says."""
@@ -19,3 +22,13 @@ def command_words(name: str, run: Told) -> str:
     recipe = run.manifest.get("recipe") or "FILE.py"
     own = recipe.endswith(".py") and run.manifest.get(needs, True)
     return f"skillweave {name} {run.path}" + (f" --recipe {recipe}" if own else "")
+
+
+def saved_words(run: Told) -> str:
+    """How far a run is saved that was stopped."""
+    try:
+        at = read_tensors(run.path / "checkpoint.safetensors")[1]
+        return f"saved at {at['steps']:,} steps of {at['stage']}"
+    except SkillweaveError:
+        done = [stage["name"] for stage in run.manifest["stages"] if stage["status"] == "done"]
+        return f"saved after {done[-1]}" if done else "saved at the start"

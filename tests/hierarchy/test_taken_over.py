@@ -122,6 +122,24 @@ def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, caps
     assert "own settings" not in "".join(capsys.readouterr())
 
 
+def test_ctrl_c_says_how_far_it_is_saved_and_how_to_go_on(tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt) as stop:
+            declare().train(path, seed=3)
+    assert str(stop.value) == f"saved at 128 steps of left; go on with: resume({str(path)!r})"
+
+    def stop_at_once(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("skillweave.training.stage_log.StageLog.tick", stop_at_once)
+    with pytest.raises(KeyboardInterrupt, match=r"^saved at 128 steps of left; go on"):
+        declare().resume(path)
+    with pytest.raises(KeyboardInterrupt, match=r"^saved at the start; go on"):
+        declare().train(tmp_path / "other")
+
+
 @pytest.mark.parametrize("nats", [0.05, "x", -3])
 def test_a_distance_from_no_guide_is_refused(nats):
     with pytest.raises(SkillweaveError, match=r"guide_nats is .*, but there is no guide"):
