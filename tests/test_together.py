@@ -34,6 +34,7 @@ from skillweave import (
 )
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
+from skillweave.training.stage_log import START, StageLog
 
 
 def declare(*skills, **how):
@@ -170,11 +171,30 @@ def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_pa
     run.close()
     said = [text for text in heard.said if "succe" in text]
     assert [text.partition(":")[0] for text in said] == ["never", "together"]
-    assert "success() held at the end of none of its latest calls" in said[0]
+    assert "success() held at the end of none of its calls" in said[0]
     assert "skill 'never' never succeeded" in said[1]
     told = lines(tmp_path / "run")[-1]
     assert "always.anchor_kl" in told
     assert "never.anchor_kl" not in told
+
+
+@pytest.mark.parametrize(
+    ("told", "succeeded"),
+    [
+        ([{}, {}], None),
+        ([{"success": 0.0}, {"success": 0.0}], False),
+        ([{"success": 0.1}, {"success": 0.0}], True),
+        ([{"success": 0.0}, {"success": 0.0, "eval_success": 1.0}], True),
+    ],
+)
+def test_success_is_judged_by_all_calls_of_a_stage(tmp_path, told, succeeded):
+    run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
+    log = StageLog("left", run, (), START)
+    for update, metrics in enumerate(told):
+        log.tick(update, 64 * (update + 1), 0.1, metrics)
+    log.done({}, {})
+    run.close()
+    assert RunDirectory.open(run.path).stage("left").get("succeeded") is succeeded
 
 
 class Right(Skill):

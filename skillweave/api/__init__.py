@@ -165,7 +165,7 @@ class Hierarchy(Declaration):
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
         The run's settings count, and the code of this hierarchy: methods, functions, conditions.
-        Settings that differ are told.
+        Settings that differ are told, but for those of a population.
 
         ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
         selection of your own. ``cluster``: where its collectors run from now on; their number

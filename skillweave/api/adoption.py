@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
@@ -15,6 +15,9 @@ from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
+
+if TYPE_CHECKING:
+    from skillweave.api import Agent, Hierarchy
 
 MOST_NAMED = 3
 """Settings that a message names."""
@@ -33,6 +36,10 @@ def adopted(declared: D, run: RunDirectory) -> D:
         return declared
     found = copied(declared)
     entries = {s["name"]: s for s in run.manifest["skills"]}
+    for path, skill in every_skill(found.skills):
+        for field in ("max_steps", "call_steps"):
+            if getattr(skill, field) != entries[path].get(field):
+                setattr(skill, field, entries[path].get(field))
     for path, own in every_hierarchy(found):
         if path:
             _adopt(own, entries[path]["hierarchy"], f"{run.path}: {path}")
@@ -41,9 +48,12 @@ def adopted(declared: D, run: RunDirectory) -> D:
     return found
 
 
-def told_differences(declared: Declaration | PlainAgent, run: RunDirectory) -> str:
-    """A sentence on settings that a run has otherwise than declared; empty if there are none."""
-    if declared.recorded:
+def told_differences(declared: Hierarchy | Agent, run: RunDirectory) -> str:
+    """A sentence on settings that a run has otherwise than declared; empty if there are none.
+
+    A recipe is not asked: nobody knows any more what was changed on the command line.
+    """
+    if declared.recorded or declared.recipe is not None:
         return ""
     seed, flat = run.manifest["seed"], run.manifest["kind"] == "agent"
     if isinstance(declared, Declaration):
@@ -53,7 +63,8 @@ def told_differences(declared: Declaration | PlainAgent, run: RunDirectory) -> s
     here, there = settings(content), settings(run.manifest)
     evolve = tuple(f"{s['name']}." for s in run.manifest["stages"] if s.get("evolution"))
     # Settings that older versions did not know are not in both; who evolves has others by plan.
-    both = [k for k in here if k in there and not k.startswith(evolve)]
+    # Where a file lies is no setting; its checksum is.
+    both = [k for k in here if k in there and not k.startswith(evolve) and not k.endswith(".file")]
     differ = [k for k in both if plain(here[k]) != plain(there[k])]
     if not differ:
         return ""
@@ -71,6 +82,7 @@ def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
     declared.reflexes_in_training = told.get("reflexes_in_training", True)
     declared.start_calls = told.get("start_calls")
     declared.search_steps = told.get("search_steps")
+    declared.call_cost = told.get("call_cost", declared.call_cost)
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
@@ -128,8 +140,8 @@ def _check_place(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
         theirs, mine = f"{theirs} made with {kwargs}", f"one made with {own}"
     what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
     raise SkillweaveError(
-        f"{run.path} was trained on {theirs}, but this {what} is on {mine}. To try its policy "
-        "elsewhere: evaluate(run.policy, env)"
+        f"{run.path} was trained on {theirs}, but this {what} is on {mine}. Load it where it was "
+        "trained; to try its policy elsewhere then: evaluate(run.policy, env)"
     )
 
 

@@ -280,9 +280,9 @@ def differing_versions(there: dict[str, Any]) -> str:
         try:
             here = metadata.version(package)
         except metadata.PackageNotFoundError:
-            continue
-        if there[package] not in (here, None):
-            found.append(f"{package} {there[package]} (here {here})")
+            here = None
+        if there[package] != here:
+            found.append(f"{package} {there[package] or 'missing'} (here {here or 'missing'})")
     return ", ".join(found)
 
 

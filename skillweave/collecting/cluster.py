@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import os
 import socket
@@ -88,7 +89,7 @@ class Ray:
         begun = not ray.is_initialized()
         if begun:
             self._connect(ray, most)
-        elif self.address is not None:
+        elif self.address:
             _must_be_joined(ray, self.address)
         try:
             yield ray
@@ -172,15 +173,23 @@ def imported() -> Any:
 def _must_be_joined(ray: Any, address: str) -> None:
     """Raise a SkillweaveError where this process is joined to a cluster at another address."""
     joined = ray.get_runtime_context().gcs_address
-    port = address.rpartition(":")[2]
-    # One machine has many names, so only ports are compared; a client's port is not the head's.
-    if address in ("local", "auto") or address.startswith("ray://"):
+    if address in ("local", "auto") or address.startswith("ray://"):  # a client's port is another
         return
-    if port != joined.rpartition(":")[2]:
+    (mine, _, port), (theirs, _, joined_port) = address.rpartition(":"), joined.rpartition(":")
+    # One machine has many names, so hosts are compared only where both are numbers.
+    if port != joined_port or (_is_outside(mine) and _is_outside(theirs) and mine != theirs):
         raise SkillweaveError(
             f"Ray: address is {short(address)}, but this process is joined to the cluster at "
             f"{joined} already. Leave the address out, or call ray.shutdown() before"
         )
+
+
+def _is_outside(host: str) -> bool:
+    """Whether a host is a number, and not this machine's own for itself."""
+    try:
+        return not ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
 
 
 def _must_listen(address: str) -> None:

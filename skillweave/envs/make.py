@@ -135,11 +135,14 @@ class EnvSpec:
             ) from error
 
     def _from_registry(self, env_id: str, render_mode: str | None) -> gym.Env[Any, Any]:
-        # Environments that cannot be rendered need not know the word.
-        rendered = {} if render_mode is None else {"render_mode": render_mode}
-        how: dict[str, Any] = rendered | self.kwargs
         try:
-            return gym.make(env_id, **how)
+            try:
+                return gym.make(env_id, render_mode=render_mode, **self.kwargs)
+            except TypeError as error:
+                word = "unexpected keyword argument 'render_mode'"
+                if render_mode is not None or word not in str(error):
+                    raise
+                return gym.make(env_id, **self.kwargs)  # what is never seen need not know it
         except gym.error.DependencyNotInstalled as error:
             if "box2d" in str(error).lower():
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error

@@ -55,8 +55,8 @@ class Declaration(Nestable):
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     skills: Sequence[Skill]
-    """What the selector chooses from; a hierarchy among them is trained inside, with its own
-    budgets."""
+    """What the selector chooses from; a hierarchy among them is trained inside, where it learns
+    apart with its own budgets."""
     call_steps: int | Lengths | None = 40
     """How long a skill acts before the selector decides again; None: until it stops by itself."""
     learn: Literal["apart", "together", "apart, then together"] = "apart"

@@ -90,13 +90,10 @@ def every_hierarchy(declared: Declaration) -> Iterator[tuple[str, Declaration]]:
 
 def copied(declared: D) -> D:
     """The same hierarchy, and the same below it: what is changed there is not changed here."""
-    found, skills = copy.copy(declared), []
-    for skill in declared.skills:
-        if (inner := inner_of(skill)) is not None:
-            skill = copy.copy(skill)
-            skill.policy = copied(inner)
-        skills.append(skill)
-    found.skills = tuple(skills)
+    found = copy.copy(declared)
+    found.skills = tuple(copy.copy(skill) for skill in declared.skills)
+    for skill, inner in inner_hierarchies(found.skills):
+        skill.policy = copied(inner)
     return found
 
 
@@ -124,6 +121,11 @@ def check_nested(declared: Declaration) -> None:
         skill._path = path
         if inner_of(skill) is None:
             continue
+        if isinstance(getattr(type(skill), "policy", None), property):
+            raise SkillweaveError(
+                f"skill {path!r} is a hierarchy, but its policy is a property: make it a class "
+                "attribute"
+            )
         for field, where in _ELSEWHERE.items():
             if getattr(skill, field) is not None:
                 raise SkillweaveError(

@@ -235,5 +235,6 @@ def _hierarchy_entry(declaration: Declaration) -> dict[str, Any]:
         "reflexes": [r.name for r in declaration.reflexes],
         "start_calls": declaration.start_calls,
         "search_steps": declaration.search_steps,
+        **({"call_cost": declaration.call_cost} if declaration.call_cost else {}),
         **_selector_entry(declaration),
     }

@@ -69,6 +69,13 @@ class Checkpoints:
             )
         return None
 
+    def told(self) -> dict[str, Any]:
+        """The header of the latest; empty where there is none."""
+        for path in self._files:
+            with suppress(SkillweaveError):
+                return read_header(path)
+        return {}
+
     def drop(self) -> None:
         """Remove them: their stage is done, and ``run.json`` says so."""
         for path in self._files:

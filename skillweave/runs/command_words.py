@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any, Protocol
 
-from skillweave.runs.files import read_tensors
-from skillweave.types import SkillweaveError
+from skillweave.runs.checkpoints import Checkpoints
 
 
 class Told(Protocol):
@@ -21,14 +21,13 @@ def command_words(name: str, run: Told) -> str:
     needs = "resume_needs_recipe" if name == "resume" else "needs_recipe"
     recipe = run.manifest.get("recipe") or "FILE.py"
     own = recipe.endswith(".py") and run.manifest.get(needs, True)
-    return f"skillweave {name} {run.path}" + (f" --recipe {recipe}" if own else "")
+    words = f"skillweave {name} {shlex.quote(str(run.path))}"
+    return words + (f" --recipe {shlex.quote(recipe)}" if own else "")
 
 
 def saved_words(run: Told) -> str:
     """How far a run is saved that was stopped."""
-    try:
-        at = read_tensors(run.path / "checkpoint.safetensors")[1]
+    if at := Checkpoints(run.path).told():
         return f"saved at {at['steps']:,} steps of {at['stage']}"
-    except SkillweaveError:
-        done = [stage["name"] for stage in run.manifest["stages"] if stage["status"] == "done"]
-        return f"saved after {done[-1]}" if done else "saved at the start"
+    done = [stage["name"] for stage in run.manifest["stages"] if stage["status"] == "done"]
+    return f"saved after {done[-1]}" if done else "saved at the start"

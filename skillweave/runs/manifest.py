@@ -54,6 +54,7 @@ class NestedEntry(TypedDict):
     reflexes_in_training: NotRequired[bool]
     start_calls: NotRequired[int | None]
     search_steps: NotRequired[int | None]
+    call_cost: NotRequired[float]
 
 
 class SkillEntry(TypedDict):
@@ -123,6 +124,8 @@ class StageEntry(TypedDict):
     steps_per_second: NotRequired[float]
     final: NotRequired[dict[str, float | None]]
     winner: NotRequired[Winner]
+    succeeded: NotRequired[bool]
+    """Any call of the skill, while it trained or was evaluated, as far as that is known."""
     sha256: NotRequired[str]
     """Of its policy's file."""
     policies: NotRequired[dict[NodePath, str]]

@@ -130,14 +130,15 @@ class Skill:
             for name in vars(kind).keys() - set(dir(Skill)):
                 if name.startswith("_"):
                     continue
-                if found := difflib.get_close_matches(name, meant, n=1, cutoff=0.8):
+                if found := difflib.get_close_matches(name, meant, n=1, cutoff=0.9):
                     yield name, found[0]
 
 
 def _is_color(value: object) -> bool:
     """Whether a value is red, green and blue, each from 0 to 255."""
-    numbers = isinstance(value, tuple | list) and len(value) == 3
-    return numbers and all(type(v) is int and 0 <= v <= 255 for v in value)  # type: ignore[attr-defined]
+    if not isinstance(value, tuple | list | np.ndarray) or np.shape(value) != (3,):
+        return False
+    return all(isinstance(v, int | np.integer) and 0 <= v <= 255 for v in value)
 
 
 def path_of(skill: Skill) -> str:

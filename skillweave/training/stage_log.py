@@ -38,12 +38,11 @@ class Listener(Protocol):
 
 
 def never_succeeded(entry: Mapping[str, Any]) -> bool:
-    """Whether a skill's stage has ended with none of its latest calls a success.
+    """Whether a skill's stage has ended, and none of its calls was a success.
 
-    A skill without ``success`` is not judged.
+    Skills without ``success`` are not judged, nor populations, nor stages of older versions.
     """
-    found: bool = entry.get("kind") == "skill" and entry.get("final", {}).get("success") == 0.0
-    return found
+    return entry.get("succeeded") is False
 
 
 class StageLog:
@@ -124,17 +123,27 @@ class StageLog:
         entry["evaluation_steps"] = at["evaluation_steps"]
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
         entry["final"] = at["metrics"]
+        if (succeeded := self._succeeded()) is not None:
+            entry["succeeded"] = succeeded
         self.run.save()
         if never_succeeded(entry):
             self.tell(
-                "success() held at the end of none of its latest calls, so stages after this one "
-                "build on a skill that does not work. It may need more steps, a reward that leads "
-                "there step by step, or states nearer to it: start_calls, initiation()"
+                "success() held at the end of none of its calls, so stages after this one build on "
+                "a skill that does not work. It may need more steps, a reward that leads there "
+                "step by step, or states nearer to it: start_calls, initiation()"
             )
         self.run.drop_checkpoints()
         drop_states(self.run, entry["name"])
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
+
+    def _succeeded(self) -> bool | None:
+        """Whether any call of the skill was a success; None: nobody says so."""
+        if self.entry["kind"] != "skill" or self.entry.get("evolution"):
+            return None
+        lines = [line for line in self.run.metrics() if line["stage"] == self.entry["name"]]
+        told = [line[k] for line in lines for k in ("success", "eval_success") if k in line]
+        return max(told) > 0.0 if told else None
 
 
 def resumed(log: StageLog, restore: Callable[[], T]) -> T:

@@ -11,6 +11,7 @@ import threading
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import metadata
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -225,19 +226,24 @@ def test_a_node_with_another_version_is_refused(other, says):
 
 
 def test_a_node_that_computes_with_another_version_is_told_once(on_ray):
-    there = {"node": "10.0.0.7"} | dict.fromkeys(COMPUTING)
+    there = {"node": "10.0.0.7"} | {name: metadata.version(name) for name in COMPUTING}
     told = on_ray(stepping())._workers[0]._actors
     for _ in range(2):
-        told.tell_versions(there | {"torch": metadata.version("torch")})
-        told.tell_versions(there | {"torch": "1.0.1", "numpy": "1.2"})
+        told.tell_versions(there)
+        told.tell_versions(there | {"torch": "1.0.1", "envpool": None})
     [line] = [line for line in on_ray.told if "10.0.0.7" in line]
-    assert re.search(r"has torch 1\.0\.1 \(here .*\), numpy 1\.2 \(here", line)
+    assert re.search(r"has torch 1\.0\.1 \(here .*\), envpool missing \(here", line)
 
 
-def test_an_address_is_refused_where_another_cluster_is_joined(cluster):
+def test_an_address_is_refused_where_another_cluster_is_joined(cluster, monkeypatch):
     port = int(cluster.address.rpartition(":")[2])
     with pytest.raises(SkillweaveError, match=rf"joined to the cluster at .*:{port} already"):
-        Ray(address=f"10.0.0.7:{port - 1}").joined(1).__enter__()
+        Ray(address=f"localhost:{port - 1}").joined(1).__enter__()
+    joined = SimpleNamespace(gcs_address="10.0.0.1:9")
+    monkeypatch.setattr(ray, "get_runtime_context", lambda: joined)
+    with pytest.raises(SkillweaveError, match=r"joined to the cluster at 10.0.0.1:9 already"):
+        Ray(address="10.0.0.7:9").joined(1).__enter__()
+    monkeypatch.undo()
     with Ray(address=f"localhost:{port}").joined(1) as found:
         assert found is ray
 

@@ -96,3 +96,18 @@ def test_a_registered_environment_need_not_know_how_it_is_rendered():
             EnvSpec("Unseen-v0").make("rgb_array")
     finally:
         del gym.registry["Unseen-v0"]
+
+
+class Shown(Unseen):
+    """Opens a window unless it is told not to."""
+
+    def __init__(self, render_mode="human"):
+        self.mode = render_mode
+
+
+def test_training_opens_no_window_whatever_an_environment_does_by_itself():
+    gym.register("Shown-v0", Shown)
+    try:
+        assert EnvSpec("Shown-v0").make().unwrapped.mode is None
+    finally:
+        del gym.registry["Shown-v0"]

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_runs import ON, Balance, Left, Push, interrupt_at_checkpoint
+from small_runs import ON, Balance, Left, Push, assert_same, interrupt_at_checkpoint
+from small_runs import Left as SmallLeft
 
 from skillweave import Agent, EnvSpec, Evolution, Hierarchy, Reflex, SkillweaveError
 from skillweave.runs.directory import RunDirectory
@@ -92,6 +93,7 @@ EVOLVE = Evolution(population=2, generations=2, episodes=2)
             "left.algorithm.gamma is 0.995 (declared now: 0.9)",
         ),
         ({}, {"call_steps": 7}, "call_steps is 6 (declared now: 7)"),
+        ({}, {"start_calls": 3}, "start_calls is none (declared now: 3)"),
         ({"evolve": {"left": EVOLVE}}, {}, ""),
     ],
 )
@@ -109,6 +111,48 @@ def test_settings_that_differ_are_told_where_a_run_goes_on(
     assert says in told
     assert run.info()["stages"][0]["algorithm"]["gamma"] == ON.gamma
     assert RunDirectory.open(tmp_path / "run").finished
+
+
+def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
+    class Left(SmallLeft):
+        pass
+
+    whole = declare(skills=[Left(), Balance()], call_cost=0.5)
+    whole.train(tmp_path / "whole", seed=3, quiet=True)
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt):
+            whole.train(tmp_path / "run", seed=3, quiet=True)
+    monkeypatch.setattr(Left, "max_steps", 4)
+    monkeypatch.setattr(Left, "call_steps", 3)
+    capsys.readouterr()
+    other = declare(skills=[Left(), Balance()], call_cost=0.1)
+    other.resume(tmp_path / "run")
+    told = "".join(capsys.readouterr())
+    assert "skills.left.max_steps is 15 (declared now: 4)" in told
+    assert "call_cost is 0.5 (declared now: 0.1)" in told
+    assert (other.skills[0].max_steps, other.call_cost) == (4, 0.1)
+    assert_same(tmp_path / "run", tmp_path / "whole")
+
+
+def test_a_loaded_hierarchy_shares_no_skills(tmp_path):
+    declare().train(tmp_path / "run", quiet=True)
+    mine = declare()
+    mine.skills[0].steps = 200
+    mine.load(tmp_path / "run").declaration.scale(0.5)
+    assert mine.skills[0].steps == 200
+
+
+def test_a_recipe_is_not_asked_for_what_the_command_line_changed(tmp_path, monkeypatch, capsys):
+    one, other = declare(skill_steps=300), declare()
+    one.recipe = other.recipe = "mine.py"
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt):
+            one.train(tmp_path / "run")
+    capsys.readouterr()
+    other.resume(tmp_path / "run")
+    assert "own settings" not in "".join(capsys.readouterr())
 
 
 def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, capsys):

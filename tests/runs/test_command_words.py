@@ -25,3 +25,8 @@ def test_commands_name_the_users_file_where_it_is_needed(
     run = SimpleNamespace(path=Path("runs/a"), manifest=told)
     assert command_words("evaluate|render", run) == f"skillweave evaluate|render runs/a{evaluate}"
     assert command_words("resume", run) == f"skillweave resume runs/a{resume}"
+
+
+def test_paths_with_spaces_are_quoted():
+    run = SimpleNamespace(path=Path("my runs/a"), manifest={"recipe": "my file.py"})
+    assert command_words("resume", run) == "skillweave resume 'my runs/a' --recipe 'my file.py'"

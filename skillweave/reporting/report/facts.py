@@ -11,7 +11,16 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
-MADE = {"steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers"}
+MADE = {
+    "steps",
+    "seconds",
+    "steps_per_second",
+    "evaluation_steps",
+    "reached",
+    "kept",
+    "workers",
+    "succeeded",
+}
 """Of a stage's entry what training wrote: no settings."""
 
 
@@ -108,6 +117,7 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
         "interrupt",
         "greedy_skills",
     )
+    told += ("start_calls", "search_steps", "call_cost")
     told += ("reflexes", "reflexes_in_training", "cut_every", "eval_every", "eval_episodes")
     found |= {k: m[k] for k in told if k in m}
     for skill in m.get("skills", ()):
