@@ -34,7 +34,7 @@ from skillweave import (
 )
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.stage_log import START, StageLog
+from skillweave.training.stage_log import START, StageLog, success_rate
 
 
 def declare(*skills, **how):
@@ -172,29 +172,34 @@ def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_pa
     said = [text for text in heard.said if "succe" in text]
     assert [text.partition(":")[0] for text in said] == ["never", "together"]
     assert "success() held at the end of none of its calls" in said[0]
-    assert "skill 'never' never succeeded" in said[1]
+    assert "skill 'never' did not succeed any more" in said[1]
     told = lines(tmp_path / "run")[-1]
     assert "always.anchor_kl" in told
     assert "never.anchor_kl" not in told
 
 
 @pytest.mark.parametrize(
-    ("told", "succeeded"),
+    ("told", "succeeded", "rate"),
     [
-        ([{}, {}], None),
-        ([{"success": 0.0}, {"success": 0.0}], False),
-        ([{"success": 0.1}, {"success": 0.0}], True),
-        ([{"success": 0.0}, {"success": 0.0, "eval_success": 1.0}], True),
+        ([{}, {}], None, 1.0),
+        ([{"success": 0.0}, {"success": 0.0}], False, 0.0),
+        ([{"success": 0.1}, {"success": 0.0}], True, 0.0),
+        ([{"success": 0.0}, {"success": 0.25}], True, 0.25),
+        ([{"success": 0.0}, {"success": 0.25, "eval_success": 1.0}], True, 1.0),
     ],
 )
-def test_success_is_judged_by_all_calls_of_a_stage(tmp_path, told, succeeded):
+def test_success_is_judged_by_all_calls_of_a_stage_and_its_rate_by_the_last(
+    tmp_path, told, succeeded, rate
+):
     run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
     log = StageLog("left", run, (), START)
     for update, metrics in enumerate(told):
         log.tick(update, 64 * (update + 1), 0.1, metrics)
     log.done({}, {})
     run.close()
-    assert RunDirectory.open(run.path).stage("left").get("succeeded") is succeeded
+    entry = RunDirectory.open(run.path).stage("left")
+    assert entry.get("succeeded") is succeeded
+    assert success_rate(entry) == rate
 
 
 class Right(Skill):

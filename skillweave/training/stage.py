@@ -99,8 +99,9 @@ class Together:
     margin: float = 0.2
     """A call is cut where another skill is worth so much more, in deviations of the return."""
     anchor_nats: float | None = 0.05
-    """How far, in nats of KL, skills that were trained before by PPO may move; None: freely. One
-    that never succeeded in a stage of its own right before moves freely."""
+    """How far, in nats of KL, skills that were trained before by PPO may move; None: freely. A
+    skill whose calls succeeded in a share p of its own stage, at its end, may move 1/p times as
+    far."""
     quota: float = 0.25
     """A skill learns when it has acted in this share of a rollout's rows, or more."""
 

@@ -45,6 +45,16 @@ def never_succeeded(entry: Mapping[str, Any]) -> bool:
     return entry.get("succeeded") is False
 
 
+def success_rate(entry: Mapping[str, Any]) -> float:
+    """The share of a skill's calls that were a success when its stage ended.
+
+    1 where that is not judged; see ``never_succeeded``.
+    """
+    if "succeeded" not in entry:
+        return 1.0
+    return max(entry["final"].get(k) or 0.0 for k in ("success", "eval_success"))
+
+
 class StageLog:
     """A stage's entry in the manifest, its lines, its checkpoints, and who is told.
 

@@ -31,7 +31,7 @@ from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
 from skillweave.training.stage import CRITIC, SELECTOR, Together
-from skillweave.training.stage_log import StageLog, never_succeeded
+from skillweave.training.stage_log import StageLog, success_rate
 from skillweave.training.trainer import OneAgent, StageRun
 from skillweave.training.woven_learner import WovenLearner, decides
 from skillweave.types import Array, prefixed, unprefixed
@@ -144,14 +144,16 @@ class WovenAgents(OneAgent):
         rollouts = algorithm.store == "rollout"
         if self.together.anchor_nats is None or decides(name) or not rollouts:
             return None
-        if never_succeeded(self._latest_stage(name)):
+        rate = success_rate(self._latest_stage(name))
+        if rate == 0.0:
             log.tell(
-                f"skill {name!r} never succeeded when it was trained, so it moves freely here "
-                "(together.anchor_nats is not used for it)"
+                f"skill {name!r} did not succeed any more when its own stage ended, so it moves "
+                "freely here (together.anchor_nats is not used for it)"
             )
             return None
         params = algorithm.acting_params(state, device=device)
-        return Anchor(params, torch.ones(1, device=device), self.together.anchor_nats)
+        # Who seldom succeeded has little to lose, and much to learn.
+        return Anchor(params, torch.ones(1, device=device), self.together.anchor_nats / rate)
 
     def _part(self, name: str, stack: Stack, log: StageLog) -> Learner:
         """The learner of the selector, or of a skill."""
