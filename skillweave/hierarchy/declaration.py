@@ -101,7 +101,8 @@ class Declaration(Nestable):
     flat_steps: int | None = None
     """Training budget of the flat baseline; None: as many steps as the whole hierarchy takes."""
     greedy_skills: bool = True
-    """Skills act greedily under the selector; else they sample."""
+    """Skills act greedily under the selector; else they sample, as they do where they learn
+    together. Try False where a hierarchy scores less than its return in training."""
     reflexes_in_training: bool = True
     """Reflexes are in force while skills train, apart or together: the body they will have."""
     cut_every: int = 100_000
