@@ -167,7 +167,7 @@ def test_it_learns_to_answer_what_it_sees(case):
     policy, shown = AgentPolicy.of(algorithm, state), np.arange(4)
     action, _ = policy.act(policy.start(4), env.show(shown))
     # By chance 0.25 or more: of choices at most half are right, a Box is 0.5 from its middle.
-    assert env.error(shown, action).mean() < 0.1
+    assert env.error(shown, action).mean() < 0.15
 
 
 @every_case

@@ -76,7 +76,7 @@ def test_a_stack_computes_and_learns_what_plain_torch_networks_do(cnn, reference
         expected = reference(own, m, image[m].float() / 255, ACTIVATIONS[activation])
         torch.testing.assert_close(features[m], expected, rtol=1e-4, atol=1e-5)
         alone = layout.gradient((expected * mix[m]).sum(), own)
-        torch.testing.assert_close(grad[m], alone[m], rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(grad[m], alone[m], rtol=1e-3, atol=3e-5)
         alone = encoder(layout.views(flat[m : m + 1]), {"image.0": image[m : m + 1]})
         torch.testing.assert_close(alone[0], features[m], rtol=1e-4, atol=1e-5)
 

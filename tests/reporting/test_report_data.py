@@ -233,7 +233,9 @@ def test_an_unfinished_run_is_shown_as_far_as_it_is(
     first, second, third = told["missing"]
     assert first == "The stage 'balance' is not finished: it stands after 256 of 256 steps."
     assert second == "The stage 'selector' has not begun."
-    assert third.endswith(f"To finish it: skillweave resume {folder / 'c'}")
+    assert third.endswith(
+        f"To finish it: skillweave resume {folder / 'c'} --recipe {folder / 'cart.py'}"
+    )
     text = out.read_text()
     assert told["bytes"] == len(text.encode())
     assert 'id="curve-0"' in text
