@@ -70,8 +70,9 @@ class Checkpoints:
         return None
 
     def told(self) -> dict[str, Any]:
-        """The header of the latest; empty where there is none."""
-        for path in self._files:
+        """The header of the one that a resumed run goes on from; empty where there is none."""
+        fresh, latest, before = self._files
+        for path in (latest, fresh, before):  # as ``clear`` and ``load`` take them
             with suppress(SkillweaveError):
                 return read_header(path)
         return {}

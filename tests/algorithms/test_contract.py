@@ -113,7 +113,7 @@ TABLE: dict[str, Case] = {
         ("ppo squashed", SQUASHED, "multi-binary", "Box", 4096),
         ("ppo with state's deviation", STATE_STD, "tuple", "Box", 4096),
         ("ppo with lstm", LSTM, "vector", "Discrete", 3072),
-        ("ppo with gru", replace(GRU, ent_coef=0.02), "dict", "MultiBinary", 4096),
+        ("ppo with gru", replace(GRU, ent_coef=0.02), "dict", "MultiBinary", 6144),
         ("own", OWN, "vector", "Discrete", 7680),
         ("own", replace(OWN, learning_rate=5e-3), "tuple", "Box", 25_600),
         ("own", OWN, "image, channels last", "Discrete", 7680),
@@ -167,7 +167,7 @@ def test_it_learns_to_answer_what_it_sees(case):
     policy, shown = AgentPolicy.of(algorithm, state), np.arange(4)
     action, _ = policy.act(policy.start(4), env.show(shown))
     # By chance 0.25 or more: of choices at most half are right, a Box is 0.5 from its middle.
-    assert env.error(shown, action).mean() < 0.15
+    assert env.error(shown, action).mean() < 0.1
 
 
 @every_case

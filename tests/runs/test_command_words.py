@@ -1,11 +1,13 @@
 """What people are told to type works: it names the file with their code."""
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from skillweave.runs.command_words import command_words
+from skillweave.runs.checkpoints import Checkpoints
+from skillweave.runs.command_words import command_words, saved_words
 
 
 @pytest.mark.parametrize(
@@ -30,3 +32,18 @@ def test_commands_name_the_users_file_where_it_is_needed(
 def test_paths_with_spaces_are_quoted():
     run = SimpleNamespace(path=Path("my runs/a"), manifest={"recipe": "my file.py"})
     assert command_words("resume", run) == "skillweave resume 'my runs/a' --recipe 'my file.py'"
+
+
+def test_what_is_saved_is_what_a_resumed_run_goes_on_from(tmp_path):
+    stages = [{"name": "left", "status": "done"}, {"name": "right", "status": "training"}]
+    run, kept = SimpleNamespace(path=tmp_path, manifest={"stages": stages}), Checkpoints(tmp_path)
+    assert saved_words(run) == "saved after left"
+    for steps in (100, 200):
+        kept.save({}, {"stage": "right", "steps": steps})
+    assert saved_words(run) == "saved at 200 steps of right"
+    names = "checkpoint", "checkpoint.new", "checkpoint.previous"
+    latest, fresh, before = (tmp_path / f"{name}.safetensors" for name in names)
+    shutil.copy(before, fresh)
+    assert saved_words(run) == "saved at 200 steps of right", "one that was not moved is removed"
+    latest.rename(fresh)
+    assert saved_words(run) == "saved at 200 steps of right", "between two renames it is whole"

@@ -12,15 +12,9 @@ from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
-    "steps",
-    "seconds",
-    "steps_per_second",
-    "evaluation_steps",
-    "reached",
-    "kept",
-    "workers",
+    "steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers",
     "succeeded",
-}
+}  # fmt: skip
 """Of a stage's entry what training wrote: no settings."""
 
 
@@ -109,16 +103,11 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
 def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     """Every setting in a run's manifest by its dotted name; not its seed, nor what came of it."""
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
-    told: tuple[str, ...] = (
-        "kind",
-        "learn",
-        "call_steps",
-        "call_lengths",
-        "interrupt",
-        "greedy_skills",
-    )
-    told += ("start_calls", "search_steps", "call_cost")
-    told += ("reflexes", "reflexes_in_training", "cut_every", "eval_every", "eval_episodes")
+    told = (
+        "kind", "learn", "call_steps", "call_lengths", "interrupt", "greedy_skills", "start_calls",
+        "search_steps", "call_cost", "reflexes", "reflexes_in_training", "cut_every", "eval_every",
+        "eval_episodes",
+    )  # fmt: skip
     found |= {k: m[k] for k in told if k in m}
     for skill in m.get("skills", ()):
         found |= flat(f"skills.{skill['name']}", {k: v for k, v in skill.items() if k != "name"})
