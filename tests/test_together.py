@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -32,7 +35,7 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
-from skillweave.hierarchy import training
+from skillweave.hierarchy import judging, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.stage_log import START, StageLog, success_rate
 
@@ -147,6 +150,74 @@ def test_the_better_of_before_and_after_is_kept(whole):
     own = {f"{n}.safetensors" for n in names} | {f"together.{n}.safetensors" for n in names}
     assert set(policies(path)) == own, "nothing that was learnt is lost"
     assert "anchor_kl" in " ".join(lines(path)[-1])
+
+
+@pytest.mark.parametrize(
+    ("learn", "asked", "played"),
+    [
+        ("together", None, {"after", "sampled"}),
+        ("together", True, set()),
+        ("together", False, set()),
+        ("apart, then together", None, {"before", "after", "sampled"}),
+        ("apart, then together", False, {"before", "after"}),
+        ("apart", None, None),
+    ],
+)
+def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
+    tmp_path, learn, asked, played
+):
+    hierarchy = declare(learn=learn, greedy_skills=asked)
+    run = hierarchy.train(tmp_path / "run", seed=3, quiet=True)
+    assert hierarchy.greedy_skills is asked, "another seed is judged anew"
+    loaded = declare(learn=learn).load(run.path)
+    run.save_weights(tmp_path / "weights")
+    read = declare(learn=learn).load_weights(tmp_path / "weights")
+    greedy = {r.policy.skills.greedy for r in (run, loaded, read)}
+    if not played:
+        assert greedy == {asked is not False}
+        return
+    kept = dict(RunDirectory.open(run.path).stage("together")["kept"])
+    best = kept.pop("kept")
+    assert set(kept) == played
+    assert kept[best] == max(kept.values())
+    assert greedy == {asked is None and best != "sampled"}
+    assert run.evaluate(100, seed=judging.SEEDS + 3).mean == kept[best]
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_of_greedy_skills_and_such_that_sample_the_better_are_kept(tmp_path, monkeypatch, better):
+    """Not by chance: one of them always plays well here."""
+
+    def played(policy, spec, **how):
+        mean = 10.0 if policy.skills.greedy is better else 5.0
+        return SimpleNamespace(mean=mean, lengths=(7, 8))
+
+    monkeypatch.setattr(judging, "evaluate", played)
+    heard = Heard()
+    run = new_run(declare(), tmp_path / "run")
+    with closing(run):
+        policy = training.train(declare(), run, (heard,))
+    assert policy.skills.greedy is better
+    assert run.stage("together")["evaluation_steps"] == 30
+    said = "after it 10.0, after it with skills that sample 5.0" if better else "sample 10.0"
+    assert said in heard.said[-1]
+
+
+def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch):
+    whole = declare().train(tmp_path / "whole", seed=3, quiet=True)
+
+    def stopped(*told, **how):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(judging, "evaluate", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            declare().train(tmp_path / "run", seed=3, quiet=True)
+    with pytest.raises(SkillweaveError, match=r"was not judged yet.*resume"):
+        declare().load(tmp_path / "run")
+    declare().resume(tmp_path / "run", quiet=True)
+    runs = [RunDirectory.open(path) for path in (tmp_path / "run", whole.path)]
+    assert runs[0].stage("together")["kept"] == runs[1].stage("together")["kept"]
 
 
 class Never(Left):

@@ -18,7 +18,7 @@ from skillweave.types import SkillweaveError
 PLAIN = tuple(
     f.name
     for f in fields(Declaration)
-    if f.type in ("int", "int | None", "float", "float | None", "bool")
+    if f.type in ("int", "int | None", "float", "float | None", "bool", "bool | None")
     or f.name in ("call_steps", "learn")
 )
 CONFIGS = ("algorithm", "selector", "flat", "together")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skillweave.collecting.lengths import calls_from_json
+from skillweave.runs.kept import kept_words
 from skillweave.training.evaluation_file import SavedEvaluation
 
 
@@ -37,10 +38,7 @@ def run_lines(m: Mapping[str, Any], saved: SavedEvaluation | None, target: objec
                 f"fitness {winner['fitness']:.1f} (skillweave plot {target})"
             )
         if kept := p.get("kept"):
-            lines.append(
-                f"    return before learning together {kept['before']:.1f}, after "
-                f"{kept['after']:.1f}: kept what was {kept['kept']}"
-            )
+            lines.append(f"    {kept_words(kept)}")
     lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
     if saved is not None:
         how = "greedy" if saved.deterministic else "sampled"

@@ -100,9 +100,10 @@ class Declaration(Nestable):
     """Trains the flat baseline; None: as ``algorithm``."""
     flat_steps: int | None = None
     """Training budget of the flat baseline; None: as many steps as the whole hierarchy takes."""
-    greedy_skills: bool = True
-    """Skills act greedily under the selector; else they sample, as they do where they learn
-    together. Try False where a hierarchy scores less than its return in training."""
+    greedy_skills: bool | None = None
+    """True: skills act greedily under the selector. False: they sample, as they do where they learn
+    together. None: they are greedy where they learn apart; where they learn together, 100 episodes
+    of each kind are played at the end, and the better is kept."""
     reflexes_in_training: bool = True
     """Reflexes are in force while skills train, apart or together: the body they will have."""
     cut_every: int = 100_000
@@ -251,7 +252,7 @@ class Declaration(Nestable):
             tuple(policies),
             tuple(self.reflexes),
             self.call_steps,
-            self.greedy_skills,
+            self.greedy_skills is not False,
             self.call_cost,
         )
 

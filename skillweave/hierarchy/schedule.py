@@ -10,7 +10,7 @@ from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
 from skillweave.hierarchy.guidance import who_guides
-from skillweave.hierarchy.nesting import inner_hierarchies, inner_of
+from skillweave.hierarchy.nesting import every_hierarchy, inner_hierarchies, inner_of
 from skillweave.skills import Skill
 from skillweave.training.scene import (
     Scene,
@@ -40,16 +40,15 @@ def own_stages(declaration: Declaration, seen_as: Skill | None = None) -> list[S
     apart = _apart(declaration, seen_as) if declaration.learns_apart else []
     if not declaration.weaves:
         return apart
-    compared = bool(apart) and (seen_as is None or _plays_alone(declaration))
-    return [*apart, _together(declaration, seen_as, compared)]
+    together = _together(declaration, seen_as)
+    if seen_as is None or _plays_alone(declaration):  # else no episode can tell
+        left = any(own.greedy_skills is None for _, own in every_hierarchy(declaration))
+        together = replace(together, compared=bool(apart), greedy_judged=left)
+    return [*apart, together]
 
 
-def _together(declaration: Declaration, seen_as: Skill | None, compared: bool) -> Stage:
-    """The stage in which skills and selectors learn from the same steps.
-
-    Args:
-        compared: it is kept only if it is better than what was there before.
-    """
+def _together(declaration: Declaration, seen_as: Skill | None) -> Stage:
+    """The stage in which skills and selectors learn from the same steps."""
     how = declaration.together
 
     def scene(policies: Policies) -> WovenScene:
@@ -74,7 +73,6 @@ def _together(declaration: Declaration, seen_as: Skill | None, compared: bool) -
         declaration.interrupt,
         ready,
         declaration.guide_nats,
-        compared=compared,
     )
 
 

@@ -6,10 +6,10 @@ from typing import Any
 
 from skillweave.collecting.lengths import calls_to_json
 from skillweave.hierarchy.assembly import assembled, can_act
-from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import guide_entry, ready_guide
+from skillweave.hierarchy.judging import judged, settled
 from skillweave.hierarchy.nesting import (
-    below,
     check_nested,
     every_hierarchy,
     every_skill,
@@ -24,7 +24,6 @@ from skillweave.runs.copies import keep_policy, recorded_policy
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
-from skillweave.training.evaluation import evaluate
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.training.stage import SELECTOR, Policies
 from skillweave.training.stage_log import Listener
@@ -54,10 +53,6 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
     }
 
 
-JUDGED = 1_000
-"""Seeds of evaluations from here on tell which hierarchy is better: people take smaller ones."""
-
-
 @torch_threads(1)  # a loop sets its own; all else must not depend on how many there are
 def train(
     declaration: Declaration | PlainAgent,
@@ -74,7 +69,8 @@ def train(
     ready = _ready(declaration, run)
     for name, policy in ready.items():
         keep_policy(run, name, policy)
-    return assembled(declaration, _trained(declaration, run, listeners, ready, make_learner))
+    found = _trained(declaration, run, listeners, ready, make_learner)
+    return assembled(settled(declaration, run), found)
 
 
 def _trained(
@@ -97,7 +93,7 @@ def _trained(
         for skill, inner in inner_hierarchies(declaration.skills):
             where = (*nodes, skill.name)
             known = _trained(inner, run, listeners, known, make_learner, where, skill)
-    stages = own_stages(declaration, seen_as)
+    stages = own_stages(settled(declaration, run, nodes), seen_as)
     for name in reversed(nodes):
         stages = [stage.inside(name) for stage in stages]
     apart = [s for s in stages if s.kind != "together"]
@@ -105,50 +101,7 @@ def _trained(
     if len(apart) == len(stages):
         return before
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
-    if not stages[-1].compared:
-        return after
-    return _better(declaration, run, listeners, before, after, nodes)
-
-
-def _better(
-    declaration: Declaration,
-    run: RunDirectory,
-    listeners: tuple[Listener, ...],
-    before: Policies,
-    after: Policies,
-    nodes: tuple[str, ...] = (),
-) -> Policies:
-    """The better of two hierarchies, by episodes of the environment; written into the run."""
-    entry = run.stage("/".join((*nodes, TOGETHER)))
-    found = {"before": before, "after": after}
-    if "kept" not in entry:
-        seed = JUDGED + int(run.manifest["seed"])
-        means = {
-            name: evaluate(
-                assembled(declaration, _inside(policies, nodes)),
-                declaration.spec, episodes=100, seed=seed,
-            )
-            for name, policies in found.items()
-        }  # fmt: skip
-        entry["kept"] = {name: found.mean for name, found in means.items()}
-        better = means["after"].mean >= means["before"].mean
-        entry["kept"]["kept"] = "after" if better else "before"
-        entry["evaluation_steps"] += sum(sum(found.lengths) for found in means.values())
-        run.save()
-        kept = entry["kept"]
-        for listener in listeners:
-            listener.message(
-                f"{entry['name']}: mean return before {kept['before']:.1f}, after "
-                f"{kept['after']:.1f} (100 episodes each): kept what was {kept['kept']}"
-            )
-    return found[entry["kept"]["kept"]]
-
-
-def _inside(policies: Policies, nodes: tuple[str, ...]) -> Policies:
-    """Those of a hierarchy below."""
-    for name in nodes:
-        policies = below(policies, name)
-    return policies
+    return judged(declaration, run, listeners, before, after, nodes)
 
 
 def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
@@ -160,8 +113,8 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     found = ready | _learnt(run)
     if run.unjudged:
         raise SkillweaveError(
-            f"{run.path}: all is learnt, but whether the hierarchy before or that after learning "
-            f"together is better was not judged yet; {command_words('resume', run)}"
+            f"{run.path}: all is learnt, but which of the hierarchies that it could end with is "
+            f"the best was not judged yet; {command_words('resume', run)}"
         )
     absent = [s.name for s in declaration.skills if not can_act(s, found)]
     if absent:
@@ -169,7 +122,7 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
             f"{run.path}: {', '.join(map(repr, absent))} did not learn there: declare the skills "
             "with the policies that they had when it was trained"
         )
-    policy = assembled(declaration, found)
+    policy = assembled(settled(declaration, run), found)
     check_parts(declaration, policy, str(run.path))
     return policy
 

@@ -53,14 +53,14 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
         ready[name] = source_of(own)
         if isinstance(own, Foreign) and (content := own.content()) is not None:
             tensors[f"{name}/content"] = torch.tensor(np.frombuffer(content, np.uint8))
-    hierarchies = every_hierarchy(declaration)
+    hierarchies = dict(_hierarchies_of(declaration, policy))
     header = {
         "kind": "hierarchy",
         "recipe": getattr(declaration, "recipe", None),
         **place,
         "skills": [name for name, _ in every_skill(declaration.skills)],
-        **_how(declaration),
-        "hierarchies": {name: _how(found) for name, found in hierarchies if name},
+        **hierarchies.pop(""),
+        "hierarchies": hierarchies,
         "parts": parts,
         "ready": ready,
     }
@@ -85,13 +85,24 @@ def _parts_of(
             yield from _parts_of(inner, own, f"{path}{skill.name}/")
 
 
-def _how(declaration: Declaration) -> dict[str, Any]:
+def _hierarchies_of(
+    declaration: Declaration, policy: HierarchyPolicy, path: str = ""
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """By path, how a hierarchy calls its skills, and how those below it do."""
+    yield path, _how(declaration, policy)
+    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
+        if (inner := inner_of(skill)) is not None:
+            assert isinstance(own, HierarchyPolicy)
+            yield from _hierarchies_of(inner, own, f"{path}/{skill.name}".removeprefix("/"))
+
+
+def _how(declaration: Declaration, policy: HierarchyPolicy) -> dict[str, Any]:
     """How a hierarchy calls its skills."""
     guide = ready_guide(declaration) if declaration.guide_restricts else None
     return {
         **calls_to_json(declaration.call_steps),
         "interrupt": declaration.together.margin if declaration.interrupt else None,
-        "greedy_skills": declaration.greedy_skills,
+        "greedy_skills": policy.skills.greedy,
         **({} if guide is None else {"guide": source_of(guide)}),
     }
 

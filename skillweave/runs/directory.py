@@ -37,6 +37,7 @@ from skillweave.runs.files import (
     write_tensors,
 )
 from skillweave.runs.jsonl import JsonLines
+from skillweave.runs.kept import to_be_judged
 from skillweave.runs.lock import Lock
 from skillweave.runs.manifest import (
     Checkpoint,
@@ -156,12 +157,9 @@ class RunDirectory:
 
     @property
     def unjudged(self) -> bool:
-        """Whether nobody has found out yet which is better: before, or after, learning together."""
-        both = self.manifest.get("learn") == "apart, then together"  # older runs say no more
-        return any(
-            s["kind"] == "together" and s.get("compared", both) and "kept" not in s
-            for s in self.manifest["stages"]
-        )
+        """Whether nobody has found out yet which hierarchy is the best that was learnt."""
+        stages = self.manifest["stages"]
+        return any("kept" not in s and to_be_judged(s, self.manifest) for s in stages)
 
     def save_checkpoint(
         self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from skillweave.algorithms.config import config_from_json
 from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
 from skillweave.runs.files import read_json
+from skillweave.runs.kept import Kept
 from skillweave.runs.older import manifest_today
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
@@ -43,7 +44,8 @@ class NestedEntry(TypedDict):
     interrupt: NotRequired[float | None]
     """By how much another skill must be worth more for a call to be cut."""
     learn: NotRequired[Literal["apart", "together", "apart, then together"]]
-    greedy_skills: bool
+    greedy_skills: bool | None
+    """None: found out at the end of learning together, and written there (``kept``)."""
     selector: NotRequired[Source]
     """Of a ready selector; absent where it is trained."""
     guide: NotRequired[Source]
@@ -92,14 +94,6 @@ class Reached(TypedDict):
     value: float
 
 
-class Kept(TypedDict):
-    """Which of two hierarchies a stage ended with, by their mean returns."""
-
-    before: float
-    after: float
-    kept: Literal["before", "after"]
-
-
 class StageEntry(TypedDict):
     """A stage: who learns in it and who decides, for how many steps, and how far it is."""
 
@@ -140,8 +134,10 @@ class StageEntry(TypedDict):
     """How far the selector may be from its guide."""
     compared: NotRequired[bool]
     """What is learnt together is kept only if it is better than what was there before."""
+    greedy_judged: NotRequired[bool]
+    """Whether skills are greedy after it is found out at its end."""
     kept: NotRequired[Kept]
-    """Whether what was there before was better than what was learnt together."""
+    """What was found out at its end."""
 
 
 class Manifest(TypedDict):

@@ -136,8 +136,10 @@ def check_fields(declared: Any) -> None:
         if whole and (type(value) is not int or value < 1):
             what = "at least 1, or None" if none else "a whole number, at least 1"
             raise SkillweaveError(f"{f.name} is {short(value)}; it must be {what}")
-        if f.type == "bool" and not isinstance(value, bool):
-            raise SkillweaveError(f"{f.name} is {short(value)}; it must be True or False")
+        flag = f.type == "bool" or (f.type == "bool | None" and value is not None)
+        if flag and not isinstance(value, bool):
+            also = ", or None" if f.type == "bool | None" else ""
+            raise SkillweaveError(f"{f.name} is {short(value)}; it must be True or False{also}")
 
 
 def check_rollout(config: AlgorithmConfig | None, space: gym.Space[Any]) -> None:

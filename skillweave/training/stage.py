@@ -142,6 +142,8 @@ class Stage:
     """The path of the hierarchy that it is of: empty, or ``inner/`` for example."""
     compared: bool = False
     """What is learnt is kept only if it is better than what was there before."""
+    greedy_judged: bool = False
+    """Whether skills are greedy afterwards, or sample, is found out at its end."""
 
     def inside(self, name: str) -> Stage:
         """This stage in a hierarchy that is the skill ``name`` of another one."""
@@ -177,6 +179,7 @@ class Stage:
             entry["guide_nats"] = self.guide_nats
         if self.kind == "together":
             entry["compared"] = self.compared
+            entry["greedy_judged"] = self.greedy_judged
         return entry
 
 

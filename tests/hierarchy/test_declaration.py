@@ -282,7 +282,7 @@ WRONG_SETTINGS = {
     "call_steps=true": "call_steps=true: expected int",
     "call_steps=": "call_steps=: expected int",
     "greedy_skills=1": "greedy_skills=1: expected bool",
-    "greedy_skills=none": "greedy_skills=none: expected bool",
+    "interrupt=none": "interrupt=none: expected bool",
     "skill_steps=none": "skill_steps=none: expected int",
     "skill_steps=1e999": "skill_steps=1e999: expected int",
     "selector.gamma=high": "selector.gamma=high: expected float",

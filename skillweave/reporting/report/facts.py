@@ -8,6 +8,7 @@ from typing import Any
 from skillweave.reporting.report.skills_table import number
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.kept import kept_words
 from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
@@ -62,8 +63,7 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
         if reached := entry.get("reached"):
             notes.append(f"target reached after {reached['steps']:,} steps")
         if kept := entry.get("kept"):
-            before, after = kept["before"], kept["after"]
-            notes.append(f"return {before:.1f} before, {after:.1f} after: kept {kept['kept']}")
+            notes.append(kept_words(kept))
         if winner := entry.get("winner"):
             notes.append(f"winner: member {winner['member']}, fitness {winner['fitness']:.1f}")
         done = entry["status"] == "done"

@@ -1,0 +1,36 @@
+"""Which of several hierarchies a stage ended with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, NotRequired, TypedDict
+
+
+class Kept(TypedDict):
+    """Which hierarchy a stage ended with, by their mean returns."""
+
+    before: NotRequired[float]
+    after: float
+    sampled: NotRequired[float]
+    """That after learning together, with skills that sample instead of greedy ones."""
+    kept: Literal["before", "after", "sampled"]
+
+
+_WHEN = {
+    "before": "before learning together",
+    "after": "after it",
+    "sampled": "after it with skills that sample",
+}
+
+
+def kept_words(kept: Mapping[str, Any]) -> str:
+    """A sentence on the hierarchies that were compared, and on which was kept."""
+    returns = ", ".join(f"{words} {kept[k]:.1f}" for k, words in _WHEN.items() if k in kept)
+    return f"mean return {returns}: kept what was {_WHEN[kept['kept']]}"
+
+
+def to_be_judged(entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> bool:
+    """Whether a stage of a run is to end with the best of several hierarchies."""
+    both = manifest.get("learn") == "apart, then together"  # older runs say no more
+    compared = entry.get("compared", both) or entry.get("greedy_judged", False)
+    return entry["kind"] == "together" and bool(compared)
