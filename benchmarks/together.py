@@ -1,11 +1,12 @@
-"""What learning together is worth: key and door (MiniGrid), against flat agents.
+"""What learning together is worth on chains of skills, against flat agents.
 
-    python -m benchmarks.together [CASE …] [--seeds 0 1 2 3 4] [--size 8x8] [--steps 500000]
+    python -m benchmarks.together [CASE …] [--task 8x8] [--seeds 0 1 2 3 4] [--steps 500000]
 
-Every case has the same number of environment steps in all. Scores are 100 sampled episodes of
-MiniGrid's own environment, with seeds that training never saw. Training steps EnvPool's, or with
-``--engine sync`` MiniGrid's own. Two runs go side by side (``--processes``), so the seconds are
-those of a busy machine.
+Tasks: ``8x8`` and ``16x16``, MiniGrid's DoorKey (``examples/doorkey.py``); ``bridge``, a longer
+chain (``examples/bridge.py``). Every case has the same number of environment steps in all. Scores
+are 100 episodes with a selector that samples, with seeds that training never saw, on MiniGrid's own
+environment; training steps EnvPool's, or with ``--engine sync`` MiniGrid's own. Two runs go side by
+side (``--processes``), so the seconds are those of a busy machine.
 """
 
 from __future__ import annotations
@@ -15,69 +16,109 @@ import functools
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.common import cases_asked, median, report, table, workers
-from examples import doorkey
-from skillweave import Hierarchy, Lengths, Together
+from examples import bridge, doorkey
+from skillweave import PPO, Hierarchy, Lengths, Together
 
 FLOOR = Together(floor=1.0, floor_final=0.1)
 
 FLOORS = {"floor": FLOOR.floor, "floor_final": FLOOR.floor_final}
-declare = functools.partial(doorkey.declare, workers=1)  # runs go side by side
 
 
-def apart(size: str, steps: int, **how: Any) -> Hierarchy:
-    """Three skills apart, each after calls of those before, then the selector."""
-    asked = {"start_calls": 8, "selector": doorkey.algorithm(**FLOORS)} | how
-    return declare(
-        size, learn="apart", skill_steps=steps // 5, selector_steps=2 * steps // 5, **asked
-    )
+@dataclass(frozen=True)
+class Task:
+    """A chain of skills to learn."""
+
+    declare: Callable[..., Hierarchy]
+    algorithm: Callable[..., PPO]
+    has_engines: bool = True
+    """``--engine`` is about it."""
+
+
+def _doorkey(size: str) -> Task:
+    declare = functools.partial(doorkey.declare, size)
+    return Task(lambda steps, **how: declare(steps, **how), doorkey.algorithm)
+
+
+TASKS = {
+    "8x8": _doorkey("8x8"),
+    "16x16": _doorkey("16x16"),
+    "bridge": Task(bridge.declare, bridge.algorithm, has_engines=False),
+}
+
+
+def together(task: Task, steps: int, **how: Any) -> Hierarchy:
+    """Skills and selector from the same steps, from nothing."""
+    return task.declare(steps, **{"workers": 1} | how)  # runs go side by side
+
+
+def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
+    """Skills apart, each after calls of those before, then the selector."""
+    share = len(task.declare(steps).skills)
+    asked = {
+        "learn": "apart",
+        "start_calls": 8,
+        "selector": task.algorithm(**FLOORS),
+        "skill_steps": 3 * steps // (5 * share),
+        "selector_steps": 2 * steps // 5,
+    }
+    return together(task, steps, **asked | how)
+
+
+def then(task: Task, steps: int, **how: Any) -> Hierarchy:
+    """The first half of the steps apart, the second together."""
+    return apart(task, steps // 2, learn="apart, then together", together_steps=steps // 2, **how)
 
 
 CASES: dict[str, Callable[..., Hierarchy]] = {
-    "together": declare,
+    "together": together,
     "apart": apart,
+    "then": then,
     "no start calls": functools.partial(apart, start_calls=None),
-    "low floor": functools.partial(declare, together=Together(floor=0.3, floor_final=0.02)),
-    "no floor": functools.partial(declare, together=Together(floor=0.0, floor_final=0.0)),
-    "no call cost": functools.partial(declare, call_cost=0.0),
-    "task advantage": functools.partial(declare, together=replace(FLOOR, task_weight=1.0)),
-    "lengths": functools.partial(declare, call_steps=Lengths(4, ..., 64)),
-    "interrupt": functools.partial(declare, interrupt=True),
-    "flat": declare,
+    "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
+    "no floor": functools.partial(together, together=Together(floor=0.0, floor_final=0.0)),
+    "no call cost": functools.partial(together, call_cost=0.0),
+    "task advantage": functools.partial(together, together=replace(FLOOR, task_weight=1.0)),
+    "lengths": functools.partial(together, call_steps=Lengths(4, ..., 64)),
+    "interrupt": functools.partial(together, interrupt=True),
+    "flat": together,
 }
-"""By name, a hierarchy of this size of the task, with so many steps."""
+"""By name, a hierarchy of a task, with so many steps."""
 
 
-def one(case: str, size: str, steps: int, engine: str, seed: int) -> dict[str, Any]:
+def one(case: str, task: str, steps: int, engine: str, seed: int) -> dict[str, Any]:
     """Train and score in this process."""
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        hierarchy = CASES[case](size, steps, engine=engine)
+        how = {"engine": engine} if TASKS[task].has_engines else {}
+        hierarchy = CASES[case](TASKS[task], steps, **how)
         run = hierarchy.train(Path(folder) / "run", seed=seed, quiet=True, flat=case == "flat")
         seconds = time.perf_counter() - started
         found = run.evaluate(100, deterministic=False)
         spent = sum(s["steps"] + s["evaluation_steps"] for s in run.info()["stages"])
+        kept = run.info()["stages"][-1].get("kept")
     usage = found.to_json()["skill_usage"]
     solved = float(np.mean(np.array(found.returns) > 0))
-    return {"seed": seed, "solved": solved, "steps": spent, "seconds": seconds, "usage": usage}
+    told = {"seed": seed, "solved": solved, "steps": spent, "seconds": seconds, "usage": usage}
+    return told | ({} if kept is None else {"kept": kept})
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", default="8x8")
+    parser.add_argument("--task", choices=TASKS, default="8x8")
     parser.add_argument("--engine", choices=("auto", "sync"), default="auto")
     asked = cases_asked(parser, CASES, steps=500_000)
     rows, found = [], {}
     with workers(asked.processes) as pool:
         futures = {
             case: [
-                pool.submit(one, case, asked.size, asked.steps, asked.engine, s)
+                pool.submit(one, case, asked.task, asked.steps, asked.engine, s)
                 for s in asked.seeds
             ]
             for case in asked.cases
@@ -87,14 +128,15 @@ def main() -> None:
             for future in pending:
                 runs.append(future.result())
                 told = runs[-1]
-                print(f"{case}, seed {told['seed']}: {told['solved']:.0%} solved", flush=True)
+                said = f"{case}, seed {told['seed']}: {told['solved']:.0%} solved"
+                print(said, told["usage"], told.get("kept", ""), flush=True)
             solved = [r["solved"] for r in runs]
             seconds = f"{median(r['seconds'] for r in runs):.0f}"
             steps = f"{median(r['steps'] for r in runs):,.0f}"
             each = " ".join(f"{x:.0%}" for x in solved)
             rows.append((case, f"{median(solved):.0%}", f"{min(solved):.0%}", steps, seconds, each))
             print(table(("case", "median", "worst", "steps", "s", "each"), rows), flush=True)
-    report("together", {"size": asked.size, "seeds": asked.seeds, "cases": found})
+    report("together", {"task": asked.task, "seeds": asked.seeds, "cases": found})
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 8
+COUNT = 9
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
+    "bridge.py": ("--steps", "3000", "--out", "{folder}/run"),
     "doorkey.py": ("--steps", "3000", "--out", "{folder}/run"),
     "foreign_skills.py": ("--steps", "3000"),
     "four_rooms.py": ("--steps", "3000"),
@@ -28,6 +29,7 @@ NEEDS = {
     "tutorial.py": ("Box2D", "PIL"),
 }
 SAYS = {
+    "bridge.py": "solved: ",
     "doorkey.py": "solved: ",
     "foreign_skills.py": "woven by the selector: ",
     "four_rooms.py": "steps from the corner to the goal: ",
