@@ -23,7 +23,8 @@ from skillweave import (
 )
 from skillweave.cli import main
 from skillweave.envs.make import make_engine
-from skillweave.hierarchy.nesting import every_skill
+from skillweave.hierarchy.judging import settled
+from skillweave.hierarchy.nesting import every_hierarchy, every_skill
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.call_log import CallLog
@@ -418,3 +419,34 @@ def test_errors_of_skills_below_name_their_path(tmp_path):
 
     with pytest.raises(SkillweaveError, match="'inner/broken'"):
         declare(inside(Broken()), learn="together").train(tmp_path / "run", quiet=True)
+
+
+def stage(name, kept):
+    """An entry of ``run.json``: done and judged, done, or still waiting."""
+    entry = {"name": name, "kind": "together", "status": "waiting" if kept == "waiting" else "done"}
+    judged = kept in ("before", "after", "sampled")
+    told = {"compared": judged or kept == "unjudged", "greedy_judged": True}
+    return entry | ({} if kept == "alone" else told) | ({"kept": {"kept": kept}} if judged else {})
+
+
+@pytest.mark.parametrize(
+    ("stages", "greedy"),
+    [
+        ({}, (True, True)),  # all apart
+        ({"together": "after"}, (True, True)),
+        ({"together": "sampled"}, (False, False)),
+        ({"together": "waiting"}, (True, True)),
+        ({"together": "unjudged"}, (True, True)),
+        ({"inner/together": "sampled"}, (True, False)),
+        ({"inner/together": "sampled", "together": "before"}, (True, False)),
+        ({"inner/together": "sampled", "together": "after"}, (True, True)),
+        ({"inner/together": "sampled", "together": "unjudged"}, (True, False)),
+        ({"inner/together": "alone"}, (True, False)),  # it played no episodes: as it learnt
+    ],
+)
+def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(stages, greedy):
+    run = SimpleNamespace(manifest={"stages": [stage(*told) for told in stages.items()]})
+    found = settled(declare(), run)
+    assert tuple(own.greedy_skills for _, own in every_hierarchy(found)) == greedy
+    said = settled(declare(inside(greedy_skills=False), greedy_skills=True), run)
+    assert [own.greedy_skills for _, own in every_hierarchy(said)] == [True, False]
