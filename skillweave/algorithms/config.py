@@ -149,11 +149,17 @@ class SkillCritic(OnPolicy):
     """Adam's ε."""
     max_grad_norm: float = 0.5
     """Gradients are scaled down to this norm."""
+    floor: float = 0.0
+    """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
+    cut: while skills learn, what they are worth is told 1 − floor times."""
+    floor_final: float | None = None
+    """The same at the end of the budget, reached linearly; None: constant."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         whole(self, "batch_size", "update_epochs")
         number(self, "gae_lambda", high=1.0)
+        number(self, "floor", *(["floor_final"] if self.floor_final is not None else []), high=1.0)
         positive(self, "max_grad_norm", "adam_eps")
 
 

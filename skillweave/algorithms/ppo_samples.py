@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams
-from skillweave.algorithms.config import PPO
+from skillweave.algorithms.config import PPO, SkillCritic
 from skillweave.algorithms.rollouts import Cells, Samples, values_after
 from skillweave.experience import Anchor, Rollout
 from skillweave.networks.stacked import take_rows
@@ -40,7 +40,7 @@ class Terms:
         return cls(rate, ent_coef, rollout.anchor)
 
 
-def floor_now(config: PPO, progress: float, like: Tensor) -> Tensor | None:
+def floor_now(config: PPO | SkillCritic, progress: float, like: Tensor) -> Tensor | None:
     """The share of actions that is drawn uniformly, (P, 1, 1); None: there is no such share.
 
     Args:

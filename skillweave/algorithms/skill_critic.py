@@ -14,9 +14,10 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
+from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.parameters import ParameterGroup
+from skillweave.algorithms.ppo_samples import floor_now
 from skillweave.algorithms.rollouts import values_after
 from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
@@ -65,9 +66,21 @@ class SkillCriticAlgorithm(Algorithm):
         noise: Any,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, None]:
-        """The skill that is worth most, and what each is worth in deviations of the return."""
-        worth = self.net(params.views, self.inputs(params, obs))
+        """The skill that is worth most, and what each is worth in deviations of the return.
+
+        Where the selector still draws calls to try them, worths differ less: few calls are cut.
+        """
+        worth = self.net(params.views, self.inputs(params, obs)) * params.extra.get("trust", 1.0)
         return worth.argmax(-1), worth, None
+
+    def acting_params(
+        self, state: AgentState, progress: float = 1.0, device: Device = "cpu"
+    ) -> ActingParams:
+        """A copy of what acting needs; see ``Algorithm.acting_params``."""
+        found = super().acting_params(state, progress, device)
+        if (floor := floor_now(self.config, progress, state.learning_rate)) is not None:
+            found.extra["trust"] = 1.0 - floor.to(device)
+        return found
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:
         """None: there is no chance in what it says."""

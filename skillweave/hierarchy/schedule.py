@@ -57,10 +57,10 @@ def _together(declaration: Declaration, seen_as: Skill | None) -> Stage:
         return woven_scene(declaration.spec, skills, guide, seen_as, margins, nats)
 
     ready = declaration.ready_selector is not None
-    beside = _learners(declaration, how)
-    beside |= _critic(declaration) if how.task_weight or declaration.interrupt else {}
-    target = target_of(declaration.selector_target_return, None, TOGETHER)
     config = declaration.algorithm if ready else _with_floor(declaration.selector, how)
+    beside = _learners(declaration, how)
+    beside |= _critic(config) if how.task_weight or declaration.interrupt else {}
+    target = target_of(declaration.selector_target_return, None, TOGETHER)
     return Stage(
         TOGETHER,
         "together",
@@ -94,9 +94,10 @@ def _learners(declaration: Declaration, how: Together) -> dict[str, AlgorithmCon
         if (inner := inner_of(skill)) is None:
             continue
         own = _learners(inner, how)
+        selects: Any = inner.algorithm
         if isinstance(inner.selector, AlgorithmConfig):
-            own[SELECTOR] = _with_floor(inner.selector, how)
-        own |= _critic(inner) if inner.interrupt else {}
+            own[SELECTOR] = selects = _with_floor(inner.selector, how)
+        own |= _critic(selects) if inner.interrupt else {}
         found |= {f"{skill.name}/{name}": config for name, config in own.items()}
     return found
 
@@ -128,13 +129,12 @@ def _with_floor(config: Any, how: Together) -> Any:
     return config
 
 
-def _critic(declaration: Declaration) -> dict[str, AlgorithmConfig]:
-    """The critic of skills, which sees and discounts as the selector does."""
-    own: Any = declaration.selector
-    own = own if isinstance(own, AlgorithmConfig) else declaration.algorithm
+def _critic(own: Any) -> dict[str, AlgorithmConfig]:
+    """The critic of skills; it sees and discounts as a selector with the settings ``own`` does."""
     shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(own, PPO):
-        shared |= {f: getattr(own, f) for f in ("n_steps", "gae_lambda", "network", "overlap")}
+        same = ("n_steps", "gae_lambda", "network", "overlap", "floor", "floor_final")
+        shared |= {f: getattr(own, f) for f in same}
     if "network" in shared:  # the critic remembers nothing
         shared["network"] = replace(shared["network"], rnn=None)
     return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}
@@ -178,6 +178,6 @@ def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
     nats = declaration.guide_nats
     last = Stage(SELECTOR, "selector", config, budget, calls, target, guide_nats=nats)
     if declaration.interrupt:
-        how, beside = declaration.together, _critic(declaration)
+        how, beside = declaration.together, _critic(config)
         last = replace(last, beside=beside, together=how, interrupt=True)
     return [*first, last]

@@ -69,3 +69,13 @@ def test_it_learns_what_each_skill_is_worth():
     assert found[2, 1].item() == pytest.approx(0.5 * (1.0 + 0.5 * found[0, 0].item()), abs=0.03)
     assert report.metrics["value_loss"].isfinite().all()
     assert algorithm.value(state, torch.eye(3)[None]).shape == (1, 3)
+
+
+def test_while_skills_are_tried_they_differ_less_in_worth_so_that_few_calls_are_cut():
+    algorithm, state = critic(floor=1.0, floor_final=0.2)
+    obs = torch.eye(3)[None]
+    whole = algorithm.act(algorithm.learning_params(state), obs, None, None)[1]
+    assert whole.abs().min() > 0
+    for progress, share in ((0.0, 0.0), (0.5, 0.4), (1.0, 0.8)):
+        params = algorithm.acting_params(state, progress)
+        torch.testing.assert_close(algorithm.act(params, obs, None, None)[1], share * whole)
