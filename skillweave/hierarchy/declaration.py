@@ -88,8 +88,8 @@ class Declaration(Nestable):
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
     call_cost: float = 0.0
-    """What the selector pays for each decision while it learns, in units of reward: a deliberation
-    cost, so that calls which change nothing are not worth as much as others."""
+    """What the selector pays for each decision while it learns, in units of reward, so that calls
+    which change nothing are worth less. More than the discounted reward makes long calls best."""
     interrupt: bool = False
     """The selector cuts a call where another skill is clearly worth more (``Together.margin``)."""
     together: Together = field(default_factory=Together)
