@@ -4,9 +4,9 @@
 
 Tasks: ``8x8`` and ``16x16``, MiniGrid's DoorKey (``examples/doorkey.py``); ``bridge``, a longer
 chain (``examples/bridge.py``). Every case has the same number of environment steps in all. Scores
-are 100 episodes with a selector that samples, with seeds that training never saw, on MiniGrid's own
-environment; training steps EnvPool's, or with ``--engine sync`` MiniGrid's own. Two runs go side by
-side (``--processes``), so the seconds are those of a busy machine.
+are 100 episodes with a selector that samples, with seeds that training never saw. DoorKey is scored
+on MiniGrid's own environment; training steps EnvPool's, or with ``--engine sync`` MiniGrid's own.
+Two runs go side by side (``--processes``), so the seconds are those of a busy machine.
 """
 
 from __future__ import annotations

@@ -117,9 +117,7 @@ def declare(
         "together_steps": steps,
         # At first any skill that may start is called: else one that may start anywhere takes all.
         "together": sw.Together(floor=1.0, floor_final=0.1),
-        # A call that ends at once is not worth as much as one that does not. But the goal may be
-        # hundreds of steps away: discounted, it is worth little there, and a cost must be less.
-        "call_cost": 0.001,
+        "call_cost": 0.01,  # a call that ends at once is not worth as much as one that does not
         "greedy_skills": False,
         "algorithm": algorithm(),
         "selector": algorithm(),

@@ -199,8 +199,10 @@ def test_of_greedy_skills_and_such_that_sample_the_better_are_kept(tmp_path, mon
         policy = training.train(declare(), run, (heard,))
     assert policy.skills.greedy is better
     assert run.stage("together")["evaluation_steps"] == 30
-    said = "after it 10.0, after it with skills that sample 5.0" if better else "sample 10.0"
-    assert said in heard.said[-1]
+    returns = (10.0, 5.0) if better else (5.0, 10.0)
+    words = "with greedy skills {:.1f}, with skills that sample {:.1f} (100 episodes each): kept"
+    assert words.format(*returns) in heard.said[-1]
+    assert "2 times 100 episodes are played" in heard.said[-2]
 
 
 def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch):

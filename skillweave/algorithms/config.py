@@ -151,7 +151,7 @@ class SkillCritic(OnPolicy):
     """Gradients are scaled down to this norm."""
     floor: float = 0.0
     """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
-    cut: while skills learn, what they are worth is told 1 − floor times."""
+    cut: while skills learn, what skills are worth is multiplied by 1 − floor."""
     floor_final: float | None = None
     """The same at the end of the budget, reached linearly; None: constant."""
 

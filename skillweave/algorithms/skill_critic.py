@@ -76,9 +76,10 @@ class SkillCriticAlgorithm(Algorithm):
     def acting_params(
         self, state: AgentState, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs; see ``Algorithm.acting_params``."""
+        """A copy of what acting needs, and while skills learn, how much what it says is trusted."""
         found = super().acting_params(state, progress, device)
-        if (floor := floor_now(self.config, progress, state.learning_rate)) is not None:
+        floor = floor_now(self.config, progress, state.learning_rate)
+        if floor is not None and progress < 1.0:  # at the end calls are cut as they will be
             found.extra["trust"] = 1.0 - floor.to(device)
         return found
 

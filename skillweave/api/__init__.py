@@ -20,7 +20,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import below
+from skillweave.hierarchy.nesting import below, copied
 from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
 from skillweave.messages import as_path, whole_number
 from skillweave.runs.directory import RunDirectory
@@ -188,9 +188,10 @@ class Hierarchy(Declaration):
     def load_weights(self, path: str | Path) -> Run:
         """This hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
         path = as_path(path, "path")
-        policy = read_weights(self, path)
+        own = copied(self)  # it takes over how skills are called
+        policy = read_weights(own, path)
         plain = isinstance(policy, AgentPolicy)
-        return Run(self.plain_agent() if plain else self, path, policy)
+        return Run(self.plain_agent() if plain else own, path, policy)
 
     @staticmethod
     def pretrained(name: str) -> Run:

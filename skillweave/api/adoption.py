@@ -65,7 +65,9 @@ def told_differences(declared: Hierarchy | Agent, run: RunDirectory) -> str:
     # Settings that older versions did not know are not in both; who evolves has others by plan.
     # Where a file lies is no setting; its checksum is.
     both = [k for k in here if k in there and not k.startswith(evolve) and not k.endswith(".file")]
-    differ = [k for k in both if plain(here[k]) != plain(there[k])]
+    # Nor is it told where this declaration leaves it open.
+    left = [k for k in both if k.endswith("greedy_skills") and here[k] is None]
+    differ = [k for k in both if k not in left and plain(here[k]) != plain(there[k])]
     if not differ:
         return ""
     named = [

@@ -140,7 +140,7 @@ class States:
                 if sampled:
                     raise SkillweaveError(
                         f"{name} is an automaton that draws among the skills of a state, which the "
-                        "runner does not: let the skills around it be greedy (greedy_skills=True)"
+                        "runner does not: train with greedy_skills=True for the skills around it"
                     )
                 return self._automaton(selector, name)
             case FunctionSelector():

@@ -41,6 +41,8 @@ def judged(
         if entry.get("compared", True):
             earlier = settled(declaration, run, nodes)
             found["before"] = assembled(earlier, _inside(before, nodes))
+        for listener in listeners:
+            listener.message(f"{entry['name']}: {len(found)} times {EPISODES} episodes are played")
         seed = SEEDS + int(run.manifest["seed"])
         scores = {
             name: evaluate(policy, declaration.spec, episodes=EPISODES, seed=seed)

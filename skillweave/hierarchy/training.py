@@ -45,8 +45,11 @@ def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, An
         "cut_every": declaration.cut_every,
         "eval_every": declaration.eval_every,
         "eval_episodes": declaration.eval_episodes,
-        "skills": [_skill_entry(path, s) for path, s in every_skill(declaration.skills)],
-        **_hierarchy_entry(declaration),
+        "skills": [
+            _skill_entry(path, s, woven=_is_woven(declaration, path))
+            for path, s in every_skill(declaration.skills)
+        ],
+        **_hierarchy_entry(declaration, woven=declaration.weaves),
         "resume_needs_recipe": not declaration.trains_from_data,
         "needs_recipe": not declaration.is_data,
         "stages": [stage.entry() for stage in stages_of(declaration)],
@@ -165,7 +168,16 @@ def _selector_entry(declaration: Declaration) -> dict[str, Any]:
     return guide_entry(declaration) if selector is None else {SELECTOR: source_of(selector)}
 
 
-def _skill_entry(path: str, skill: Skill) -> dict[str, Any]:
+def _is_woven(declaration: Declaration, path: str) -> bool:
+    """Whether a skill that is a hierarchy learns together with its own skills at any time."""
+    return any(
+        own.weaves
+        for node, own in every_hierarchy(declaration)
+        if not node or f"{path}/".startswith(f"{node}/")
+    )
+
+
+def _skill_entry(path: str, skill: Skill, *, woven: bool) -> dict[str, Any]:
     inner = inner_of(skill)
     policy = ready_policy(skill) if inner is None else None
     entry: dict[str, Any] = {"name": path, "max_steps": skill.max_steps}
@@ -173,17 +185,22 @@ def _skill_entry(path: str, skill: Skill) -> dict[str, Any]:
     if skill.call_steps is not None:
         entry["call_steps"] = skill.call_steps
     if inner is not None:
-        entry["hierarchy"] = _hierarchy_entry(inner)
+        entry["hierarchy"] = _hierarchy_entry(inner, woven=woven)
     return entry if policy is None else entry | {"policy": source_of(policy)}
 
 
-def _hierarchy_entry(declaration: Declaration) -> dict[str, Any]:
-    """What a run says of a hierarchy, be it itself or one below."""
+def _hierarchy_entry(declaration: Declaration, *, woven: bool) -> dict[str, Any]:
+    """What a run says of a hierarchy, be it itself or one below.
+
+    Args:
+        woven: all in it learn together at any time; else its skills are greedy, if nobody says it.
+    """
+    greedy = declaration.greedy_skills
     return {
         **calls_to_json(declaration.call_steps),
         "learn": declaration.learn,
         "interrupt": declaration.together.margin if declaration.interrupt else None,
-        "greedy_skills": declaration.greedy_skills,
+        "greedy_skills": True if greedy is None and not woven else greedy,
         "reflexes_in_training": declaration.reflexes_in_training,
         "reflexes": [r.name for r in declaration.reflexes],
         "start_calls": declaration.start_calls,

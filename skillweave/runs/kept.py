@@ -16,17 +16,18 @@ class Kept(TypedDict):
     kept: Literal["before", "after", "sampled"]
 
 
-_WHEN = {
-    "before": "before learning together",
-    "after": "after it",
-    "sampled": "after it with skills that sample",
-}
-
-
 def kept_words(kept: Mapping[str, Any]) -> str:
     """A sentence on the hierarchies that were compared, and on which was kept."""
-    returns = ", ".join(f"{words} {kept[k]:.1f}" for k, words in _WHEN.items() if k in kept)
-    return f"mean return {returns}: kept what was {_WHEN[kept['kept']]}"
+    judged = "sampled" in kept
+    named = {
+        "before": "before learning together",
+        "after": "after it with greedy skills" if judged else "after it",
+        "sampled": "after it with skills that sample",
+    }
+    if "before" not in kept:
+        named |= {"after": "with greedy skills", "sampled": "with skills that sample"}
+    returns = ", ".join(f"{words} {kept[k]:.1f}" for k, words in named.items() if k in kept)
+    return f"mean return {returns} (100 episodes each): kept what was {named[kept['kept']]}"
 
 
 def to_be_judged(entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> bool:

@@ -138,8 +138,8 @@ def check_fields(declared: Any) -> None:
             raise SkillweaveError(f"{f.name} is {short(value)}; it must be {what}")
         flag = f.type == "bool" or (f.type == "bool | None" and value is not None)
         if flag and not isinstance(value, bool):
-            also = ", or None" if f.type == "bool | None" else ""
-            raise SkillweaveError(f"{f.name} is {short(value)}; it must be True or False{also}")
+            what = "True or False" if f.type == "bool" else "True, False or None"
+            raise SkillweaveError(f"{f.name} is {short(value)}; it must be {what}")
 
 
 def check_rollout(config: AlgorithmConfig | None, space: gym.Space[Any]) -> None:

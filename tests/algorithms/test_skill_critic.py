@@ -76,6 +76,6 @@ def test_while_skills_are_tried_they_differ_less_in_worth_so_that_few_calls_are_
     obs = torch.eye(3)[None]
     whole = algorithm.act(algorithm.learning_params(state), obs, None, None)[1]
     assert whole.abs().min() > 0
-    for progress, share in ((0.0, 0.0), (0.5, 0.4), (1.0, 0.8)):
+    for progress, share in ((0.0, 0.0), (0.5, 0.4), (1.0, 1.0)):
         params = algorithm.acting_params(state, progress)
         torch.testing.assert_close(algorithm.act(params, obs, None, None)[1], share * whole)

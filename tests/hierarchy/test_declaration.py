@@ -400,7 +400,8 @@ def test_weights_written_and_read_act_the_same(tmp_path, skills):
     assert acts(run.policy) == acts(policy)
     assert len({a for actions, _ in acts(policy) for a in actions}) == 2
     assert len({s for _, acting in acts(policy) for s in acting}) == len(skills)
-    assert (other.call_steps, run.policy.skills.call_steps) == (6, 6)
+    assert (run.hierarchy.call_steps, run.policy.skills.call_steps) == (6, 6)
+    assert other.call_steps == 40, "what is loaded changes nothing of the user's own"
 
 
 @pytest.mark.parametrize("call_steps", [None, 3])
@@ -598,7 +599,7 @@ def test_a_wrong_argument_of_train_is_told(tmp_path, wrong, says):
         ({"skills": 3}, "skills must be a list"),
         ({"reflexes": 3}, "reflexes is 3; it must be a list"),
         ({"reflexes": Reflex(max, 0)}, "reflexes is .*; it must be a list"),
-        ({"greedy_skills": "no"}, "greedy_skills is 'no'; it must be True or False"),
+        ({"greedy_skills": "no"}, "greedy_skills is 'no'; it must be True, False or None"),
         ({"skill_steps": 10.0}, "skill_steps is 10.0"),
         ({"env": None}, "env is None"),
         ({"skills": ["x" * 10_000]}, "skills holds 'xxx.{0,200} which is not a Skill"),

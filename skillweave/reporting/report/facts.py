@@ -14,9 +14,9 @@ from skillweave.types import flat
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
     "steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers",
-    "succeeded",
+    "succeeded", "compared", "greedy_judged",
 }  # fmt: skip
-"""Of a stage's entry what training wrote: no settings."""
+"""Of a stage's entry what training wrote, or what follows from settings of the hierarchy."""
 
 
 def name_of(run: RunDirectory) -> str:
