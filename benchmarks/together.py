@@ -42,8 +42,7 @@ class Task:
 
 
 def _doorkey(size: str) -> Task:
-    declare = functools.partial(doorkey.declare, size)
-    return Task(lambda steps, **how: declare(steps, **how), doorkey.algorithm)
+    return Task(functools.partial(doorkey.declare, size), doorkey.algorithm)
 
 
 TASKS = {
@@ -55,17 +54,17 @@ TASKS = {
 
 def together(task: Task, steps: int, **how: Any) -> Hierarchy:
     """Skills and selector from the same steps, from nothing."""
-    return task.declare(steps, **{"workers": 1} | how)  # runs go side by side
+    return task.declare(steps, workers=1, **how)  # runs go side by side
 
 
 def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
     """Skills apart, each after calls of those before, then the selector."""
-    share = len(task.declare(steps).skills)
+    count = len(task.declare(steps).skills)
     asked = {
         "learn": "apart",
         "start_calls": 8,
         "selector": task.algorithm(**FLOORS),
-        "skill_steps": 3 * steps // (5 * share),
+        "skill_steps": 3 * steps // (5 * count),
         "selector_steps": 2 * steps // 5,
     }
     return together(task, steps, **asked | how)
@@ -81,6 +80,7 @@ CASES: dict[str, Callable[..., Hierarchy]] = {
     "apart": apart,
     "then": then,
     "no start calls": functools.partial(apart, start_calls=None),
+    "small call cost": functools.partial(apart, call_cost=0.001),
     "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
     "no floor": functools.partial(together, together=Together(floor=0.0, floor_final=0.0)),
     "no call cost": functools.partial(together, call_cost=0.0),
@@ -101,8 +101,9 @@ def one(case: str, task: str, steps: int, engine: str, seed: int) -> dict[str, A
         run = hierarchy.train(Path(folder) / "run", seed=seed, quiet=True, flat=case == "flat")
         seconds = time.perf_counter() - started
         found = run.evaluate(100, deterministic=False)
-        spent = sum(s["steps"] + s["evaluation_steps"] for s in run.info()["stages"])
-        kept = run.info()["stages"][-1].get("kept")
+        stages = run.info()["stages"]
+    spent = sum(s["steps"] + s["evaluation_steps"] for s in stages)
+    kept = stages[-1].get("kept")
     usage = found.to_json()["skill_usage"]
     solved = float(np.mean(np.array(found.returns) > 0))
     told = {"seed": seed, "solved": solved, "steps": spent, "seconds": seconds, "usage": usage}

@@ -3,8 +3,8 @@
     python examples/bridge.py
 
 A grid of 13 by 9 cells with a river. Whoever fetches the axe can fell the tree, whoever has the
-wood can build a bridge at the river, and the reward is paid on the other side alone. All needs
-nothing but NumPy.
+wood can build a bridge at the river, and the reward is paid on the other side alone. It needs no
+extra.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ WORK = len(MOVES)
 
 
 class River(gym.Env[np.ndarray, np.int64]):
-    """Observed: own cell; has axe, has wood, bridge stands; cells of axe and tree, bridge's row."""
+    """Observations: the agent's cell; whether it has the axe, has wood, and the bridge stands; the
+    cells of axe and tree; the bridge's row, -1 before there is one.
+    """
 
     action_space = gym.spaces.Discrete(5)
     observation_space = gym.spaces.Box(-1.0, 13.0, (10,), np.float32)
@@ -74,7 +76,7 @@ class River(gym.Env[np.ndarray, np.int64]):
 
 
 class Get(sw.Skill):
-    """Comes to have what ``what`` says; the others are made from this one."""
+    """Gets the thing whose flag in the observation is ``what``."""
 
     max_steps = 20
     what = AXE
@@ -115,7 +117,7 @@ class Build(Get):
 
 
 class Cross(sw.Skill):
-    """Reaches the far bank; it may be called anywhere, as its user forgot to say where."""
+    """Reaches the far bank. It may start anywhere: nobody tells the selector when it is of use."""
 
     max_steps = 20
 

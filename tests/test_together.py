@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -35,6 +36,7 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
+from skillweave.api.adoption import told_differences
 from skillweave.hierarchy import judging, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.stage_log import START, StageLog, success_rate
@@ -79,7 +81,9 @@ KINDS = {
     ),
     "replay then": lambda: declare(Left(), Other(), learn="apart, then together"),
     "off-policy selector": lambda: declare(Left(), Balance(), selector=OFF),
-    "then": lambda: declare(learn="apart, then together", together=Together(anchor_nats=0.001)),
+    "then": lambda: declare(
+        learn="apart, then together", together=Together(anchor_nats=0.001), greedy_skills=True
+    ),
     "interrupt apart": lambda: declare(learn="apart", interrupt=True, selector_steps=900),
 }
 
@@ -185,7 +189,7 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_of_greedy_skills_and_such_that_sample_the_better_are_kept(tmp_path, monkeypatch, better):
+def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(tmp_path, monkeypatch, better):
     """Not by chance: one of them always plays well here."""
 
     def played(policy, spec, **how):
@@ -220,6 +224,26 @@ def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch
     declare().resume(tmp_path / "run", quiet=True)
     runs = [RunDirectory.open(path) for path in (tmp_path / "run", whole.path)]
     assert runs[0].stage("together")["kept"] == runs[1].stage("together")["kept"]
+
+
+@pytest.mark.parametrize(("learn", "said"), [("apart", True), ("together", None)])
+def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn, said):
+    """Older runs always say it; nothing differs from what was left open."""
+    run = new_run(declare(learn=learn), tmp_path / "run")
+    assert run.manifest["greedy_skills"] is said
+    run.manifest["greedy_skills"] = True
+    assert told_differences(declare(learn=learn), run) == ""
+    told = told_differences(declare(learn=learn, greedy_skills=False), run)
+    assert "greedy_skills is yes (declared now: no)" in told
+    run.close()
+
+
+def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
+    for how in ({}, {"selector": replace(ON, floor=0.7)}):
+        (stage,) = training.stages_of(declare(interrupt=True, **how))
+        critic = stage.beside["skill_critic"]
+        assert (critic.floor, critic.floor_final) == (stage.config.floor, stage.config.floor_final)
+        assert critic.floor == (0.7 if how else Together().floor)
 
 
 class Never(Left):

@@ -159,7 +159,9 @@ class SkillCritic(OnPolicy):
         super().__post_init__()
         whole(self, "batch_size", "update_epochs")
         number(self, "gae_lambda", high=1.0)
-        number(self, "floor", *(["floor_final"] if self.floor_final is not None else []), high=1.0)
+        number(self, "floor", high=1.0)
+        if self.floor_final is not None:
+            number(self, "floor_final", high=1.0)
         positive(self, "max_grad_norm", "adam_eps")
 
 

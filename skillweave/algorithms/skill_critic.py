@@ -76,7 +76,7 @@ class SkillCriticAlgorithm(Algorithm):
     def acting_params(
         self, state: AgentState, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs, and while skills learn, how much what it says is trusted."""
+        """A copy of what acting needs; ``trust`` multiplies worths while skills learn."""
         found = super().acting_params(state, progress, device)
         floor = floor_now(self.config, progress, state.learning_rate)
         if floor is not None and progress < 1.0:  # at the end calls are cut as they will be

@@ -9,14 +9,13 @@ from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import TOGETHER, Declaration
 from skillweave.hierarchy.nesting import below, copied, every_hierarchy
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.kept import kept_words, to_be_judged
+from skillweave.runs.kept import EPISODES, kept_words, to_be_judged
 from skillweave.training.evaluation import evaluate
 from skillweave.training.stage import Policies
 from skillweave.training.stage_log import Listener
 
 SEEDS = 1_000
 """Seeds of these episodes begin here: people take smaller ones."""
-EPISODES = 100
 
 
 def judged(

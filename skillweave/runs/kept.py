@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, NotRequired, TypedDict
 
+EPISODES = 100
+"""Of each hierarchy, to find out which is the best."""
+
 
 class Kept(TypedDict):
     """Which hierarchy a stage ended with, by their mean returns."""
@@ -27,7 +30,7 @@ def kept_words(kept: Mapping[str, Any]) -> str:
     if "before" not in kept:
         named |= {"after": "with greedy skills", "sampled": "with skills that sample"}
     returns = ", ".join(f"{words} {kept[k]:.1f}" for k, words in named.items() if k in kept)
-    return f"mean return {returns} (100 episodes each): kept what was {named[kept['kept']]}"
+    return f"mean return {returns} ({EPISODES} episodes each): kept what was {named[kept['kept']]}"
 
 
 def to_be_judged(entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> bool:
