@@ -63,6 +63,7 @@ def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
     asked = {
         "learn": "apart",
         "start_calls": 8,
+        "episode_calls": 8,
         "selector": task.algorithm(**FLOORS),
         "skill_steps": 3 * steps // (5 * count),
         "selector_steps": 2 * steps // 5,
@@ -79,6 +80,7 @@ CASES: dict[str, Callable[..., Hierarchy]] = {
     "together": together,
     "apart": apart,
     "then": then,
+    "one call an episode": functools.partial(apart, episode_calls=1),
     "no start calls": functools.partial(apart, start_calls=None),
     "small call cost": functools.partial(apart, call_cost=0.001),
     "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),

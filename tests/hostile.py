@@ -426,7 +426,7 @@ DECLARED = (
     "skills", "call_steps", "reflexes", "algorithm", "selector", "skill_steps", "selector_steps",
     "flat", "flat_steps", "greedy_skills", "reflexes_in_training", "cut_every", "eval_every",
     "eval_episodes", "selector_target_return", "start_calls",
-    "search_steps",
+    "search_steps", "episode_calls",
 )  # fmt: skip
 ATTRIBUTES = (
     "name", "max_steps", "steps", "algorithm", "policy", "color", "reward", "termination",

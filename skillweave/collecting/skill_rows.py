@@ -34,7 +34,10 @@ class Judged:
 
 
 class SkillCollector(Collector):
-    """Environments seen through a skill: its reward, its ends; after each end a real reset.
+    """Environments seen through a skill: its reward, its ends.
+
+    After each end comes a real reset, but for a call that ended at the skill's limit where an
+    episode has several.
 
     A skill's ``termination`` terminates the episode (nothing is worth anything after it), its
     ``max_steps`` truncates it (its value goes on). Where the skill may not start, skills that can
@@ -50,6 +53,7 @@ class SkillCollector(Collector):
         start_calls: the most calls of theirs that come first; their number is drawn evenly.
         search_steps: an episode begins anew where the skill may not start after so many steps;
             None: it goes on.
+        episode_calls: the most calls of the skill in an episode.
     """
 
     def __init__(
@@ -61,14 +65,18 @@ class SkillCollector(Collector):
         starters: SkillSet | None = None,
         start_calls: int = 0,
         search_steps: int | None = None,
+        episode_calls: int = 1,
     ) -> None:
         super().__init__(engine, acting)
         self.skill, self.reflexes = skill, reflexes
         self._start_calls = 0 if starters is None else start_calls
-        self._search_steps = search_steps
+        self._search_steps, self._episode_calls = search_steps, episode_calls
         n = self.num_envs
         self._never = np.zeros(n, bool)
         self.kept["elapsed"] = np.zeros(n, np.int64)  # the skill's steps in the open episode
+        if episode_calls > 1:
+            self.kept["calls_made"] = np.zeros(n, np.int64)  # of the skill, in the open episode
+            self.kept["call_ended"] = np.zeros(n, np.int64)  # steps of the episode until then
         self._restricted = skill is not None and skill.defines("initiation")
         self._searches = self._restricted or self._start_calls > 0
         if self._searches:
@@ -82,15 +90,8 @@ class SkillCollector(Collector):
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
         """The same over other environments."""
         starters = self._starters.skills if self._searches else None
-        return SkillCollector(
-            engine,
-            acting,
-            self.skill,
-            self.reflexes,
-            starters,
-            self._start_calls,
-            self._search_steps,
-        )
+        how = self._start_calls, self._search_steps, self._episode_calls
+        return SkillCollector(engine, acting, self.skill, self.reflexes, starters, *how)
 
     def _collect(self, request: Request) -> Experience:
         self._prepare(request)
@@ -142,13 +143,30 @@ class SkillCollector(Collector):
             told = ids if playing is None else np.flatnonzero(playing & ended)
             success = None if judged.success is None else judged.success[told]
             self._tell(told, success, task=self.skill is not None)
-            self._begin_anew(ids)
+            more = self._call_again(told[(judged.truncated & ~raw.truncated)[told]])
+            self._begin_anew(np.setdiff1d(ids, more) if len(more) else ids)
         if playing is not None:
             going_on = searching[~over[searching]]
             free = self._starters.observe(going_on, obs, action, raw)
             left = self.kept["calls_left"]
             left[free] = np.maximum(left[free] - 1, 0)
             self._give_up(self._look(going_on))
+
+    def _call_again(self, limited: Array) -> Array:
+        """The skill's calls in environments ``limited`` (k,) ended at its limit, no more.
+
+        Returns:
+            Those whose episodes go on: others are called next, and then the skill again.
+        """
+        if self._episode_calls == 1:
+            return limited[:0]
+        made = self.kept["calls_made"]
+        ids = limited[made[limited] + 1 < self._episode_calls]
+        age, calls = self.kept["age"][ids], made[ids] + 1
+        self._forget(ids)
+        self.kept["age"][ids] = self.kept["call_ended"][ids] = age
+        made[ids] = calls
+        return ids
 
     def _draw_calls(self) -> None:
         """How many calls of others come first, where an episode has just begun."""
@@ -202,7 +220,10 @@ class SkillCollector(Collector):
     def _give_up(self, waiting: Array) -> None:
         """Begin anew where the skill may not start, and has been waited for long enough."""
         if self._search_steps is not None:
-            self._begin_anew(waiting[self.kept["age"][waiting] >= self._search_steps])
+            age = self.kept["age"][waiting]
+            if self._episode_calls > 1:
+                age = age - self.kept["call_ended"][waiting]
+            self._begin_anew(waiting[age >= self._search_steps])
 
     def _given_up(self) -> Array:
         if not self._searches:

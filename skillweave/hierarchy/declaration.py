@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -85,6 +86,10 @@ class Declaration(Nestable):
     search_steps: int | None = None
     """While a skill trains apart, an episode begins anew in which it may not start within so many
     steps: for environments of several kinds, where some have nothing for it. None: it goes on."""
+    episode_calls: int = 1
+    """While a skill trains apart: its calls in an episode. After one that reached its ``max_steps``
+    the episode goes on, others are called (``start_calls``), then the skill again. 1: each call
+    has an episode of its own."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
     call_cost: float = 0.0
@@ -283,18 +288,12 @@ class Declaration(Nestable):
         hierarchies = (self, *(inner_of(s) for _, s in every_skill(self.skills)))
         if all(h is None or h.ready_selector is None for h in hierarchies):
             return {}
-        env = self.spec.make()
-        try:
+        with closing(self.spec.make()) as env:
             return fitted_selectors(self, env.observation_space)
-        finally:
-            env.close()
 
     def ready_policies(self) -> dict[str, Policy]:
         """By path, the policies of skills that are not trained, on the environment's spaces."""
         if all(s.policy is None for s in self.skills):
             return {}
-        env = self.spec.make()
-        try:
+        with closing(self.spec.make()) as env:
             return fitted_policies(self, env)
-        finally:
-            env.close()

@@ -159,6 +159,7 @@ def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
                 led_by,
                 declaration.start_calls or 0,
                 declaration.search_steps,
+                declaration.episode_calls,
             )
 
         return Stage(skill.name, "skill", config, budget, scene, target)

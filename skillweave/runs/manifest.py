@@ -56,6 +56,7 @@ class NestedEntry(TypedDict):
     reflexes_in_training: NotRequired[bool]
     start_calls: NotRequired[int | None]
     search_steps: NotRequired[int | None]
+    episode_calls: NotRequired[int]
     call_cost: NotRequired[float]
 
 

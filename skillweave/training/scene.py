@@ -61,6 +61,7 @@ def skill_scene(
     starters: SkillSet | None = None,
     start_calls: int = 0,
     search_steps: int | None = None,
+    episode_calls: int = 1,
 ) -> Scene:
     """The environments seen through a skill; None: as they are.
 
@@ -68,15 +69,15 @@ def skill_scene(
         starters: skills that can act already: they lead to where the skill may start.
         start_calls: an episode begins after up to so many calls of theirs.
         search_steps: an episode begins anew where it may not start after so many steps.
+        episode_calls: the most calls of the skill in an episode.
     """
+    search = start_calls, search_steps, episode_calls
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return SkillCollector(
-            engine, acting, skill, tuple(reflexes), starters, start_calls, search_steps
-        )
+        return SkillCollector(engine, acting, skill, tuple(reflexes), starters, *search)
 
     return Scene(spec.name, *_spaces(spec), collector)
 

@@ -77,11 +77,12 @@ class Anywhere(Skill):
     max_steps = 7
 
 
-def collector_of(*kinds, skill=Far, start_calls=0, search_steps=None):
+def collector_of(*kinds, skill=Far, start_calls=0, search_steps=None, episode_calls=1):
     skills = tuple(kind() for kind in kinds)
     starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
     engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
-    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters, start_calls, search_steps)
+    how = start_calls, search_steps, episode_calls
+    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters, *how)
     found.start(Seeds(0))
     return found
 
@@ -155,13 +156,21 @@ def test_where_it_may_start_the_calls_that_come_first_take_their_time():
 
 
 @pytest.mark.parametrize(
-    ("rows", "start_calls", "search_steps"),
-    [(7, 0, None), (50, 0, None), (7, 3, None), (50, 3, None), (7, 3, 23)],
+    ("rows", "start_calls", "search_steps", "episode_calls"),
+    [
+        (7, 0, None, 1),
+        (50, 0, None, 1),
+        (7, 3, None, 1),
+        (50, 3, None, 1),
+        (7, 3, 23, 1),
+        (7, 0, None, 4),
+        (50, 3, 23, 4),
+    ],
 )
 def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(
-    rows, start_calls, search_steps
+    rows, start_calls, search_steps, episode_calls
 ):
-    how = {"start_calls": start_calls, "search_steps": search_steps}
+    how = {"start_calls": start_calls, "search_steps": search_steps, "episode_calls": episode_calls}
     first, asked = collector_of(Forward, **how), requests(rows)
     for request in itertools.islice(asked, 3):
         first.collect(request)
@@ -199,3 +208,43 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
     allowed = [[False, True, True, False, False], [False, True, False, True, False]]
     assert drawn == [(2, allowed)]
     assert acted(far_only, [0, 0, 0, 0], [2]) == [4]
+
+
+def test_an_episode_may_have_several_calls_with_those_of_others_between_them():
+    collector = collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
+    found = collector.collect(next(requests(3_000))).experience
+    for n in range(N):
+        clock, valid = found.obs[:, n, T], found.valid[:, n]
+        ends = np.flatnonzero(valid & found.truncated[:, n])
+        starts = [0, *np.flatnonzero(clock[1:] == 0) + 1]
+        calls = [int(((ends >= a) & (ends < b)).sum()) for a, b in itertools.pairwise(starts)]
+        assert set(calls) == {3}, "three calls of 7 and at most six of 5 fit into 60 steps"
+        gaps = [int(valid[t + 1 :].argmax()) for t in ends[:-1] if clock[t + 1] > 0]
+        assert set(gaps) == {0, 5, 10}
+
+
+def test_no_call_is_left_over_where_the_environments_own_episode_ends():
+    class Long(Skill):
+        max_steps = 25
+
+    found = collector_of(skill=Long, episode_calls=9).collect(next(requests(400))).experience
+    clock, over = found.obs[:, 0, T], found.truncated[:, 0] | found.terminated[:, 0]
+    assert clock[over][:6].tolist() == [24, 49, 59, 24, 49, 59]
+    assert found.terminated[:, 0][over][:3].tolist() == [False, False, True]
+
+
+def test_search_steps_count_from_the_end_of_the_call_before():
+    class OnTime(Skill):
+        max_steps = 5
+
+        def initiation(self, obs):
+            return obs[:, T] % 20 == 0
+
+    def calls(search_steps):
+        how = {"search_steps": search_steps, "episode_calls": 3}
+        found = collector_of(Five, skill=OnTime, **how).collect(next(requests(300))).experience
+        ends = found.valid & found.truncated
+        return found.obs[:, :, T][ends]
+
+    assert set(calls(16)) == {4, 24, 44}
+    assert set(calls(14)) == {4}, "14 steps after the first call it is given up"

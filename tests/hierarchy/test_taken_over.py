@@ -94,6 +94,7 @@ EVOLVE = Evolution(population=2, generations=2, episodes=2)
         ),
         ({}, {"call_steps": 7}, "call_steps is 6 (declared now: 7)"),
         ({}, {"start_calls": 3}, "start_calls is none (declared now: 3)"),
+        ({}, {"episode_calls": 3}, "episode_calls is 1 (declared now: 3)"),
         ({"evolve": {"left": EVOLVE}}, {}, ""),
     ],
 )
