@@ -58,17 +58,22 @@ def together(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 
 def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """Skills apart, each after calls of those before, then the selector."""
-    count = len(task.declare(steps).skills)
+    """Skills apart, each after calls of those before, then the selector.
+
+    The k-th skill gets k times the steps of the first: it comes after k − 1 others.
+    """
     asked = {
         "learn": "apart",
         "start_calls": 8,
         "episode_calls": 8,
         "selector": task.algorithm(**FLOORS),
-        "skill_steps": 3 * steps // (5 * count),
-        "selector_steps": 2 * steps // 5,
+        "selector_steps": steps // 4,
     }
-    return together(task, steps, **asked | how)
+    hierarchy = together(task, steps, **asked | how)
+    parts = sum(range(1, len(hierarchy.skills) + 1))
+    for k, skill in enumerate(hierarchy.skills, start=1):
+        skill.steps = 3 * steps * k // (4 * parts)
+    return hierarchy
 
 
 def then(task: Task, steps: int, **how: Any) -> Hierarchy:
@@ -81,7 +86,7 @@ CASES: dict[str, Callable[..., Hierarchy]] = {
     "apart": apart,
     "then": then,
     "one call an episode": functools.partial(apart, episode_calls=1),
-    "no start calls": functools.partial(apart, start_calls=None),
+    "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "small call cost": functools.partial(apart, call_cost=0.001),
     "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
     "no floor": functools.partial(together, together=Together(floor=0.0, floor_final=0.0)),

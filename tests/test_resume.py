@@ -249,6 +249,7 @@ SETTINGS = [  # a run that lost any of them would end otherwise
     ["reflexes_in_training=false", "skills.left.gamma=0.9", "cut_every=250", "selector_steps=700"],
     ["greedy_skills=true", "call_steps=9", "skills.left.steps=400", "selector.learning_rate=0.01"],
     ["start_calls=2", "search_steps=12"],
+    ["start_calls=2", "episode_calls=3"],
 ]
 
 

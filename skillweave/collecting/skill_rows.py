@@ -76,7 +76,6 @@ class SkillCollector(Collector):
         self.kept["elapsed"] = np.zeros(n, np.int64)  # the skill's steps in the open episode
         if episode_calls > 1:
             self.kept["calls_made"] = np.zeros(n, np.int64)  # of the skill, in the open episode
-            self.kept["call_ended"] = np.zeros(n, np.int64)  # steps of the episode until then
         self._restricted = skill is not None and skill.defines("initiation")
         self._searches = self._restricted or self._start_calls > 0
         if self._searches:
@@ -153,10 +152,10 @@ class SkillCollector(Collector):
             self._give_up(self._look(going_on))
 
     def _call_again(self, limited: Array) -> Array:
-        """The skill's calls in environments ``limited`` (k,) ended at its limit, no more.
+        """The skill's calls in environments ``limited`` (k,) ended at its limit and nothing else.
 
         Returns:
-            Those whose episodes go on: others are called next, and then the skill again.
+            Those whose episodes go on: perhaps others are called next, and then the skill again.
         """
         if self._episode_calls == 1:
             return limited[:0]
@@ -164,8 +163,7 @@ class SkillCollector(Collector):
         ids = limited[made[limited] + 1 < self._episode_calls]
         age, calls = self.kept["age"][ids], made[ids] + 1
         self._forget(ids)
-        self.kept["age"][ids] = self.kept["call_ended"][ids] = age
-        made[ids] = calls
+        self.kept["age"][ids], made[ids] = age, calls
         return ids
 
     def _draw_calls(self) -> None:
@@ -218,12 +216,14 @@ class SkillCollector(Collector):
         return waiting
 
     def _give_up(self, waiting: Array) -> None:
-        """Begin anew where the skill may not start, and has been waited for long enough."""
+        """Begin anew where it has waited for long enough: after a call of its own, at once."""
+        enough = self._never[waiting]
         if self._search_steps is not None:
-            age = self.kept["age"][waiting]
-            if self._episode_calls > 1:
-                age = age - self.kept["call_ended"][waiting]
-            self._begin_anew(waiting[age >= self._search_steps])
+            enough = self.kept["age"][waiting] >= self._search_steps
+        if self._episode_calls > 1:
+            called = self.kept["calls_made"][waiting] > 0
+            enough = np.where(called, self.kept["calls_left"][waiting] == 0, enough)
+        self._begin_anew(waiting[enough])
 
     def _given_up(self) -> Array:
         if not self._searches:

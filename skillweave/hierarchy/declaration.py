@@ -87,9 +87,9 @@ class Declaration(Nestable):
     """While a skill trains apart, an episode begins anew in which it may not start within so many
     steps: for environments of several kinds, where some have nothing for it. None: it goes on."""
     episode_calls: int = 1
-    """While a skill trains apart: its calls in an episode. After one that reached its ``max_steps``
-    the episode goes on, others are called (``start_calls``), then the skill again. 1: each call
-    has an episode of its own."""
+    """The most calls of a skill in an episode, while it trains apart. After one that reached its
+    ``max_steps`` others are called if ``start_calls`` says so, then the skill again, if it may
+    start. 1: each call begins with a reset. Evaluations count an episode's first call."""
     together_steps: int = 1_000_000
     """Training budget of learning together, in environment steps."""
     call_cost: float = 0.0

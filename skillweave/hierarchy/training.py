@@ -205,7 +205,7 @@ def _hierarchy_entry(declaration: Declaration, *, woven: bool) -> dict[str, Any]
         "reflexes": [r.name for r in declaration.reflexes],
         "start_calls": declaration.start_calls,
         "search_steps": declaration.search_steps,
-        "episode_calls": declaration.episode_calls,
+        **({"episode_calls": calls} if (calls := declaration.episode_calls) > 1 else {}),
         **({"call_cost": declaration.call_cost} if declaration.call_cost else {}),
         **_selector_entry(declaration),
     }

@@ -56,7 +56,8 @@ class NestedEntry(TypedDict):
     reflexes_in_training: NotRequired[bool]
     start_calls: NotRequired[int | None]
     search_steps: NotRequired[int | None]
-    episode_calls: NotRequired[int]
+    episode_calls: NotRequired[Positive]
+    """Absent: 1."""
     call_cost: NotRequired[float]
 
 

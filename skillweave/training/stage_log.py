@@ -140,7 +140,7 @@ class StageLog:
             self.tell(
                 "success() held at the end of none of its calls, so stages after this one build on "
                 "a skill that does not work. It may need more steps, a reward that leads there "
-                "step by step, or states nearer to it: start_calls, initiation()"
+                "step by step, or states nearer to it: start_calls, episode_calls, initiation()"
             )
         self.run.drop_checkpoints()
         drop_states(self.run, entry["name"])

@@ -77,10 +77,12 @@ class Anywhere(Skill):
     max_steps = 7
 
 
-def collector_of(*kinds, skill=Far, start_calls=0, search_steps=None, episode_calls=1):
+def collector_of(
+    *kinds, env=Corridor, skill=Far, start_calls=0, search_steps=None, episode_calls=1
+):
     skills = tuple(kind() for kind in kinds)
     starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
-    engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
+    engine = make_engine(EnvSpec(env, engine="sync"), N)
     how = start_calls, search_steps, episode_calls
     found = SkillCollector(engine, Choices(N, 5), skill(), (), starters, *how)
     found.start(Seeds(0))
@@ -156,31 +158,53 @@ def test_where_it_may_start_the_calls_that_come_first_take_their_time():
 
 
 @pytest.mark.parametrize(
-    ("rows", "start_calls", "search_steps", "episode_calls"),
+    ("rows", "start_calls", "search_steps"),
     [
-        (7, 0, None, 1),
-        (50, 0, None, 1),
-        (7, 3, None, 1),
-        (50, 3, None, 1),
-        (7, 3, 23, 1),
-        (7, 0, None, 4),
-        (50, 3, 23, 4),
+        (7, 0, None),
+        (50, 0, None),
+        (7, 3, None),
+        (50, 3, None),
+        (7, 3, 23),
     ],
 )
 def test_restored_in_the_middle_of_a_starters_call_it_goes_on_the_same(
-    rows, start_calls, search_steps, episode_calls
+    rows, start_calls, search_steps
 ):
-    how = {"start_calls": start_calls, "search_steps": search_steps, "episode_calls": episode_calls}
-    first, asked = collector_of(Forward, **how), requests(rows)
+    how = {"start_calls": start_calls, "search_steps": search_steps}
+    goes_on_the_same(lambda: collector_of(Forward, **how), rows)
+
+
+@pytest.mark.parametrize("rows", [5, 9, 11])
+def test_restored_between_calls_of_one_episode_it_goes_on_the_same(rows):
+    def make():
+        return collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
+
+    kept = goes_on_the_same(make, rows)
+    assert kept["kept.calls_made"].any()
+
+
+def goes_on_the_same(make, rows):
+    """Cut after three rounds; returns what was kept there."""
+    first, asked = make(), requests(rows)
     for request in itertools.islice(asked, 3):
         first.collect(request)
     first.cut(Seeds(1))
-    again = collector_of(Forward, **how)
+    again = make()
     assert not len(again.restore(first.state()))
-    for request in itertools.islice(asked, 4):
+    kept = first.state()
+    for request in itertools.islice(asked, 9):
         one, two = first.collect(request).experience, again.collect(request).experience
         for name in ("obs", "action", "reward", "next_obs", "valid", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    return kept
+
+
+def test_others_over_other_environments_are_like_it():
+    first = collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
+    other = first.like(first.engine, first.acting)
+    assert {k: v.shape for k, v in other.kept.items()} == {
+        k: v.shape for k, v in first.kept.items()
+    }
 
 
 def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
@@ -223,28 +247,74 @@ def test_an_episode_may_have_several_calls_with_those_of_others_between_them():
         assert set(gaps) == {0, 5, 10}
 
 
-def test_no_call_is_left_over_where_the_environments_own_episode_ends():
+class Bounded(Corridor):
+    """It ends by its time limit."""
+
+    def step(self, action):
+        obs, reward, over, _, info = super().step(action)
+        return obs, reward, False, over, info
+
+
+@pytest.mark.parametrize("max_steps", [25, 30])
+@pytest.mark.parametrize("env", [Corridor, Bounded])
+def test_no_call_is_left_over_where_the_environments_own_episode_ends(env, max_steps):
     class Long(Skill):
-        max_steps = 25
+        pass
 
-    found = collector_of(skill=Long, episode_calls=9).collect(next(requests(400))).experience
-    clock, over = found.obs[:, 0, T], found.truncated[:, 0] | found.terminated[:, 0]
-    assert clock[over][:6].tolist() == [24, 49, 59, 24, 49, 59]
-    assert found.terminated[:, 0][over][:3].tolist() == [False, False, True]
+    Long.max_steps = max_steps
+    found = collector_of(env=env, skill=Long, episode_calls=9).collect(next(requests(400)))
+    clock = found.experience.obs[:, 0, T]
+    over = found.experience.truncated[:, 0] | found.experience.terminated[:, 0]
+    ends = [24, 49, 59] if max_steps == 25 else [29, 59]
+    assert clock[over][: 2 * len(ends)].tolist() == 2 * ends
+    by_itself = found.experience.terminated[:, 0][over]
+    assert by_itself[: len(ends)].tolist() == [False] * (len(ends) - 1) + [env is Corridor]
+    assert clock.max() == 59
 
 
-def test_search_steps_count_from_the_end_of_the_call_before():
-    class OnTime(Skill):
+class OnTime(Skill):
+    """May start at a reset, and again at 15 and 30."""
+
+    max_steps = 5
+
+    def initiation(self, obs):
+        return obs[:, T] % 15 == 0
+
+
+@pytest.mark.parametrize(("start_calls", "ends"), [(0, {4}), (2, {4, 19, 34})])
+def test_after_a_call_it_is_called_again_only_where_the_calls_between_lead_to(start_calls, ends):
+    how = {"start_calls": start_calls, "episode_calls": 3, "search_steps": 9}
+    found = collector_of(Five, skill=OnTime, **how).collect(next(requests(2_000))).experience
+    at = found.obs[:, :, T][found.valid & found.truncated]
+    assert set(at) == ends
+
+
+def test_a_skill_that_may_start_at_a_reset_alone_does_not_wait_for_ever():
+    class Endless(Corridor):
+        def step(self, action):
+            obs, reward, _, _, info = super().step(action)
+            return obs, reward, False, False, info
+
+    class AtReset(Skill):
         max_steps = 5
 
         def initiation(self, obs):
-            return obs[:, T] % 20 == 0
+            return obs[:, T] == 0
 
-    def calls(search_steps):
-        how = {"search_steps": search_steps, "episode_calls": 3}
-        found = collector_of(Five, skill=OnTime, **how).collect(next(requests(300))).experience
-        ends = found.valid & found.truncated
-        return found.obs[:, :, T][ends]
+    collector = collector_of(Five, env=Endless, skill=AtReset, episode_calls=8)
+    assert collector.collect(next(requests(600))).experience.valid.mean() > 0.8
 
-    assert set(calls(16)) == {4, 24, 44}
-    assert set(calls(14)) == {4}, "14 steps after the first call it is given up"
+
+def test_an_evaluated_episode_is_its_first_call():
+    class Second(Skill):
+        max_steps = 7
+
+        def reward(self, step):
+            return step.obs[:, T] == 10
+
+    collector = collector_of(skill=Second, episode_calls=4)
+    told = collector.collect(next(requests(400))).episodes[:, 0]
+    assert set(told[:4]) | set(told) == {0.0, 1.0}
+    played = collector.play(next(requests(1)), Seeds(0), 100)
+    assert played[:, 0].tolist() == [0.0] * N
+    assert played[:, 2].tolist() == [7.0] * N
