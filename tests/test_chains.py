@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, got_key
 from small_runs import ON, Heard, StopAt, Stopped, assert_same, new_run
@@ -11,6 +14,7 @@ from test_together import declare
 
 from skillweave import Automaton, SkillweaveError, Together
 from skillweave.collecting import skill_rows
+from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy import training
 from skillweave.skills import Skill
 from skillweave.training.stage_log import StageLog
@@ -59,6 +63,38 @@ def test_a_skill_that_found_no_start_in_all_its_steps_is_told_in_the_end(tmp_pat
     run.close()
     (said,) = [text for text in heard.said if "learnt nothing" in text]
     assert said.startswith("beyond: it learnt nothing in 3"), said
+
+
+@pytest.mark.parametrize("calls", [1, 3])
+def test_its_second_call_begins_where_its_first_has_left_the_agent(tmp_path, calls):
+    class Patient(Skill):
+        max_steps = 3
+
+        def reward(self, step):
+            return np.where(step.obs[:, 2] >= 3, 1.0, 0.0)
+
+    class Clock(gym.Env):
+        observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        action_space = gym.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.t = 0
+            return np.zeros(3, np.float32), {}
+
+        def step(self, action):
+            self.t += 1
+            return np.array([0, 0, self.t], np.float32), 0.0, False, self.t >= 40, {}
+
+    env = EnvSpec(Clock, engine="sync")
+    how = {"env": env, "learn": "apart", "episode_calls": calls, "skill_steps": 400}
+    run = chain(Patient(), selector=lambda obs: np.zeros(len(obs), int), **how).train(
+        tmp_path / "run", quiet=True
+    )
+    rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+    best = max(row.get("return", 0.0) for row in rows)
+    # Of three calls the second and the third are paid in each of their three steps.
+    assert best == 0.0 if calls == 1 else best > 1.5
 
 
 def test_no_skill_may_start_where_learning_together_begins(tmp_path):
