@@ -66,6 +66,7 @@ def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
         "learn": "apart",
         "start_calls": 8,
         "episode_calls": 8,
+        "call_cost": 0.001,  # far from the goal a decision is worth 0.02
         "selector": task.algorithm(**FLOORS),
         "selector_steps": steps // 4,
     }
@@ -87,7 +88,7 @@ CASES: dict[str, Callable[..., Hierarchy]] = {
     "then": then,
     "one call an episode": functools.partial(apart, episode_calls=1),
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
-    "small call cost": functools.partial(apart, call_cost=0.001),
+    "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
     "no floor": functools.partial(together, together=Together(floor=0.0, floor_final=0.0)),
     "no call cost": functools.partial(together, call_cost=0.0),
