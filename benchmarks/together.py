@@ -37,18 +37,21 @@ class Task:
 
     declare: Callable[..., Hierarchy]
     algorithm: Callable[..., PPO]
+    parts: tuple[int, ...]
+    """Of the steps apart, how many parts each skill gets."""
     has_engines: bool = True
     """``--engine`` is about it."""
 
 
 def _doorkey(size: str) -> Task:
-    return Task(functools.partial(doorkey.declare, size), doorkey.algorithm)
+    parts = 1, 2, 3  # the key is found soon, the goal is far behind the door
+    return Task(functools.partial(doorkey.declare, size), doorkey.algorithm, parts)
 
 
 TASKS = {
     "8x8": _doorkey("8x8"),
     "16x16": _doorkey("16x16"),
-    "bridge": Task(bridge.declare, bridge.algorithm, has_engines=False),
+    "bridge": Task(bridge.declare, bridge.algorithm, (1, 1, 1, 1), has_engines=False),
 }
 
 
@@ -58,10 +61,7 @@ def together(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 
 def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """Skills apart, each after calls of those before, then the selector.
-
-    The k-th skill gets k times the steps of the first: it comes after k − 1 others.
-    """
+    """Skills apart, each after calls of those before, then the selector."""
     asked = {
         "learn": "apart",
         "start_calls": 8,
@@ -71,9 +71,8 @@ def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
         "selector_steps": steps // 4,
     }
     hierarchy = together(task, steps, **asked | how)
-    parts = sum(range(1, len(hierarchy.skills) + 1))
-    for k, skill in enumerate(hierarchy.skills, start=1):
-        skill.steps = 3 * steps * k // (4 * parts)
+    for skill, part in zip(hierarchy.skills, task.parts, strict=True):
+        skill.steps = 3 * steps * part // (4 * sum(task.parts))
     return hierarchy
 
 
