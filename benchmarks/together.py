@@ -39,13 +39,15 @@ class Task:
     algorithm: Callable[..., PPO]
     parts: tuple[int, ...]
     """Of the steps apart, how many parts each skill gets."""
+    ent_coef: float = 0.01
+    """Of skills that learn apart."""
     has_engines: bool = True
     """``--engine`` is about it."""
 
 
 def _doorkey(size: str) -> Task:
     parts = 1, 2, 3  # the key is found soon, the goal is far behind the door
-    return Task(functools.partial(doorkey.declare, size), doorkey.algorithm, parts)
+    return Task(functools.partial(doorkey.declare, size), doorkey.algorithm, parts, ent_coef=0.03)
 
 
 TASKS = {
@@ -67,6 +69,7 @@ def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
         "start_calls": 8,
         "episode_calls": 8,
         "call_cost": 0.001,  # far from the goal a decision is worth 0.02
+        "algorithm": task.algorithm(ent_coef=task.ent_coef),
         "selector": task.algorithm(**FLOORS),
         "selector_steps": steps // 4,
     }
@@ -86,6 +89,7 @@ CASES: dict[str, Callable[..., Hierarchy]] = {
     "apart": apart,
     "then": then,
     "one call an episode": functools.partial(apart, episode_calls=1),
+    "less entropy": lambda task, steps: apart(task, steps, algorithm=task.algorithm()),
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
