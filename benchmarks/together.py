@@ -38,22 +38,23 @@ class Task:
     declare: Callable[..., Hierarchy]
     algorithm: Callable[..., PPO]
     parts: tuple[int, ...]
-    """Of the steps apart, how many parts each skill gets."""
-    ent_coef: float = 0.01
-    """Of skills that learn apart."""
+    """Of the steps apart, how many parts each skill gets, and last the selector."""
+    episode_calls: int = 1
+    """Of a skill that learns apart."""
     has_engines: bool = True
     """``--engine`` is about it."""
 
 
 def _doorkey(size: str) -> Task:
-    parts = 1, 2, 3  # the key is found soon, the goal is far behind the door
-    return Task(functools.partial(doorkey.declare, size), doorkey.algorithm, parts, ent_coef=0.03)
+    parts = 1, 2, 3, 2  # the key is found soon, the goal is far behind the door
+    declare = functools.partial(doorkey.declare, size)
+    return Task(declare, doorkey.algorithm, parts, episode_calls=8)
 
 
 TASKS = {
     "8x8": _doorkey("8x8"),
     "16x16": _doorkey("16x16"),
-    "bridge": Task(bridge.declare, bridge.algorithm, (1, 1, 1, 1), has_engines=False),
+    "bridge": Task(bridge.declare, bridge.algorithm, (3, 3, 3, 3, 8), has_engines=False),
 }
 
 
@@ -64,18 +65,19 @@ def together(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
     """Skills apart, each after calls of those before, then the selector."""
+    *each, last = [steps * part // sum(task.parts) for part in task.parts]
     asked = {
         "learn": "apart",
         "start_calls": 8,
-        "episode_calls": 8,
+        "episode_calls": task.episode_calls,
         "call_cost": 0.001,  # far from the goal a decision is worth 0.02
-        "algorithm": task.algorithm(ent_coef=task.ent_coef),
+        "algorithm": task.algorithm(ent_coef=0.03),  # with 0.01 some settle before they can
         "selector": task.algorithm(**FLOORS),
-        "selector_steps": steps // 4,
+        "selector_steps": last,
     }
     hierarchy = together(task, steps, **asked | how)
-    for skill, part in zip(hierarchy.skills, task.parts, strict=True):
-        skill.steps = 3 * steps * part // (4 * sum(task.parts))
+    for skill, own in zip(hierarchy.skills, each, strict=True):
+        skill.steps = own
     return hierarchy
 
 
