@@ -15,7 +15,7 @@ import argparse
 import functools
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,8 +39,8 @@ class Task:
     algorithm: Callable[..., PPO]
     parts: tuple[int, ...]
     """Of the steps apart, how many parts each skill gets, and last the selector."""
-    episode_calls: int = 1
-    """Of a skill that learns apart."""
+    apart: Mapping[str, Any]
+    """Settings where skills learn apart."""
     has_engines: bool = True
     """``--engine`` is about it."""
 
@@ -48,13 +48,16 @@ class Task:
 def _doorkey(size: str) -> Task:
     parts = 1, 2, 3, 2  # the key is found soon, the goal is far behind the door
     declare = functools.partial(doorkey.declare, size)
-    return Task(declare, doorkey.algorithm, parts, episode_calls=8)
+    # With less entropy `goal` settles too early; far from it a decision is worth 0.02.
+    explores = doorkey.algorithm(ent_coef=0.03)
+    apart = {"episode_calls": 8, "call_cost": 0.001, "algorithm": explores}
+    return Task(declare, doorkey.algorithm, parts, apart)
 
 
 TASKS = {
     "8x8": _doorkey("8x8"),
     "16x16": _doorkey("16x16"),
-    "bridge": Task(bridge.declare, bridge.algorithm, (3, 3, 3, 3, 8), has_engines=False),
+    "bridge": Task(bridge.declare, bridge.algorithm, (3, 3, 3, 3, 8), {}, has_engines=False),
 }
 
 
@@ -69,13 +72,10 @@ def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
     asked = {
         "learn": "apart",
         "start_calls": 8,
-        "episode_calls": task.episode_calls,
-        "call_cost": 0.001,  # far from the goal a decision is worth 0.02
-        "algorithm": task.algorithm(ent_coef=0.03),  # with 0.01 some settle before they can
         "selector": task.algorithm(**FLOORS),
         "selector_steps": last,
     }
-    hierarchy = together(task, steps, **asked | how)
+    hierarchy = together(task, steps, **asked | task.apart | how)
     for skill, own in zip(hierarchy.skills, each, strict=True):
         skill.steps = own
     return hierarchy
