@@ -57,7 +57,7 @@ def _doorkey(size: str) -> Task:
 TASKS = {
     "8x8": _doorkey("8x8"),
     "16x16": _doorkey("16x16"),
-    "bridge": Task(bridge.declare, bridge.algorithm, (3, 3, 3, 3, 8), {}, has_engines=False),
+    "bridge": Task(bridge.declare, bridge.algorithm, (4, 5, 5, 3, 3), {}, has_engines=False),
 }
 
 

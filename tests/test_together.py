@@ -246,6 +246,12 @@ def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
         assert critic.floor == (0.7 if how else Together().floor)
 
 
+def test_the_critic_divides_advantages_by_as_much_as_the_selector_does():
+    selector = replace(ON, min_advantage_std=7.0)
+    (stage,) = training.stages_of(declare(interrupt=True, selector=selector))
+    assert stage.beside["skill_critic"].min_advantage_std == 7.0
+
+
 class Never(Left):
     """Says of no call that it succeeded."""
 

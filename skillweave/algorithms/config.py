@@ -101,6 +101,9 @@ class PPO(OnPolicy):
     """KL at which an update stops early, or that the 'kl' schedule aims at."""
     normalize_advantage: bool = True
     """Zero mean, unit deviation of the advantages of each update."""
+    min_advantage_std: float = 0.1
+    """Advantages of a smaller deviation, in units of reward, are divided by this instead: where
+    nothing was won yet, they are errors of the critic, and would be as large as a success."""
     normalize_returns: bool = True
     """The critic learns returns in units of their running deviation: no reward is too large."""
     action_std_init: float = 0.6
@@ -117,7 +120,7 @@ class PPO(OnPolicy):
         whole(self, "batch_size", "update_epochs")
         number(self, "gae_lambda", high=1.0)
         positive(self, "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")
-        number(self, "ent_coef", "vf_coef")
+        number(self, "ent_coef", "vf_coef", "min_advantage_std")
         number(self, "floor", high=1.0)
         for name in ("ent_coef_final", "floor_final"):
             if getattr(self, name) is not None:
@@ -149,6 +152,8 @@ class SkillCritic(OnPolicy):
     """Adam's ε."""
     max_grad_norm: float = 0.5
     """Gradients are scaled down to this norm."""
+    min_advantage_std: float = 0.1
+    """Advantages that skills learn from are divided by no less, in units of reward."""
     floor: float = 0.0
     """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
     cut: while skills learn, what skills are worth is multiplied by 1 − floor."""
@@ -160,6 +165,7 @@ class SkillCritic(OnPolicy):
         whole(self, "batch_size", "update_epochs")
         number(self, "gae_lambda", high=1.0)
         number(self, "floor", high=1.0)
+        number(self, "min_advantage_std")
         if self.floor_final is not None:
             number(self, "floor_final", high=1.0)
         positive(self, "max_grad_norm", "adam_eps")
@@ -283,6 +289,8 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
         raise SkillweaveError(f"{where}{_not_registered(shown(kind))}")
     if issubclass(_REGISTERED[kind].config, OffPolicy):
         values.setdefault("bouts", 0.0)  # they were recorded before there were bouts
+    if _REGISTERED[kind].config in (PPO, SkillCritic):
+        values.setdefault("min_advantage_std", 0.0)  # likewise
     config: AlgorithmConfig = fit(_REGISTERED[kind].config, values, file, path or kind)
     return config
 

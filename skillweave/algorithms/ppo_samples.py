@@ -135,7 +135,8 @@ def _advantage(
     agent: PPOAlgorithm, own: Tensor, other: Tensor | None, counts: Tensor | None
 ) -> Tensor:
     """The learner's own advantage, and what counts beside it in the same units, (P, N)."""
-    own = normalise(own, counts) if agent.config.normalize_advantage else own
+    if agent.config.normalize_advantage:
+        own = normalise(own, counts, min_std=agent.config.min_advantage_std)
     return own if other is None else own + other
 
 

@@ -35,19 +35,22 @@ def masked_var_mean(x: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Ten
     return masked_mean(away.square(), valid), mean
 
 
-def normalise(x: Tensor, valid: Tensor | None = None, eps: float = 1e-8) -> Tensor:
+def normalise(
+    x: Tensor, valid: Tensor | None = None, eps: float = 1e-8, min_std: float = 0.0
+) -> Tensor:
     """Zero mean and unit deviation over all axes but the first.
 
     Args:
         x: (P, ...).
         valid: (P, ...) bool, what mean and deviation are taken over; None: all.
         eps: added to the deviation.
+        min_std: where the deviation is smaller, ``x`` is divided by this instead.
 
     Returns:
         (P, ...).
     """
     variance, mean = (m.view(-1, *[1] * (x.ndim - 1)) for m in masked_var_mean(x, valid))
-    return (x - mean) / (variance.sqrt() + eps)
+    return (x - mean) / (variance.sqrt().clamp_min(min_std) + eps)
 
 
 def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:

@@ -68,14 +68,18 @@ class WovenLearner:
             self.parts[name].take(rows)
 
     def _task_advantage(self, rows: Experience) -> Array:
-        """What each step did for the task, (T, N) float32, with deviation 1."""
+        """What each step did for the task, (T, N) float32, with deviation 1.
+
+        With less where it is small, in units of reward: see ``PPO.min_advantage_std``.
+        """
         (stack,) = self.parts[self._critic].stacks
         store = RolloutStore(1, device=stack.state.params.device)
         store.add(rows)
         rollout = store.rollout(stack.state.gamma)
         assert rollout is not None
         found: Array = stack.algorithm.advantage(stack.state, rollout)[0].cpu().numpy()
-        scaled: Array = (found - found.mean()) / (found.std() + np.float32(1e-3))
+        least = stack.algorithm.config.min_advantage_std / stack.state.return_scale.item()
+        scaled: Array = (found - found.mean()) / (max(found.std(), least) + np.float32(1e-3))
         return scaled
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ from gymnasium.spaces import Box, Discrete
 from torch import nn
 from toys import Echo, learn, training
 
-from skillweave.algorithms.config import PPO, config_from_json, config_to_json
+from skillweave.algorithms.config import PPO, SkillCritic, config_from_json, config_to_json
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
@@ -87,6 +87,7 @@ VARIANTS = {
     "early stop": {"target_kl": 0.003, "learning_rate": 1e-2},
     "rate by kl": {"target_kl": 0.01, "learning_rate_schedule": "kl"},
     "linear rate": {"learning_rate_schedule": "linear"},
+    "small advantages": {"min_advantage_std": 10.0},
     "raw": {"normalize_returns": False, "normalize_advantage": False},
     "critic of its own": {"critic": Network((8, 8), "relu", layer_norm=True)},
     "minibatches of unequal size": {"batch_size": 13},
@@ -436,6 +437,13 @@ def test_settings_survive_json():
     config = replace(CONFIG, critic=Network((8,), "relu", True), target_kl=0.1)
     assert config_from_json(config_to_json(config)) == config
     assert config_from_json(config_to_json(PPO())) == PPO()
+
+
+@pytest.mark.parametrize("kind", [PPO, SkillCritic])
+def test_older_settings_are_read_with_no_least_deviation_of_advantages(kind):
+    recorded = config_to_json(kind())
+    del recorded["min_advantage_std"]
+    assert config_from_json(recorded) == kind(min_advantage_std=0.0)
 
 
 @pytest.mark.parametrize(

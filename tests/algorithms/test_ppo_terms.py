@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from torch.distributions import Categorical, Independent, Normal, kl_divergence
+from toys import Toy, learn
 
 from skillweave import PPO, Network, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
@@ -146,3 +147,37 @@ def test_the_price_of_divergence_follows_the_budget():
     coef, kl = torch.tensor([1.0, 1.0, 1.0]), torch.tensor([0.2, 0.1, 0.01])
     assert adapted(coef, kl, 0.1).tolist() == [2.0, 1.0, 0.5]
     assert adapted(torch.tensor([1e3]), torch.tensor([9.0]), 0.1).tolist() == [1e3]
+
+
+class Fruitless(Toy):
+    """A walk on a plane on which every step costs the same; an episode is cut after 20."""
+
+    observation_space = gym.spaces.Box(-9.0, 9.0, (2,), np.float32)
+    action_space = gym.spaces.Discrete(4)
+    moves = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)], np.float32)
+
+    def first(self, rows):
+        return self.rng.uniform(-4, 4, (len(rows), 2)).astype(np.float32)
+
+    def play(self, action):
+        after = np.clip(self.obs + self.moves[action], -9, 9)
+        never = np.zeros(self.num_envs, bool)
+        return after, np.full(self.num_envs, -0.02), never, self.t >= 20
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_policy_that_can_win_nothing_stays_as_random_as_it_was(seed):
+    """All advantages are the critic's errors. Made as large as any, they move the policy."""
+
+    def entropy(**how):
+        config = PPO(
+            num_envs=16, n_steps=64, gamma=0.9, update_epochs=4,
+            learning_rate_schedule="constant", network=Network((64, 64)), **how,
+        )  # fmt: skip
+        algorithm, state = learn(config, Fruitless(16), 40_000, seed, members=(seed,))
+        obs = torch.as_tensor(Fruitless.moves * 2)[None]
+        _, head, _ = algorithm.act(algorithm.acting_params(state), obs, None, None)
+        return Categorical(logits=head).entropy().mean().item()
+
+    assert entropy() > 0.95 * np.log(4)
+    assert entropy(min_advantage_std=0.0) < 0.8 * np.log(4)

@@ -33,6 +33,16 @@ def test_valid_samples_are_normalised_as_if_there_were_no_others():
     assert torch.allclose(normalise(X[:1], VALID[:1])[0, VALID[0]], kept[0])
 
 
+def test_a_deviation_that_is_too_small_is_not_made_one():
+    few = torch.tensor([[1.0, 3.0], [0.001, 0.003]])
+    found = normalise(few, min_std=0.1)
+    torch.testing.assert_close(found, torch.tensor([[-1.0, 1.0], [-0.01, 0.01]]))
+    assert torch.equal(found[0], normalise(few)[0])
+    valid = torch.tensor([[True, True, False]])
+    found = normalise(torch.tensor([[0.001, 0.003, 99.0]]), valid, min_std=0.1)
+    torch.testing.assert_close(found[:, :2], torch.tensor([[-0.01, 0.01]]))
+
+
 def test_the_variance_explained_is_that_of_valid_samples():
     value = torch.tensor([[1.0, 99.0, 2.0, 8.0]])
     kept = VALID[0]

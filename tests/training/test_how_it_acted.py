@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
+import pytest
+import torch
 
+from skillweave import Together
+from skillweave.algorithms.config import SkillCritic
+from skillweave.algorithms.policy import make_algorithm
 from skillweave.experience import Experience
-from skillweave.training.woven_learner import how_it_acted
+from skillweave.seeding import Seeds
+from skillweave.training.learner import RolloutLearner, Stack
+from skillweave.training.woven_learner import WovenLearner, how_it_acted
 from skillweave.types import Array
 
 
@@ -38,3 +46,19 @@ def test_of_a_selector_how_long_its_calls_were() -> None:
 
 def test_of_a_critic_nothing() -> None:
     assert told("skill_critic", rows()) == {}
+
+
+@pytest.mark.parametrize(("least", "deviation"), [(0.0, 1.0), (4.0, 0.5)])
+def test_a_task_that_says_little_moves_skills_little(least: float, deviation: float) -> None:
+    """The critic gives advantages in deviations of the return, 4 here; their own is 0.5."""
+    config = SkillCritic(num_envs=2, n_steps=3, batch_size=6, min_advantage_std=least)
+    seen, skills = gym.spaces.Box(-9, 9, (1,), np.float32), gym.spaces.Discrete(2)
+    algorithm = make_algorithm(config, seen, skills)
+    state = algorithm.init([Seeds(0)])
+    state.return_var = torch.full_like(state.return_var, 16.0)
+    given = torch.tensor([[[0.5, -0.5]] * 3])
+    algorithm.advantage = lambda *_: given  # type: ignore[method-assign]
+    learner = RolloutLearner(Stack(algorithm, state), Seeds(0))
+    woven = WovenLearner({"skill_critic": learner}, "", Together())
+    found = woven._task_advantage(rows())
+    assert found.std() == pytest.approx(deviation, rel=0.01)
