@@ -101,7 +101,7 @@ class PPO(OnPolicy):
     """KL at which an update stops early, or that the 'kl' schedule aims at."""
     normalize_advantage: bool = True
     """Zero mean, unit deviation of the advantages of each update."""
-    min_advantage_std: float = 0.1
+    min_advantage_std: float = 0.05
     """Advantages of a smaller deviation, in units of reward, are divided by this instead: where
     nothing was won yet, they are errors of the critic, and would be as large as a success."""
     normalize_returns: bool = True
@@ -152,7 +152,7 @@ class SkillCritic(OnPolicy):
     """Adam's ε."""
     max_grad_norm: float = 0.5
     """Gradients are scaled down to this norm."""
-    min_advantage_std: float = 0.1
+    min_advantage_std: float = 0.05
     """Advantages that skills learn from are divided by no less, in units of reward."""
     floor: float = 0.0
     """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
