@@ -102,8 +102,8 @@ class PPO(OnPolicy):
     normalize_advantage: bool = True
     """Zero mean, unit deviation of the advantages of each update."""
     min_advantage_std: float = 0.05
-    """Advantages of a smaller deviation, in units of reward, are divided by this instead: where
-    nothing was won yet, they are errors of the critic, and would be as large as a success."""
+    """Advantages to normalise that have a smaller deviation, in units of reward, are divided by
+    this: where nothing was won yet, they are the critic's errors. 0: no limit."""
     normalize_returns: bool = True
     """The critic learns returns in units of their running deviation: no reward is too large."""
     action_std_init: float = 0.6
@@ -153,7 +153,7 @@ class SkillCritic(OnPolicy):
     max_grad_norm: float = 0.5
     """Gradients are scaled down to this norm."""
     min_advantage_std: float = 0.05
-    """Advantages that skills learn from are divided by no less, in units of reward."""
+    """The task's advantages of a smaller deviation, in units of reward, are divided by this."""
     floor: float = 0.0
     """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
     cut: while skills learn, what skills are worth is multiplied by 1 − floor."""
@@ -289,7 +289,7 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
         raise SkillweaveError(f"{where}{_not_registered(shown(kind))}")
     if issubclass(_REGISTERED[kind].config, OffPolicy):
         values.setdefault("bouts", 0.0)  # they were recorded before there were bouts
-    if _REGISTERED[kind].config in (PPO, SkillCritic):
+    if issubclass(_REGISTERED[kind].config, (PPO, SkillCritic)):
         values.setdefault("min_advantage_std", 0.0)  # likewise
     config: AlgorithmConfig = fit(_REGISTERED[kind].config, values, file, path or kind)
     return config

@@ -1,4 +1,4 @@
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -7,7 +7,14 @@ from gymnasium.spaces import Box, Discrete
 from torch import nn
 from toys import Echo, learn, training
 
-from skillweave.algorithms.config import PPO, SkillCritic, config_from_json, config_to_json
+from skillweave.algorithms import config as configs
+from skillweave.algorithms.config import (
+    PPO,
+    Registration,
+    SkillCritic,
+    config_from_json,
+    config_to_json,
+)
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
@@ -439,8 +446,15 @@ def test_settings_survive_json():
     assert config_from_json(config_to_json(PPO())) == PPO()
 
 
-@pytest.mark.parametrize("kind", [PPO, SkillCritic])
-def test_older_settings_are_read_with_no_least_deviation_of_advantages(kind):
+@dataclass(frozen=True)
+class Mine(PPO):
+    """A user's own kind of PPO."""
+
+
+@pytest.mark.parametrize("kind", [PPO, SkillCritic, Mine])
+def test_older_settings_are_read_with_no_least_deviation_of_advantages(kind, monkeypatch):
+    known = {"Mine": Registration(Mine, PPOAlgorithm, (Discrete,))}
+    monkeypatch.setattr(configs, "_REGISTERED", configs._REGISTERED | known)
     recorded = config_to_json(kind())
     del recorded["min_advantage_std"]
     assert config_from_json(recorded) == kind(min_advantage_std=0.0)

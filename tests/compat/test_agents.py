@@ -206,6 +206,7 @@ def test_settings_are_those_of_the_native_agent():
     agent.lr, agent.batch_size = 5e-4, np.int64(32)
     config = agent.native.member.config
     assert (config.learning_rate, config.batch_size) == (5e-4, 32)
+    assert config.min_advantage_std == 0.0  # AgileRL has no such limit
     assert float(agent.native.member.state.learning_rate[0]) == pytest.approx(5e-4)
     other = KINDS["td3"](lr_actor=1e-4, lr_critic=1e-3, learn_step=5)
     assert (other.lr_critic, other.learn_step) == (1e-3, 5)

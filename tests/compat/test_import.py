@@ -81,6 +81,7 @@ def test_a_ppo_checkpoint_becomes_an_agent_that_computes_the_same(tmp_path, norm
     assert command(tmp_path / "old.pt", "--trust", "-o", tmp_path / "new.pt") == 0
     assert "PPO agent" in capsys.readouterr().out
     agent = PPO.load(tmp_path / "new.pt")
+    assert agent.native.member.config.min_advantage_std == 0.0
     numpy_actor, obs = agent.native.numpy_actor, torch.from_numpy(OBS)
     want = actor.feature_net(obs).log_softmax(-1).detach()
     found = torch.from_numpy(numpy_actor.output(OBS)).log_softmax(-1)
