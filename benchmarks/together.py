@@ -86,6 +86,12 @@ def then(task: Task, steps: int, **how: Any) -> Hierarchy:
     return apart(task, steps // 2, learn="apart, then together", together_steps=steps // 2, **how)
 
 
+def no_least_deviation(task: Task, steps: int) -> Hierarchy:
+    """The critic's errors are made as large as a success, where nothing was won yet."""
+    who = task.algorithm(min_advantage_std=0.0)
+    return together(task, steps, algorithm=who, selector=who)
+
+
 CASES: dict[str, Callable[..., Hierarchy]] = {
     "together": together,
     "apart": apart,
@@ -95,6 +101,7 @@ CASES: dict[str, Callable[..., Hierarchy]] = {
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
+    "no least deviation": no_least_deviation,
     "no floor": functools.partial(together, together=Together(floor=0.0, floor_final=0.0)),
     "no call cost": functools.partial(together, call_cost=0.0),
     "task advantage": functools.partial(together, together=replace(FLOOR, task_weight=1.0)),
