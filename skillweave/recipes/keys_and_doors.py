@@ -202,6 +202,7 @@ class ReachGoal(Errand):
 
 CELLS = Network(hidden=(64,), encoder="cells")  # a cell's numbers are kinds, not brightnesses
 WORKER = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=128,
     n_steps=32,
     batch_size=256,
@@ -213,6 +214,7 @@ WORKER = PPO(
     network=CELLS,
 )
 SELECTOR = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=32,
     n_steps=256,
     batch_size=64,  # a rollout has few decisions

@@ -154,6 +154,7 @@ class Land(Flight):
 
 RELU = Network(activation="relu")  # tanh costs more than all the rest of so small a network
 PILOT = PPO(
+    min_advantage_std=0.0,  # so it was measured
     batch_size=256,
     update_epochs=8,
     gamma=0.99,
@@ -162,6 +163,7 @@ PILOT = PPO(
     network=RELU,
 )
 SELECTOR = PPO(
+    min_advantage_std=0.0,  # so it was measured
     n_steps=128,
     batch_size=32,  # a rollout has few decisions
     update_epochs=10,

@@ -154,6 +154,7 @@ register_encoder("map of a maze", Map)
 
 MAP = Network(hidden=(128, 128), activation="relu", encoder="map of a maze")
 BALL = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=32,
     n_steps=32,
     batch_size=128,
@@ -165,6 +166,7 @@ BALL = PPO(
     network=Network(hidden=(32, 32), activation="relu", encoder="motion in a maze"),
 )
 SELECTOR = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=32,
     n_steps=256,
     batch_size=128,

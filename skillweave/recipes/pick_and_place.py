@@ -198,6 +198,7 @@ behaviour_tree = sw.tree.Sequence(
 
 RELU = Network(hidden=(64, 64), activation="relu")
 LEARNER = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=16,
     n_steps=128,
     batch_size=256,
@@ -207,6 +208,7 @@ LEARNER = PPO(
     network=RELU,
 )
 SELECTOR = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=16,
     n_steps=128,
     batch_size=64,

@@ -126,6 +126,7 @@ register_encoder("half-cheetah's body", Body)
 
 RELU = Network(hidden=(64, 64), activation="relu")  # tanh costs more than all the rest of it
 RUNNER = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=64,
     n_steps=64,
     batch_size=256,
@@ -137,6 +138,7 @@ RUNNER = PPO(
     network=replace(RELU, encoder="half-cheetah's body"),
 )
 SELECTOR = PPO(
+    min_advantage_std=0.0,  # so it was measured
     num_envs=64,
     n_steps=64,
     batch_size=128,
