@@ -120,7 +120,7 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": _mlp(actor)}
     if kind is PPO:
         config |= {"learning_rate_schedule": "constant", "num_envs": 1, "n_steps": 2**31}
-        config["min_advantage_std"] = 0.0
+        config["min_advantage_std"] = 0.0  # AgileRL has no such limit
     config["normalize_obs"] = False  # AgileRL does not
     if "learn_step" in data and kind is not PPO:
         config["update_ratio"] = 1.0 / data["learn_step"]

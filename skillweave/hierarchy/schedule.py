@@ -133,13 +133,11 @@ def _critic(own: Any) -> dict[str, AlgorithmConfig]:
     """The critic of skills; it sees and discounts as a selector with the settings ``own`` does."""
     shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(own, PPO):
-        shared |= {
-            field: getattr(own, field)
-            for field in (
-                "n_steps", "gae_lambda", "network", "overlap", "floor", "floor_final",
-                "min_advantage_std",
-            )
-        }  # fmt: skip
+        same = (
+            "n_steps", "gae_lambda", "network", "overlap", "floor", "floor_final",
+            "min_advantage_std",
+        )  # fmt: skip
+        shared |= {f: getattr(own, f) for f in same}
     if "network" in shared:  # the critic remembers nothing
         shared["network"] = replace(shared["network"], rnn=None)
     return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}

@@ -31,7 +31,7 @@ class PPO(Agent):
         actions: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (action_dim,), np.float32)
         actions = gym.spaces.Discrete(action_dim) if discrete_actions else actions
         own = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
-        own["min_advantage_std"] = 0.0
+        own["min_advantage_std"] = 0.0  # AgileRL has no such limit
         self._start(locals(), actions, n_steps=2**31, normalize_obs=False, **own)
 
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
