@@ -7,6 +7,10 @@ chain (``examples/bridge.py``). Every case has the same number of environment st
 are 100 episodes with a selector that samples, with seeds that training never saw. DoorKey is scored
 on MiniGrid's own environment; training steps EnvPool's, or with ``--engine sync`` MiniGrid's own.
 Two runs go side by side (``--processes``), so the seconds are those of a busy machine.
+
+Flat agents: ``flat`` (F0), ``"skill rewards x 0.1"`` and other weights (F1), ``bonus`` (F2). With
+``--f4`` the skills of each hierarchy are also scored without its selector: chosen by lot, and each
+alone. (F3, fine-tuned from another task, does not exist here: there is one task.)
 """
 
 from __future__ import annotations
@@ -23,8 +27,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import cases_asked, median, report, table, workers
+from benchmarks.pay.agents import by_lot
+from benchmarks.pay.flat import Flat, with_bonus
+from benchmarks.pay.suite import Shaped
 from examples import bridge, doorkey
-from skillweave import PPO, Hierarchy, Lengths, Together
+from skillweave import PPO, Array, Hierarchy, Lengths, Run, Together
 
 FLOOR = Together(floor=1.0, floor_final=0.1)
 
@@ -41,6 +48,8 @@ class Task:
     """Of the steps apart, how many parts each skill gets, and last the selector."""
     apart: Mapping[str, Any]
     """Settings where skills learn apart."""
+    cells: Callable[[Array], Array]
+    """Observations (n, …) to whole numbers (n, k): what ``bonus`` counts visits of."""
     has_engines: bool = True
     """``--engine`` is about it."""
 
@@ -51,13 +60,15 @@ def _doorkey(size: str) -> Task:
     # With less entropy `goal` settles too early; far from it a decision is worth 0.02.
     explores = doorkey.algorithm(ent_coef=0.03)
     apart = {"episode_calls": 8, "call_cost": 0.001, "algorithm": explores}
-    return Task(declare, doorkey.algorithm, parts, apart)
+    return Task(declare, doorkey.algorithm, parts, apart, lambda obs: obs.reshape(len(obs), -1))
 
 
 TASKS = {
     "8x8": _doorkey("8x8"),
     "16x16": _doorkey("16x16"),
-    "bridge": Task(bridge.declare, bridge.algorithm, (4, 5, 5, 3, 3), {}, has_engines=False),
+    "bridge": Task(
+        bridge.declare, bridge.algorithm, (4, 5, 5, 3, 3), {}, lambda obs: obs[:, :5], False
+    ),
 }
 
 
@@ -86,18 +97,40 @@ def then(task: Task, steps: int, **how: Any) -> Hierarchy:
     return apart(task, steps // 2, learn="apart, then together", together_steps=steps // 2, **how)
 
 
-def no_least_deviation(task: Task, steps: int) -> Hierarchy:
+def no_least_deviation(task: Task, steps: int, **how: Any) -> Hierarchy:
     """The critic's errors are made as large as a success, where nothing was won yet."""
     who = task.algorithm(min_advantage_std=0.0)
-    return together(task, steps, algorithm=who, selector=who)
+    return together(task, steps, algorithm=who, selector=who, **how)
 
 
-CASES: dict[str, Callable[..., Hierarchy]] = {
+def less_entropy(task: Task, steps: int, **how: Any) -> Hierarchy:
+    """Apart, skills have no more entropy than together."""
+    return apart(task, steps, algorithm=task.algorithm(), **how)
+
+
+def flat(task: Task, steps: int, weight: float = 0.0, bonus: float = 0.0, **how: Any) -> Flat:
+    """One plain agent that learns as the skills do.
+
+    Args:
+        weight: of the skills' rewards, which it has beside the task's (F1).
+        bonus: for the first visit of a cell (F2).
+    """
+    hierarchy = together(task, steps, **how)
+    agent = Flat(hierarchy.spec, hierarchy.algorithm, steps)
+    if weight:
+        weights = {skill.name: weight for skill in hierarchy.skills}
+        agent.learns = Shaped(list(hierarchy.skills), weights, task_weight=1.0)
+    if bonus:
+        agent.learns_in = with_bonus(hierarchy.spec, task.cells, bonus)
+    return agent
+
+
+CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "together": together,
     "apart": apart,
     "then": then,
     "one call an episode": functools.partial(apart, episode_calls=1),
-    "less entropy": lambda task, steps: apart(task, steps, algorithm=task.algorithm()),
+    "less entropy": less_entropy,
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
@@ -107,39 +140,63 @@ CASES: dict[str, Callable[..., Hierarchy]] = {
     "task advantage": functools.partial(together, together=replace(FLOOR, task_weight=1.0)),
     "lengths": functools.partial(together, call_steps=Lengths(4, ..., 64)),
     "interrupt": functools.partial(together, interrupt=True),
-    "flat": together,
+    "flat": flat,
+    **{f"skill rewards x {w}": functools.partial(flat, weight=w) for w in (1.0, 0.3, 0.1, 0.03)},
+    "bonus": functools.partial(flat, bonus=0.1),
 }
-"""By name, a hierarchy of a task, with so many steps."""
+"""By name, who learns a task in so many steps."""
 
 
-def one(case: str, task: str, steps: int, engine: str, seed: int) -> dict[str, Any]:
+def one(case: str, task: str, steps: int, engine: str, f4: bool, seed: int) -> dict[str, Any]:
     """Train and score in this process."""
     started = time.perf_counter()
+    declare = functools.partial(CASES[case], TASKS[task], steps)
+    if TASKS[task].has_engines:
+        declare = functools.partial(declare, engine=engine)
     with tempfile.TemporaryDirectory() as folder:
-        how = {"engine": engine} if TASKS[task].has_engines else {}
-        hierarchy = CASES[case](TASKS[task], steps, **how)
-        run = hierarchy.train(Path(folder) / "run", seed=seed, quiet=True, flat=case == "flat")
+        learner, path = declare(), Path(folder) / "run"
+        if isinstance(learner, Flat):
+            run = learner.run(path, seed)
+        else:
+            run = learner.train(path, seed=seed, quiet=True)
         seconds = time.perf_counter() - started
-        found = run.evaluate(100, deterministic=False)
+        score, usage = solved(run)
         stages = run.info()["stages"]
-    spent = sum(s["steps"] + s["evaluation_steps"] for s in stages)
+        told = {"seed": seed, "solved": score, "usage": usage, "seconds": seconds}
+        if f4 and not isinstance(learner, Flat):
+            told["f4"] = without_selector(run, declare(), Path(folder) / "lot", seed)
+    told["steps"] = sum(s["steps"] + s["evaluation_steps"] for s in stages)
     kept = stages[-1].get("kept")
-    usage = found.to_json()["skill_usage"]
-    solved = float(np.mean(np.array(found.returns) > 0))
-    told = {"seed": seed, "solved": solved, "steps": spent, "seconds": seconds, "usage": usage}
     return told | ({} if kept is None else {"kept": kept})
+
+
+def solved(run: Run, **how: Any) -> tuple[float, dict[str, float]]:
+    """The share of 100 episodes that is solved, and how much each skill acted in them."""
+    found = run.evaluate(100, deterministic=False, **how)
+    return float(np.mean(np.array(found.returns) > 0)), found.to_json()["skill_usage"]
+
+
+def without_selector(run: Run, same: Hierarchy, path: Path, seed: int) -> dict[str, float]:
+    """F4: what skills that were learnt solve when chosen by lot, and each when called alone."""
+    policy: Any = run.policy
+    for skill, learnt in zip(same.skills, policy.skills.policies, strict=True):
+        skill.policy = learnt
+    chosen = by_lot(same, seed).train(path, seed=seed, quiet=True)
+    alone = {skill.name: solved(run, skill=skill.name)[0] for skill in same.skills}
+    return {"by lot": solved(chosen)[0]} | alone
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", choices=TASKS, default="8x8")
     parser.add_argument("--engine", choices=("auto", "sync"), default="auto")
+    parser.add_argument("--f4", action="store_true", help="score skills without the selector, too")
     asked = cases_asked(parser, CASES, steps=500_000)
     rows, found = [], {}
     with workers(asked.processes) as pool:
         futures = {
             case: [
-                pool.submit(one, case, asked.task, asked.steps, asked.engine, s)
+                pool.submit(one, case, asked.task, asked.steps, asked.engine, asked.f4, s)
                 for s in asked.seeds
             ]
             for case in asked.cases
@@ -150,7 +207,9 @@ def main() -> None:
                 runs.append(future.result())
                 told = runs[-1]
                 said = f"{case}, seed {told['seed']}: {told['solved']:.0%} solved"
-                print(said, told["usage"], told.get("kept", ""), flush=True)
+                print(
+                    said, told["usage"], *(told[k] for k in ("kept", "f4") if k in told), flush=True
+                )
             solved = [r["solved"] for r in runs]
             seconds = f"{median(r['seconds'] for r in runs):.0f}"
             steps = f"{median(r['steps'] for r in runs):,.0f}"

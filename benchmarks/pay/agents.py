@@ -101,19 +101,7 @@ class Bench:
             self._save(run, task, SINGLE, 0, started, each[best].returns, {best: 1.0})
 
     def _random(self, task: Task, skills: Policies) -> Hierarchy:
-        """F4: of the skills that may start, any, all equally likely."""
-        hierarchy = self.suite.hierarchy(task, skills)
-        rng, all_skills = np.random.default_rng(self.seed), list(hierarchy.skills)
-        if isinstance(hierarchy.call_steps, Lengths):
-            lengths = hierarchy.call_steps.steps
-            hierarchy.call_steps = lengths[len(lengths) // 2]
-
-        def anyone(obs: Array) -> Array:
-            allowed = np.stack([s.initiation(obs) for s in all_skills], axis=1)
-            found: Array = np.where(allowed, rng.random(allowed.shape), -1.0).argmax(axis=1)
-            return found
-
-        return replace_selector(hierarchy, anyone)
+        return by_lot(self.suite.hierarchy(task, skills), self.seed)
 
     def _ready(self, task: Task, agent: str, hierarchy: Hierarchy) -> Run:
         """The run of a hierarchy in which nobody learns."""
@@ -239,3 +227,17 @@ def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:
         hierarchy.env, skills, call_steps=hierarchy.call_steps, selector=selector,
         reflexes=hierarchy.reflexes, greedy_skills=hierarchy.greedy_skills,
     )  # fmt: skip
+
+
+def by_lot(hierarchy: Hierarchy, seed: int) -> Hierarchy:
+    """F4: of the skills that may start, any, all equally likely."""
+    rng, skills, calls = np.random.default_rng(seed), hierarchy.skills, hierarchy.call_steps
+
+    def anyone(obs: Array) -> Array:
+        allowed = np.stack([s.initiation(obs) for s in skills], axis=1)
+        found: Array = np.where(allowed, rng.random(allowed.shape), -1.0).argmax(axis=1)
+        return found
+
+    if isinstance(calls, Lengths):
+        hierarchy.call_steps = calls.steps[len(calls.steps) // 2]
+    return replace_selector(hierarchy, anyone)
