@@ -45,6 +45,7 @@ class Experience:
     advantage: Array | None = None  # (T, N) float32, what counts beside the learner's own
     guide: Array | None = None  # (T, N, A) float32, logits of a ready selector's choice
     overridden: Array | None = None  # (T, N) bool, a reflex acted, not ``action``; None: nowhere
+    decided: Array | None = None  # (T, N) bool, a call begins here; of critics of skills
     parts: tuple[Experience, ...] = ()
     """Of a selector: what its skills did in the same steps, those that learn, in their order."""
     spent: int = 0
@@ -82,6 +83,7 @@ class Rollout:
     advantage: Tensor | None = None  # (P, T, B), what counts beside the learner's own advantage
     guide: Tensor | None = None  # (P, T, B, A), logits of a ready selector's choice
     overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted instead; None: nowhere
+    decided: Tensor | None = None  # (P, T, B) bool, a call begins here; of critics of skills
     anchor: Anchor | None = None  # the policy to stay near
     progress: float = 0.0  # share of the budget that is spent, for schedules
 

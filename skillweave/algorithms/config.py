@@ -152,6 +152,8 @@ class SkillCritic(OnPolicy):
     """Adam's ε."""
     max_grad_norm: float = 0.5
     """Gradients are scaled down to this norm."""
+    deciding: bool = False
+    """It also learns what it is worth to decide anew, which interruption asks for."""
     min_advantage_std: float = 0.05
     """The task's advantages of a smaller deviation, in units of reward, are divided by this."""
     floor: float = 0.0

@@ -45,7 +45,9 @@ class SkillCriticAlgorithm(Algorithm):
         action_space: gym.spaces.Discrete,
     ) -> None:
         super().__init__(config, observation_space, action_space)
-        self.net = Net("critic", self.obs, config.network, int(action_space.n))
+        self.skills = int(action_space.n)
+        outputs = self.skills + config.deciding  # the last one: deciding anew
+        self.net = Net("critic", self.obs, config.network, outputs)
         self.acting = self.layout = Layout(self.net.shapes)
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> AgentState:
@@ -66,12 +68,13 @@ class SkillCriticAlgorithm(Algorithm):
         noise: Any,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, None]:
-        """The skill that is worth most, and what each is worth in deviations of the return.
+        """The skill that is worth most, and what each is worth in deviations of the return; last
+        what it is worth to decide anew, with ``deciding``.
 
         Where the selector still draws calls to try them, worths differ less: few calls are cut.
         """
         worth = self.net(params.views, self.inputs(params, obs)) * params.extra.get("trust", 1.0)
-        return worth.argmax(-1), worth, None
+        return worth[..., : self.skills].argmax(-1), worth, None
 
     def acting_params(
         self, state: AgentState, progress: float = 1.0, device: Device = "cpu"
@@ -90,7 +93,7 @@ class SkillCriticAlgorithm(Algorithm):
     def value(self, state: AgentState, obs: Tensor, mask: Tensor | None = None) -> Tensor:
         """What the best skill is worth, (P, B), in units of reward."""
         params = self.learning_params(state)
-        worth = self.net(params.views, self.inputs(params, obs)).amax(-1)
+        worth = self.net(params.views, self.inputs(params, obs))[..., : self.skills].amax(-1)
         return worth * state.return_scale + state.return_mean
 
     def advantage(self, state: AgentState, rollout: Rollout) -> Tensor:
@@ -112,14 +115,22 @@ class SkillCriticAlgorithm(Algorithm):
         leaves = self.layout.leaves(state.params)
         inputs = self.inputs(self.learning_params(state), obs)
         action, size = _valid(batch, batch.action), target.shape[1]
+        decided = None
+        if cfg.deciding:
+            assert batch.decided is not None
+            decided = _valid(batch, batch.decided)
         rate, loss = state.learning_rate * (1.0 - batch.progress), target.new_zeros(len(target))
         parts = max(1, round(size / cfg.batch_size))
         for _ in range(cfg.update_epochs):
             order = torch.stack([torch.randperm(size, generator=g) for g in rng]).to(target.device)
             for rows in order.chunk(parts, dim=1):
                 own = {k: take_rows(v, rows) for k, v in inputs.items()}
-                worth = self.net(leaves, own).gather(2, take_rows(action, rows)[..., None])
-                loss = value_loss(worth.squeeze(-1), take_rows(target, rows))
+                worth, goal = self.net(leaves, own), take_rows(target, rows)
+                chosen = worth.gather(2, take_rows(action, rows)[..., None])
+                loss = value_loss(chosen.squeeze(-1), goal)
+                if decided is not None:  # V(s) = Σ π(k | s) Q(s, k), learnt where one decided
+                    here = take_rows(decided, rows)
+                    loss = loss + value_loss(worth[..., -1], goal, valid=here)
                 grad = self.layout.gradient(loss, leaves)
                 clip_grad_norm_(grad, torch.full_like(rate, cfg.max_grad_norm))
                 adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=cfg.adam_eps)

@@ -49,6 +49,7 @@ class RolloutStore:
             "terminated": e.terminated, "next_obs": e.next_obs, "last": last,
             "obs_mask": e.obs_mask, "head": e.head, "starts": e.starts,
             "advantage": e.advantage, "overridden": e.overridden, "guide": e.guide,
+            "decided": e.decided,
         }  # fmt: skip
         rows = {k: x for k, x in found.items() if x is not None}
         if valid.all():

@@ -244,15 +244,18 @@ class SkillSet:
         return stuck
 
     def _interrupt(self, how: Interruption, running: Array, obs: Array, why: Array) -> None:
-        """Cut calls where another skill that may start is worth more, in place."""
+        """Cut calls where it is worth more to decide anew, in place."""
         rows = np.flatnonzero(why == Why.RUNNING)
         if not len(rows):
             return
-        worth = how.worth(obs[rows])
-        may = self.startable(obs[rows])[:, :: max(1, len(self.lengths))]
-        best = np.where(may, worth, -np.inf).max(axis=1)
+        worth, n = how.worth(obs[rows]), len(self.skills)
         own = worth[np.arange(len(rows)), running[rows]]
-        why[rows[best - own > how.margin]] = Why.INTERRUPTED
+        if worth.shape[1] > n:
+            anew = worth[:, n]
+        else:  # critics of older versions: the best skill is called then
+            may = self.startable(obs[rows])[:, :: max(1, len(self.lengths))]
+            anew = np.where(may, worth, -np.inf).max(axis=1)
+        why[rows[anew - own > how.margin]] = Why.INTERRUPTED
 
     def succeeded(self, memory: Memory, rows: Array, step: Step, why: Array) -> Array:
         """(k,) bool: the calls of environments ``rows`` (k,) that are over and have succeeded.

@@ -26,7 +26,7 @@ class Why(IntEnum):
     LIMIT = 2
     """It had lasted as long as it may: ``max_steps``, or ``call_steps``."""
     INTERRUPTED = 3
-    """The selector cut it, as another skill was worth more."""
+    """The selector cut it, as it was worth more to decide anew."""
     EPISODE = 4
     """The episode ended, or has just begun: there is no call."""
 
@@ -36,10 +36,10 @@ class Interruption:
     """When a call is cut (Sutton, Precup & Singh 1999, sec. 4)."""
 
     worth: Callable[[Array], Array]
-    """Observations (n, …) to what each skill is worth there, (n, S), in deviations of the return.
-    """
+    """Observations (n, …) to what each skill is worth there, and last what it is worth to decide
+    anew, (n, S + 1), in deviations of the return; of older versions the skills alone, (n, S)."""
     margin: float
-    """By how much another skill must be worth more, in the same unit."""
+    """By how much deciding anew must be worth more, in the same unit."""
     critic: Policy | None = None
     """Who says what skills are worth, where it is trained."""
 

@@ -132,9 +132,7 @@ class WovenCollector(DecisionCollector):
         assert self._rows is not None
         self._rows.put(step, self.kept["leaf"], self._fresh, mask, self.engine.mask())
         truncated = raw.truncated & ~raw.terminated
-        self._rows.put_critic(
-            "", self._all, self._calls["skill"], raw.reward, raw.terminated, truncated
-        )
+        self._rows.put_critic(self.root, self._all, raw.reward, raw.terminated, truncated)
         self._walk(self.root, self._all, step, why)
         self._rows.next()
 
@@ -169,8 +167,7 @@ class WovenCollector(DecisionCollector):
         inside, part = level.below[i], self._part_of(level, i, mine, step)
         reward, terminated = judged(level.skills.skills[i], part, mine, why)
         over = (why != Why.RUNNING) & ~terminated
-        running = self._calls[f"{inside.prefix}skill"][mine]
-        self._rows.put_critic(inside.path, mine, running, reward, terminated, over)
+        self._rows.put_critic(inside, mine, reward, terminated, over)
         if inside.selector is not None:
             gamma = self._gammas[inside.path + SELECTOR]
             own = self._calls[inside.prefix + ENDED][mine] != Why.RUNNING

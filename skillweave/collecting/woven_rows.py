@@ -91,16 +91,17 @@ class Rows:
 
     def put_critic(
         self,
-        path: str,
+        level: Level,
         mine: Array,
-        skill: Array,
         reward: Array,
         terminated: Array,
         truncated: Array,
     ) -> None:
-        """Write what the step was to the level of ``path``, of whose skills ``skill`` (k,) acts."""
-        if (rows := self._critics.get(path)) is not None:
-            rows.put(self._at, mine, skill, reward, terminated, truncated)
+        """Write what the step was to a level, in environments ``mine`` (k,) where it acts."""
+        if (rows := self._critics.get(level.path)) is not None:
+            calls = self._collector._calls
+            skill, elapsed = (calls[f"{level.prefix}{k}"][mine] for k in ("skill", "elapsed"))
+            rows.put(self._at, mine, skill, elapsed == 1, reward, terminated, truncated)
 
     def next(self) -> None:
         """The row is full."""
@@ -133,7 +134,7 @@ class Rows:
             obs=self._obs, action=rows.skill, reward=rows.reward,
             steps=np.ones(rows.skill.shape, np.int64), terminated=rows.terminated,
             truncated=rows.truncated, next_obs=self._next_obs,
-            valid=None if rows.valid.all() else rows.valid,
+            valid=None if rows.valid.all() else rows.valid, decided=rows.decided,
         )  # fmt: skip
 
 
@@ -143,18 +144,20 @@ class CriticRows:
     def __init__(self, lead: tuple[int, int]) -> None:
         self.skill, self.reward = np.zeros(lead, np.int64), np.zeros(lead, np.float32)
         self.terminated, self.truncated = np.zeros(lead, bool), np.zeros(lead, bool)
-        self.valid = np.zeros(lead, bool)
+        self.valid, self.decided = np.zeros(lead, bool), np.zeros(lead, bool)
 
     def put(
         self,
         at: int,
         mine: Array,
         skill: Array,
+        decided: Array,
         reward: Array,
         terminated: Array,
         truncated: Array,
     ) -> None:
         """Write row ``at`` of environments ``mine`` (k,)."""
         self.skill[at, mine], self.reward[at, mine] = skill, reward
+        self.decided[at, mine] = decided
         self.terminated[at, mine], self.truncated[at, mine] = terminated, truncated
         self.valid[at, mine] = True

@@ -59,7 +59,8 @@ def _together(declaration: Declaration, seen_as: Skill | None) -> Stage:
     ready = declaration.ready_selector is not None
     config = declaration.algorithm if ready else _with_floor(declaration.selector, how)
     beside = _learners(declaration, how)
-    beside |= _critic(config) if how.task_weight or declaration.interrupt else {}
+    if how.task_weight or declaration.interrupt:
+        beside |= _critic(config, declaration.interrupt)
     target = target_of(declaration.selector_target_return, None, TOGETHER)
     return Stage(
         TOGETHER,
@@ -97,7 +98,7 @@ def _learners(declaration: Declaration, how: Together) -> dict[str, AlgorithmCon
         selects: Any = inner.algorithm
         if isinstance(inner.selector, AlgorithmConfig):
             own[SELECTOR] = selects = _with_floor(inner.selector, how)
-        own |= _critic(selects) if inner.interrupt else {}
+        own |= _critic(selects, deciding=True) if inner.interrupt else {}
         found |= {f"{skill.name}/{name}": config for name, config in own.items()}
     return found
 
@@ -129,7 +130,7 @@ def _with_floor(config: Any, how: Together) -> Any:
     return config
 
 
-def _critic(own: Any) -> dict[str, AlgorithmConfig]:
+def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
     """The critic of skills; it sees and discounts as a selector with the settings ``own`` does."""
     shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(own, PPO):
@@ -140,7 +141,7 @@ def _critic(own: Any) -> dict[str, AlgorithmConfig]:
         shared |= {f: getattr(own, f) for f in same}
     if "network" in shared:  # the critic remembers nothing
         shared["network"] = replace(shared["network"], rnn=None)
-    return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs)}
+    return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs, deciding=deciding)}
 
 
 def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
@@ -182,6 +183,6 @@ def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
     nats = declaration.guide_nats
     last = Stage(SELECTOR, "selector", config, budget, calls, target, guide_nats=nats)
     if declaration.interrupt:
-        how, beside = declaration.together, _critic(config)
+        how, beside = declaration.together, _critic(config, deciding=True)
         last = replace(last, beside=beside, together=how, interrupt=True)
     return [*first, last]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave.algorithms.config import SkillCritic
+from skillweave.algorithms.config import SkillCritic, config_from_json, config_to_json
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.experience import Rollout
 from skillweave.networks.config import Network
@@ -79,3 +79,38 @@ def test_while_skills_are_tried_they_differ_less_in_worth_so_that_few_calls_are_
     for progress, share in ((0.0, 0.0), (0.5, 0.4), (1.0, 1.0)):
         params = algorithm.acting_params(state, progress)
         torch.testing.assert_close(algorithm.act(params, obs, None, None)[1], share * whole)
+
+
+def test_it_learns_what_deciding_is_worth_where_one_decided():
+    algorithm, state = critic(deciding=True, update_epochs=10, gae_lambda=0.0)
+    # Four columns, each two calls of one step: skill 0 pays 1, and skill 1 pays 0. In state 0 skill
+    # 0 is chosen once in four decisions, in state 1 always. Rows in state 2 are no decisions.
+    at = torch.tensor([[0, 0, 0, 0], [1, 1, 2, 2]])
+    action = torch.tensor([[0, 1, 1, 1], [0, 0, 0, 0]])
+    eye, one = torch.eye(3), torch.ones(1, 2, 4)
+    rollout = Rollout(
+        obs=eye[at][None], next_obs=eye[at][None], action=action[None],
+        reward=(action[None] == 0).float(), discount=0.0 * one, last=one.bool(),
+        decided=(at != 2)[None],
+    )  # fmt: skip
+    for i in range(200):
+        rollout.progress = i / 200
+        state, _ = algorithm.update(state, rollout, [torch.Generator().manual_seed(i)])
+    best, worth, _ = algorithm.act(algorithm.learning_params(state), eye[None], None, None)
+    found = worth[0] * (state.return_var + 1e-8).sqrt() + state.return_mean
+    assert worth.shape == (1, 3, 3)
+    assert found[0].tolist() == pytest.approx([1.0, 0.0, 0.25], abs=0.03)
+    assert found[1, [0, 2]].tolist() == pytest.approx([1.0, 1.0], abs=0.03)
+    # Where nobody decided nothing was learnt of it; the best is a skill, not to decide.
+    assert abs(found[2, 2] - 1.0) > 0.1
+    assert best[0, 0] == 0
+    assert algorithm.value(state, eye[None])[0, 0].item() == pytest.approx(1.0, abs=0.03)
+
+
+def test_critics_of_older_versions_do_not_know_what_deciding_is_worth():
+    algorithm, state = critic()
+    told = config_to_json(algorithm.config)
+    del told["deciding"]
+    assert not config_from_json(told).deciding
+    worth = algorithm.act(algorithm.learning_params(state), torch.eye(3)[None], None, None)[1]
+    assert worth.shape == (1, 3, 2)

@@ -150,8 +150,15 @@ def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
     assert continued > 5 or call_steps == 5
 
 
-def test_a_call_is_cut_where_another_skill_is_worth_clearly_more():
-    worth = np.array([[0.0, 1.0, 3.0], [0.0, 1.0, 1.4], [2.0, 1.0, 3.0], [0.0, 0.0, 0.0]])
+# Of three skills; the last column, where there is one, is what deciding anew is worth.
+BEST = np.array([[0.0, 1.0, 3.0], [0.0, 1.0, 1.4], [2.0, 1.0, 3.0], [0.0, 0.0, 0.0]])
+ANEW = np.array(
+    [[0.0, 1.0, 9.0, 1.6], [0.0, 1.0, 9.0, 1.4], [2.0, 1.0, 3.0, 3.1], [0.0, 9.0, 9.0, 0.0]]
+)
+
+
+@pytest.mark.parametrize("worth", [BEST, ANEW], ids=["of an older version", "deciding anew"])
+def test_a_call_is_cut_where_it_is_worth_clearly_more_to_decide_anew(worth):
     skills = tuple(kind() for kind in (Down, Stay, Down))
     policy = Stay.policy
     cuts = Interruption(lambda obs: worth[obs[:, T].astype(int)], 0.5)
@@ -164,6 +171,24 @@ def test_a_call_is_cut_where_another_skill_is_worth_clearly_more():
     step = Step(obs, np.ones(4, int), obs, np.zeros(4), no, no, no, np.ones(4, int), {})
     why = found.observe(memory, rows, step)
     assert why.tolist() == [Why.INTERRUPTED, Why.RUNNING, Why.RUNNING, Why.RUNNING]
+
+
+@pytest.mark.parametrize("margin", [None, 0.5])
+def test_a_critic_is_told_where_calls_begin(margin):
+    collector = collector_of(5, margin)
+    for request in itertools.islice(asked(40), 3):
+        open_steps = collector.kept["tau"] * ~collector.kept["over"]
+        experience = collector.collect(request).experience
+        *_, stream = experience.parts
+        for n in range(N):
+            begins = np.zeros(40, bool)
+            at = -int(open_steps[n])
+            for _, steps in calls_of(experience, n):
+                begins[max(0, at)] |= at >= 0
+                at += steps
+            assert (stream.decided[:at, n] == begins[:at]).all()
+            assert stream.decided[at:, n].sum() <= 1  # the call that is open at the end
+            assert begins.sum() > 3
 
 
 def test_a_choice_is_a_skill_and_a_length():
