@@ -1,8 +1,11 @@
 """What each skill's call is worth to the task: Q(s, skill), learnt from every step.
 
 One critic serves the skills, which may count the task's advantage beside their own (Zhang &
-Whiteson 2019, "DAC"), and interruption, which asks whether another skill is worth more (Sutton,
-Precup & Singh 1999, sec. 4).
+Whiteson 2019, "DAC"), and interruption. A call is cut where its skill is worth less than V(s) =
+Σ π(k | s) Q(s, k), which is what it is worth to decide anew (Sutton, Precup & Singh 1999, sec. 4).
+π is what the selector does while it learns, so V is learnt from its decisions. The best Q in place
+of V would be too much: the selector does not always call that skill, and the best of several
+estimates is mostly one that is too high.
 """
 
 from __future__ import annotations

@@ -96,7 +96,7 @@ class Declaration(Nestable):
     """What the selector pays for each decision while it learns, in units of reward, so that calls
     which change nothing are worth less. More than the discounted reward makes long calls best."""
     interrupt: bool = False
-    """The selector cuts a call where another skill is clearly worth more (``Together.margin``)."""
+    """The selector cuts a call where deciding anew is worth clearly more (``Together.margin``)."""
     together: Together = field(default_factory=Together)
     """How skills and selector learn together."""
     selector_target_return: float | None = None

@@ -136,7 +136,7 @@ class HierarchyPolicy:
 
 
 def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:
-    """The same skills, whose calls are cut where a trained critic finds another one better."""
+    """The same skills, whose calls are cut where a trained critic would rather decide anew."""
     return replace(skills, interruption=Interruption(critic.heads, margin, critic))
 
 

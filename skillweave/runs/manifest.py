@@ -42,7 +42,7 @@ class NestedEntry(TypedDict):
     call_steps: Positive | None
     call_lengths: NotRequired[list[Positive]]
     interrupt: NotRequired[float | None]
-    """By how much another skill must be worth more for a call to be cut."""
+    """By how much deciding anew must be worth more for a call to be cut."""
     learn: NotRequired[Literal["apart", "together", "apart, then together"]]
     greedy_skills: bool | None
     """None: found out at the end of learning together, and written there (``kept``)."""

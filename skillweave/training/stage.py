@@ -97,7 +97,7 @@ class Together:
     """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
     for skills that learn by PPO."""
     margin: float = 0.2
-    """A call is cut where another skill is worth so much more, in deviations of the return."""
+    """A call is cut where it is worth so much more to decide anew, in deviations of the return."""
     anchor_nats: float | None = 0.05
     """How far, in nats of KL, skills that were trained before by PPO may move; None: freely. A
     skill whose calls succeeded in a share p of its own stage, at its end, may move 1/p times as
