@@ -10,7 +10,8 @@ Two runs go side by side (``--processes``), so the seconds are those of a busy m
 
 Flat agents: ``flat`` (F0), ``"skill rewards x 0.1"`` and other weights (F1), ``bonus`` (F2). With
 ``--f4`` the skills of each hierarchy are also scored without its selector: chosen by lot, and each
-alone. (F3, fine-tuned from another task, does not exist here: there is one task.)
+alone. F2 trains in MiniGrid's own environment. (F3, fine-tuned from another task, does not exist
+here: there is one task.)
 """
 
 from __future__ import annotations
@@ -170,9 +171,9 @@ def one(case: str, task: str, steps: int, engine: str, f4: bool, seed: int) -> d
     return told | ({} if kept is None else {"kept": kept})
 
 
-def solved(run: Run, **how: Any) -> tuple[float, dict[str, float]]:
+def solved(run: Run, greedy: bool = False, **how: Any) -> tuple[float, dict[str, float]]:
     """The share of 100 episodes that is solved, and how much each skill acted in them."""
-    found = run.evaluate(100, deterministic=False, **how)
+    found = run.evaluate(100, deterministic=greedy, **how)
     return float(np.mean(np.array(found.returns) > 0)), found.to_json()["skill_usage"]
 
 
@@ -181,8 +182,9 @@ def without_selector(run: Run, same: Hierarchy, path: Path, seed: int) -> dict[s
     policy: Any = run.policy
     for skill, learnt in zip(same.skills, policy.skills.policies, strict=True):
         skill.policy = learnt
+    greedy = same.greedy_skills = policy.skills.greedy  # as in the run itself
     chosen = by_lot(same, seed).train(path, seed=seed, quiet=True)
-    alone = {skill.name: solved(run, skill=skill.name)[0] for skill in same.skills}
+    alone = {s.name: solved(run, greedy, skill=s.name)[0] for s in same.skills}
     return {"by lot": solved(chosen)[0]} | alone
 
 

@@ -246,6 +246,14 @@ def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
         assert critic.floor == (0.7 if how else Together().floor)
 
 
+def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():
+    for learn in ("together", "apart", "apart, then together"):
+        *_, stage = training.stages_of(declare(learn=learn, interrupt=True))
+        assert stage.beside["skill_critic"].deciding
+    (stage,) = training.stages_of(declare(together=Together(task_weight=0.5)))
+    assert not stage.beside["skill_critic"].deciding
+
+
 def test_the_critic_divides_advantages_by_as_much_as_the_selector_does():
     selector = replace(ON, min_advantage_std=7.0)
     (stage,) = training.stages_of(declare(interrupt=True, selector=selector))

@@ -132,8 +132,9 @@ class SkillCriticAlgorithm(Algorithm):
                 chosen = worth.gather(2, take_rows(action, rows)[..., None])
                 loss = value_loss(chosen.squeeze(-1), goal)
                 if decided is not None:  # V(s) = Σ π(k | s) Q(s, k), learnt where one decided
-                    here = take_rows(decided, rows)
-                    loss = loss + value_loss(worth[..., -1], goal, valid=here)
+                    # A row counts as much as one of Q, however few decisions there are.
+                    anew = torch.where(take_rows(decided, rows), worth[..., -1], goal)
+                    loss = loss + value_loss(anew, goal)
                 grad = self.layout.gradient(loss, leaves)
                 clip_grad_norm_(grad, torch.full_like(rate, cfg.max_grad_norm))
                 adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=cfg.adam_eps)

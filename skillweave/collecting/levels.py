@@ -107,7 +107,7 @@ def woven(
 
 def _worth(critic: Acting) -> Callable[[Array], Array]:
     def worth(obs: Array) -> Array:
-        """What each skill is worth in observations (n, …), (n, S)."""
+        """What each skill is worth in observations (n, …), and deciding anew, (n, S + 1)."""
         found = critic.these(obs, None, None).head
         assert found is not None
         return found

@@ -34,7 +34,7 @@ class WovenCollector(DecisionCollector):
         skills: those that learn have any policy; ``Inner`` where one is a hierarchy.
         learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
             ``skill_critic`` and ``inner/skill_critic`` say what skills are worth.
-        margins: by the paths of critics: calls are cut where another skill is worth so much more.
+        margins: by the paths of critics: calls are cut where deciding anew is worth so much more.
         guide, seen_as: as of ``DecisionCollector``.
     """
 

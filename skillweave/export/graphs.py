@@ -128,7 +128,8 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
 
 
 def worth_graph(critic: AgentPolicy, where: str) -> Graph:
-    """A skill critic: inputs ``obs…``, output ``worth`` (1, S)."""
+    """A skill critic: inputs ``obs…``, output ``worth`` (1, S), or (1, S + 1) where it knows
+    what deciding anew is worth."""
     given = {leaf.name: leaf.example() for leaf in leaves_of(critic.observation_space)}
     return Graph(traced(_Worth(critic), given, ["worth"], where))
 

@@ -159,9 +159,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call i
         if told["termination"] and runner.asks(told["termination"], runner.step(*own)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
-            worth, n = self.critic.act(None), len(self.skills)
-            anew = (worth[n:] if len(worth) > n else worth[self.may_start()]).max(initial=-np.inf)
-            self.why = INTERRUPTED if anew - worth[self.skill] > self.told["margin"] else RUNNING
+            worth, may, margin = self.critic.act(None), self.may_start(), self.told["margin"]
+            gain = (worth[len(may) :] if len(worth) > len(may) else worth[may]) - worth[self.skill]
+            self.why = INTERRUPTED if may.any() and any(gain > margin) else RUNNING
         judge, self.succeeded = told["success"], self.why == OWN
         if judge and self.why != RUNNING:
             self.succeeded = runner.asks(judge, runner.step(*own))

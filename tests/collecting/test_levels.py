@@ -180,7 +180,9 @@ class One:
         stuck = inner_over and not ended and not any(self.may(now))
         over = stops or ended or limit or stuck
         reward = float(said(node, "reward", step))
-        self.critic.append((what[0], self.skill, reward, stops, over and not stops))
+        self.critic.append(
+            (what[0], self.skill, reward, stops, over and not stops, self.lasted == 1)
+        )
         if self.open is not None:
             self.open["reward"] += INNER ** self.open["steps"] * reward
             self.open["steps"] += 1
@@ -230,16 +232,19 @@ def test_decisions_of_both_levels_are_what_calls_mean(node, outer, inner):
                 assert row["reward"] == pytest.approx(reward, abs=1e-4)
                 assert row["terminated"] == terminated
         own = itertools.chain(*(_rows(r[f"{name}/skill_critic"], n) for r in rows))
-        for row, (obs, skill, reward, stops, cut) in zip(own, one.critic, strict=True):
+        for row, (obs, skill, reward, stops, cut, begins) in zip(own, one.critic, strict=True):
             np.testing.assert_array_equal(row["obs"], obs)
             assert (row["action"], row["terminated"], row["truncated"]) == (skill, stops, cut)
+            assert row["decided"] == begins
             assert row["reward"] == pytest.approx(reward, abs=1e-4)
     assert ends[1] > 5
     assert ends.sum() > 60
 
 
 def _rows(experience, n):
-    names = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs")
+    names = ["obs", "action", "reward", "steps", "terminated", "truncated", "next_obs"]
+    if experience.decided is not None:
+        names.append("decided")
     for t in valid_rows(experience, n):
         yield {k: getattr(experience, k)[t, n] for k in names}
 

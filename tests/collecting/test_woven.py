@@ -173,6 +173,28 @@ def test_a_call_is_cut_where_it_is_worth_clearly_more_to_decide_anew(worth):
     assert why.tolist() == [Why.INTERRUPTED, Why.RUNNING, Why.RUNNING, Why.RUNNING]
 
 
+class Nowhere(Down):
+    """May start at the first step alone."""
+
+    def initiation(self, obs):
+        return obs[:, T] == 0
+
+
+@pytest.mark.parametrize("columns", [2, 3])
+def test_a_call_goes_on_where_no_skill_may_start(columns):
+    worth = np.array([0.0, 9.0, 9.0])[:columns]
+    cuts = Interruption(lambda obs: np.tile(worth, (len(obs), 1)), 0.5)
+    skills = (Nowhere(), Nowhere())
+    found = SkillSet(skills, (Stay.policy,) * 2, call_steps=9, interruption=cuts)
+    memory, rows = found.start(2), np.arange(2)
+    found.begin(memory, rows, np.array([0, 0]))
+    obs = np.zeros((2, 3), np.float32)
+    obs[1, T] = 1
+    no = np.zeros(2, bool)
+    step = Step(obs, np.ones(2, int), obs, np.zeros(2), no, no, no, np.ones(2, int), {})
+    assert found.observe(memory, rows, step).tolist() == [Why.INTERRUPTED, Why.RUNNING]
+
+
 @pytest.mark.parametrize("margin", [None, 0.5])
 def test_a_critic_is_told_where_calls_begin(margin):
     collector = collector_of(5, margin)

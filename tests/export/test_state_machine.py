@@ -152,11 +152,33 @@ def guided(guide: Any, **how: Any) -> HierarchyPolicy:
     return HierarchyPolicy(network(skills.choices, seed=6), skills, Guide(asked))
 
 
-def interrupted() -> HierarchyPolicy:
-    algorithm = SkillCritic(network=Network((8,)), normalize_obs=False)
-    critic = agent(algorithm, OBS, gym.spaces.Discrete(3), seed=2)
-    skills = with_interruption(skill_set(Careful, Left, Free, call_steps=9), critic, 0.5)
-    return trained(skills)
+def critic_of(skills: int, **how: Any) -> Any:
+    algorithm = SkillCritic(network=Network((8,)), normalize_obs=False, **how)
+    return agent(algorithm, OBS, gym.spaces.Discrete(skills), seed=2)
+
+
+def interrupted(margin: float, **how: Any) -> HierarchyPolicy:
+    skills = skill_set(Careful, Left, Free, call_steps=9)
+    return trained(with_interruption(skills, critic_of(3, **how), margin))
+
+
+class Steady(Even):
+    """Starts and ends at even positions: at odd ones nobody could follow."""
+
+    max_steps = None
+
+    def termination(self, step: Step) -> Array:
+        return step.next_obs[:, POSITION] % 2 == 0
+
+
+class Steadier(Steady):
+    policy = network(3, seed=8)
+
+
+def never_alone() -> HierarchyPolicy:
+    """Calls are cut wherever a skill may start, as it seems."""
+    skills = skill_set(Steady, Steadier, call_steps=None)
+    return trained(with_interruption(skills, critic_of(2, deciding=True), -100.0))
 
 
 AUTOMATON = Automaton(
@@ -174,7 +196,9 @@ POLICIES: dict[str, Any] = {
     )),
     "nested": nested,
     "nested, waiting": waiting,
-    "interrupted": interrupted,
+    "interrupted": lambda: interrupted(0.02, deciding=True),
+    "interrupted where somebody may start": never_alone,
+    "interrupted, of an older version": lambda: interrupted(0.5),
     "an automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
     "a guide": lambda: guided(AUTOMATON),
     "a guide of lengths": lambda: guided(
@@ -213,8 +237,9 @@ def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
     assert decisions == {True, False}
 
 
-def test_why_calls_are_interrupted_is_the_same(tmp_path: Path) -> None:
-    policy = interrupted()
+@pytest.mark.parametrize("deciding", [True, False])
+def test_why_calls_are_interrupted_is_the_same(tmp_path: Path, deciding: bool) -> None:
+    policy = interrupted(0.02 if deciding else 0.5, deciding=deciding)
     export = write_export(tmp_path, policy, "walk")
     runner = Runner(tmp_path, export.functions)
     env, player, whys = LongWalk(), Player(policy), set()
