@@ -61,14 +61,21 @@ def _doorkey(size: str) -> Task:
     # With less entropy `goal` settles too early; far from it a decision is worth 0.02.
     explores = doorkey.algorithm(ent_coef=0.03)
     apart = {"episode_calls": 8, "call_cost": 0.001, "algorithm": explores}
-    return Task(declare, doorkey.algorithm, parts, apart, lambda obs: obs.reshape(len(obs), -1))
+    return Task(
+        declare, doorkey.algorithm, parts, apart, cells=lambda obs: obs.reshape(len(obs), -1)
+    )
 
 
 TASKS = {
     "8x8": _doorkey("8x8"),
     "16x16": _doorkey("16x16"),
     "bridge": Task(
-        bridge.declare, bridge.algorithm, (4, 5, 5, 3, 3), {}, lambda obs: obs[:, :5], False
+        bridge.declare,
+        bridge.algorithm,
+        (4, 5, 5, 3, 3),
+        {},
+        cells=lambda obs: obs[:, :5],
+        has_engines=False,
     ),
 }
 

@@ -23,6 +23,7 @@ from skillweave import (
 )
 from skillweave.cli import main
 from skillweave.envs.make import make_engine
+from skillweave.hierarchy import training
 from skillweave.hierarchy.judging import settled
 from skillweave.hierarchy.nesting import every_hierarchy, every_skill
 from skillweave.runs.directory import RunDirectory
@@ -450,3 +451,10 @@ def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(sta
     assert tuple(own.greedy_skills for _, own in every_hierarchy(found)) == greedy
     said = settled(declare(inside(greedy_skills=False), greedy_skills=True), run)
     assert [own.greedy_skills for _, own in every_hierarchy(said)] == [True, False]
+
+
+def test_critics_learn_what_deciding_is_worth_at_every_level_where_calls_are_cut():
+    (stage,) = training.stages_of(KINDS["interrupted"]())
+    critics = {k: c for k, c in stage.beside.items() if k.endswith("skill_critic")}
+    assert len(critics) == 2
+    assert all(critic.deciding for critic in critics.values())

@@ -173,7 +173,7 @@ def test_a_call_is_cut_where_it_is_worth_clearly_more_to_decide_anew(worth):
     assert why.tolist() == [Why.INTERRUPTED, Why.RUNNING, Why.RUNNING, Why.RUNNING]
 
 
-class Nowhere(Down):
+class AtFirst(Down):
     """May start at the first step alone."""
 
     def initiation(self, obs):
@@ -184,7 +184,7 @@ class Nowhere(Down):
 def test_a_call_goes_on_where_no_skill_may_start(columns):
     worth = np.array([0.0, 9.0, 9.0])[:columns]
     cuts = Interruption(lambda obs: np.tile(worth, (len(obs), 1)), 0.5)
-    skills = (Nowhere(), Nowhere())
+    skills = (AtFirst(), AtFirst())
     found = SkillSet(skills, (Stay.policy,) * 2, call_steps=9, interruption=cuts)
     memory, rows = found.start(2), np.arange(2)
     found.begin(memory, rows, np.array([0, 0]))

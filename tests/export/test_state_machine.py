@@ -175,8 +175,8 @@ class Steadier(Steady):
     policy = network(3, seed=8)
 
 
-def never_alone() -> HierarchyPolicy:
-    """Calls are cut wherever a skill may start, as it seems."""
+def always_better() -> HierarchyPolicy:
+    """Deciding anew is always worth more, so calls are cut wherever a skill may start."""
     skills = skill_set(Steady, Steadier, call_steps=None)
     return trained(with_interruption(skills, critic_of(2, deciding=True), -100.0))
 
@@ -197,7 +197,7 @@ POLICIES: dict[str, Any] = {
     "nested": nested,
     "nested, waiting": waiting,
     "interrupted": lambda: interrupted(0.02, deciding=True),
-    "interrupted where somebody may start": never_alone,
+    "interrupted where somebody may start": always_better,
     "interrupted, of an older version": lambda: interrupted(0.5),
     "an automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
     "a guide": lambda: guided(AUTOMATON),
