@@ -20,10 +20,12 @@ from skillweave import (
     EnvSpec,
     Evolution,
     Hierarchy,
+    Lengths,
     Mutations,
     Network,
     Reflex,
     Skill,
+    Together,
 )
 from skillweave.api import Agent, Run
 
@@ -180,6 +182,21 @@ KINDS: dict[str, Kind] = {
             selector=DQN(**REPLAYS), selector_steps=300,
         ),
         evolve=Evolution(**EVOLVES | {"population": 2, "generations": 2}),
+    ),
+    "together": Kind(
+        lambda: Hierarchy(
+            EnvSpec(CART, engine="sync"), [Left(), Leaning()], call_steps=Lengths(2, 4, 8),
+            interrupt=True, learn="together", together_steps=1200, cut_every=300,
+            together=Together(quota=1.0),  # so that a checkpoint holds rows to learn from
+            algorithm=PPO(**LEARNS, network=NET), selector=PPO(**LEARNS, network=NET),
+        ),
+    ),
+    "apart, then together, replay": Kind(
+        lambda: Hierarchy(
+            EnvSpec(CART, engine="sync"), [Left(), Leaning()], call_steps=4,
+            learn="apart, then together", skill_steps=200, selector_steps=200, together_steps=400,
+            cut_every=100, algorithm=DQN.rainbow(**REPLAYS), selector=SAC(**REPLAYS),
+        ),
     ),
     "population, replay": Kind(
         lambda: alone(EnvSpec(CART, engine="sync"), DQN(**REPLAYS), 300),

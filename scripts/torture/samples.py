@@ -285,6 +285,17 @@ SAMPLES: dict[str, Sample] = {
         unfinished(KINDS["population, replay"], 2), resumed(KINDS["population, replay"]),
         share=0.1,
     ),
+    "unfinished replay": Sample(
+        unfinished(KINDS["replay of continuous actions"], 3),
+        resumed(KINDS["replay of continuous actions"]), share=0.04,
+    ),
+    "unfinished together": Sample(
+        unfinished(KINDS["together"], 2), resumed(KINDS["together"]), share=0.04
+    ),
+    "unfinished together, replay": Sample(
+        unfinished(KINDS["apart, then together, replay"], 8),
+        resumed(KINDS["apart, then together, replay"]), share=0.04,
+    ),
     "weights": Sample(
         weights("skills and selector"), weights_file(KINDS["skills and selector"])
     ),

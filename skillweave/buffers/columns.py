@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 from torch import Tensor
 
+from skillweave.buffers.held import check_columns
 from skillweave.buffers.ram import check_memory
 from skillweave.experience import Experience
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
@@ -144,6 +145,7 @@ class Columns:
 
         Raises:
             SkillweaveError: it is of other settings, or of an older version.
+            ValueError: a number in it is none that is written here.
         """
         if "newest" not in state:
             raise SkillweaveError(
@@ -159,6 +161,7 @@ class Columns:
         self._rewards = np.zeros(max(self._rewards_used, len(self._rewards)), np.float32)
         copy_into({"newest": self.newest}, state)
         copy_into(self.written(), state)
+        check_columns(self.written(), self._mask_size)
 
     def written(self) -> dict[str, Array]:
         """Views of all that was written, by name."""

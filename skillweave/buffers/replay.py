@@ -110,6 +110,7 @@ class ReplayStore:
             mask_size=mask_size, each=4 * prioritized * (members if shared else 1),
             keep_rewards=shared,
         )  # fmt: skip
+        self.num_envs = num_envs
         self._n_step, self._between = n_step, between and n_step > 1
         self._device = torch.device(device)
         # Columns that a member draws from, and the first of them.

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.buffers.held import ONE_ROW, check_held
 from skillweave.experience import Anchor, Experience, Rollout
-from skillweave.spaces import to_tensor
+from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array, unprefixed
 
 
@@ -98,11 +100,19 @@ class RolloutStore:
         parts = {str(i): held for i, held in enumerate(self._held)}
         return {f"{i}.{k}": x.clone() for i, held in parts.items() for k, x in held.items()}
 
-    def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from a ``state``."""
-        self._held = []
-        while held := unprefixed(str(len(self._held)), state):
-            self._held.append(held)
+    def load(
+        self, state: dict[str, Tensor], observation_space: gym.Space[Any], codec: ActionCodec
+    ) -> None:
+        """Go on from a ``state``, of who acts in these spaces.
+
+        Raises:
+            ValueError: it does not fit; see ``check_held``.
+        """
+        held: list[dict[str, Tensor]] = []
+        while rows := unprefixed(str(len(held)), state):
+            held.append(rows)
+        check_held(held, self._members, observation_space, codec)
+        self._held = held
 
     def _valid_rows(self) -> int:
         """Of the member that has the fewest."""
@@ -160,11 +170,7 @@ def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     return {k: torch.cat([_padded(k, h[k], t) for h in held], 2) for k in held[0]}
 
 
-_ONE_ROW = ("memory", "log_std")
-"""Fields that have one row, however many there are of the others."""
-
-
 def _padded(name: str, x: Tensor, t: int) -> Tensor:
     """A field (P, T, B, …) with ``t`` rows: its first is repeated, but is not valid there."""
-    more = x[:, :1].expand(-1, 0 if name in _ONE_ROW else t - x.shape[1], *x.shape[2:])
+    more = x[:, :1].expand(-1, 0 if name in ONE_ROW else t - x.shape[1], *x.shape[2:])
     return torch.cat([x, torch.zeros_like(more) if name in ("valid", "last") else more], 1)

@@ -10,6 +10,7 @@ import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.columns import as_wide
+from skillweave.collecting.restored import check_numbers, opened
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, checksums
 from skillweave.experience import Experience
@@ -54,6 +55,8 @@ class Collector:
             "memory": np.zeros((n, size), np.float32),  # the learner's
         }
         """What is kept of each environment, (N, …) each; changed in place."""
+        self.ranges: dict[str, range] = {}
+        """By names of these, what numbers that choose among something may be."""
         self.open: dict[str, Array] = {}
         """The same of what has a shape that is known only when it begins."""
         self.begun = False
@@ -141,14 +144,10 @@ class Collector:
                     f"where {own.dtype} {own.shape} belongs: it is not of this stage, or damaged"
                 )
             own[:] = found
+        check_numbers(self.kept, self.ranges)
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs, self.begun = np.array(obs), True
-        self.open = {k: v.copy() for k, v in unprefixed("open", state).items()}
-        for k, v in self.open.items():  # files hold observations as bytes if they are structured
-            if k.rpartition(".")[2] == "obs":
-                self.open[k] = v.view(self.obs.dtype).reshape(self.obs.shape)
-        if any(len(v) != self.num_envs for v in self.open.values()):
-            raise ValueError("what is kept of open calls is of another number of environments")
+        self.open = opened(unprefixed("open", state), self.kept, self.obs)
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         return self._begin_anew(np.union1d(early, other))
 

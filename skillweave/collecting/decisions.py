@@ -14,6 +14,7 @@ from skillweave.collecting.collector import Collector
 from skillweave.collecting.ends import Why, judged, skill_step
 from skillweave.collecting.guide import Guide, tell_guide
 from skillweave.collecting.open_calls import Decisions, OpenCalls
+from skillweave.collecting.restored import ranges_of, ranges_of_guide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import told_success
@@ -56,6 +57,7 @@ class DecisionCollector(Collector):
         self._calls: Memory = skills.start(n)  # what the skills remember of each environment
         self._never = np.zeros(n, bool)
         self.kept |= prefixed("skills", self._calls)
+        self.ranges |= prefixed("skills", ranges_of(skills)) | ranges_of_guide(guide)
         self.kept["over"] = np.zeros(n, bool)  # there is no call: the selector must decide
         if guide is not None:
             self.kept |= guide.start(n)

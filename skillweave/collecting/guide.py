@@ -30,6 +30,11 @@ class Ready(Protocol):
 
     skills: tuple[str, ...]
 
+    @property
+    def ranges(self) -> dict[str, range]:
+        """What numbers in its memory may be, of those that choose among something, by name."""
+        ...
+
     def start(self, n: int) -> Memory:
         """The memory of n environments whose episodes begin."""
         ...

@@ -55,6 +55,7 @@ class OpenCalls:
         if skills.restricts or guide is not None:
             self.kept["allowed"] = np.ones((n, skills.choices), bool)  # when it decided
         collector.kept |= {prefix + k: v for k, v in self.kept.items()}
+        collector.ranges[f"{prefix}choice"] = range(skills.choices)
 
     def begin(
         self, ids: Array, obs: Array, choice: Array, acted: Acted, before: Array | None

@@ -57,6 +57,7 @@ class WovenCollector(DecisionCollector):
         self.overridden = np.zeros(self.num_envs, bool) if apart else None
         """(N,), where reflexes acted in the latest step; None: there are none."""
         self.kept["leaf"] = np.zeros(self.num_envs, np.int64)  # who acted last; 0: nobody yet
+        self.ranges["leaf"] = range(self.root.end)
         self._fresh = self._never  # the leaf that acts begins to
         self._rows: Rows | None = None
 

@@ -175,9 +175,12 @@ class GymnasiumEngine:
     def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
         """Play the open episodes again; observations (N, *obs_shape), and who ended early."""
         self._root = int(state["root"][0])
-        for name in ("episode", "seed"):
-            if state[name].shape != (self.num_envs,) or state[name].dtype.kind != "i":
+        for name, most in (("episode", 2**62), ("seed", 2**31)):
+            found = state[name]
+            if found.shape != (self.num_envs,) or found.dtype.kind != "i":
                 raise ValueError(f"{name} is no whole number for each environment")
+            if not ((found >= 0) & (found < most)).all():
+                raise ValueError(f"{name} is out of its range")
         self._episode, self._seed = state["episode"].copy(), state["seed"].copy()
         self._history.load(state)
         obs, early = self._begin(self._all), [np.zeros(0, np.int64)]

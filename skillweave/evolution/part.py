@@ -25,7 +25,7 @@ from skillweave.training.arena import returns_of
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.loop import Progress, train
-from skillweave.training.replay_learner import ReplayLearner, store_of
+from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -193,6 +193,8 @@ class Part:
             store: what the replay buffer kept; empty where there is none.
         """
         self._kept = unprefixed("kept", saved)
+        if self._kept:
+            check_counts(self._kept, self.num_envs)
         arrays = {k: v.numpy() for k, v in saved.items()}
         self.episodes.load(unprefixed("episodes", arrays))
         if store:

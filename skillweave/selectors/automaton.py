@@ -102,6 +102,11 @@ class Automaton(ReadySelector):
                 found.ranks[i, number] = len(numbers) - place
         return found
 
+    @property
+    def ranges(self) -> dict[str, range]:
+        """Its states."""
+        return {"state": range(len(self.state_names))}
+
     def start(self, n: int) -> Memory:
         """Memory of ``n`` environments in the first state."""
         return {"state": np.full(n, self.state_names.index(self.start_state))}

@@ -24,6 +24,11 @@ class ReadySelector(Foreign):
         super().__init__(name)
         self.skills: tuple[str, ...] = ()
 
+    @property
+    def ranges(self) -> dict[str, range]:
+        """What numbers in its memory may be, of those that choose among something, by name."""
+        return {}
+
     def among(self, skills: tuple[str, ...]) -> Self:
         """A copy that chooses among the skills of these names, in the hierarchy's order.
 

@@ -47,6 +47,11 @@ class TreeSelector(ReadySelector):
         found._top = found._plan.add(self.root, lambda name: found._number(name, "tree: a leaf"))
         return found
 
+    @property
+    def ranges(self) -> dict[str, range]:
+        """Its leaves, and −1 for none."""
+        return {"leaf": range(-1, len(self._plan.skills))}
+
     def start(self, n: int) -> Memory:
         """Nothing is under way."""
         return {

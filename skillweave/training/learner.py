@@ -129,7 +129,8 @@ class RolloutLearner:
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint kept."""
-        self._store.load(kept)
+        algorithm = self._stack.algorithm
+        self._store.load(kept, algorithm.observation_space, algorithm.codec)
         if self.anchor is not None:
             coef = kept["anchor_coef"]
             if coef.shape != self.anchor.coef.shape or not bool(coef.isfinite().all()):

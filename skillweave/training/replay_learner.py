@@ -174,6 +174,7 @@ class ReplayLearner:
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint kept."""
+        check_counts(kept, self.store.num_envs)
         self._transitions = kept["transitions"].numpy().copy()
         if "returns" in kept:
             self._returns = kept["returns"].numpy().copy()
@@ -189,6 +190,24 @@ class ReplayLearner:
         """The columns of a stack's members."""
         each = experience.reward.shape[1] // self.members
         return slice(self._first[stack] * each, self._first[stack + 1] * each)
+
+
+def check_counts(kept: dict[str, Tensor], num_envs: int) -> None:
+    """Raise a ValueError where ``ReplayLearner.counts`` cannot be gone on from."""
+    made = kept["transitions"]
+    if made.shape != (2,) or made.dtype != torch.float64:
+        raise ValueError(f"the number of its transitions is {made.dtype} {tuple(made.shape)}")
+    # A clean cut is made after learning, so nothing was collected since.
+    learnt, now = made.tolist()
+    if learnt != now or not 0.0 <= now < 2.0**53:
+        raise ValueError(f"it has learnt from {learnt} of {now} transitions")
+    returns = kept.get("returns")
+    if returns is not None and (
+        returns.shape != (num_envs,)
+        or returns.dtype != torch.float32
+        or not bool(returns.isfinite().all())
+    ):
+        raise ValueError("the returns of its open episodes are no row of numbers")
 
 
 def store_of(

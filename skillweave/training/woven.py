@@ -34,7 +34,7 @@ from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.training.stage_log import StageLog, success_rate
 from skillweave.training.trainer import OneAgent, StageRun
 from skillweave.training.woven_learner import WovenLearner, decides
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
 
 def agents_of(stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> OneAgent:
@@ -125,6 +125,8 @@ class WovenAgents(OneAgent):
         found = WovenLearner(parts, self.node, self.together)
         if extra:
             told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
+            if not ((told >= 0) & (told < 2**53)).all():
+                raise SkillweaveError(f"{log.run.path}: its counts of rows and updates are none")
             found.counts = dict(zip(parts, told.tolist(), strict=True))
         return found
 

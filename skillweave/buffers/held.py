@@ -1,0 +1,112 @@
+"""Whether rows that a checkpoint holds, of either store, can be learnt from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.spaces import ActionCodec, obs_dtype, obs_shape, to_tensor
+from skillweave.types import Array
+
+DTYPES = {
+    "reward": torch.float32, "steps": torch.int64, "terminated": torch.bool, "last": torch.bool,
+    "valid": torch.bool, "advantage": torch.float32, "starts": torch.bool,
+    "overridden": torch.bool, "decided": torch.bool, "obs_mask": torch.bool,
+    "head": torch.float32, "guide": torch.float32, "memory": torch.float32,
+    "log_std": torch.float32,
+}  # fmt: skip
+"""Of all fields but observations and actions."""
+NEEDED = {"obs", "next_obs", "action", "reward", "steps", "terminated", "last", "valid"}
+ONE_ROW = ("memory", "log_std")
+"""Fields that have one row, however many there are of the others."""
+VECTORS = ("obs_mask", "head", "guide", *ONE_ROW)
+"""Fields that have several numbers for each row."""
+
+
+def check_held(
+    held: Sequence[Mapping[str, Tensor]],
+    members: int,
+    observation_space: gym.Space[Any],
+    codec: ActionCodec,
+) -> None:
+    """Raise a ValueError where rows do not fit together, or into the spaces of who learns.
+
+    Args:
+        held: of each experience, fields (P, T, B, …).
+        members: P.
+        codec: of the actions.
+    """
+    obs = to_tensor(np.zeros((1, *obs_shape(observation_space)), obs_dtype(observation_space)))
+    for rows in held:
+        # Where all actions are allowed, an experience has no mask.
+        names, first = rows.keys() - {"obs_mask"}, held[0].keys() - {"obs_mask"}
+        if names != first or not NEEDED <= names <= NEEDED | DTYPES.keys():
+            raise ValueError(f"its rows hold {', '.join(sorted(rows))}")
+        lead = rows["valid"].shape
+        if len(lead) != 3 or lead[0] != members or 0 in lead:
+            raise ValueError(f"its rows are {tuple(lead)} for {members} members")
+        for name, x in rows.items():
+            _check_field(name, x, lead, obs, codec)
+        _check_actions(rows["action"], codec)
+        if int(rows["steps"].min()) < 1:
+            raise ValueError("a row of it took no step")
+
+
+def _check_field(
+    name: str, x: Tensor, lead: tuple[int, ...], obs: Tensor, codec: ActionCodec
+) -> None:
+    """Dtype, shape, and that all are numbers."""
+    dtype, item = DTYPES.get(name), tuple(x.shape[3:]) if name in VECTORS else ()
+    if name in ("obs", "next_obs"):
+        dtype, item = obs.dtype, tuple(obs.shape[1:])
+    elif name == "action":
+        dtype = torch.int64 if codec.discrete else torch.float32
+        width = len(codec.parts) if codec.discrete else codec.size
+        item = () if codec.discrete and not codec.multi else (width,)
+    rows = 1 if name in ONE_ROW else lead[1]
+    columns = {lead[2], 1} if name == "log_std" else {lead[2]}
+    shapes = [(lead[0], rows, n, *item) for n in columns]
+    if x.dtype != dtype or tuple(x.shape) not in shapes or (name in VECTORS and len(item) != 1):
+        raise ValueError(f"{name!r} of its rows is {x.dtype} {tuple(x.shape)}")
+    if x.is_floating_point() and bool(x.isnan().any()):
+        raise ValueError(f"{name!r} of its rows holds NaN")
+
+
+def _check_actions(action: Tensor, codec: ActionCodec) -> None:
+    """That discrete actions are among those that there are."""
+    if codec.discrete:
+        most = torch.tensor(codec.parts if codec.multi else codec.parts[0])
+        if not bool(((action >= 0) & (action < most)).all()):
+            raise ValueError("an action of its rows does not exist")
+
+
+def check_columns(written: Mapping[str, Array], actions: int) -> None:
+    """Raise a ValueError where a replay buffer holds numbers that are never written.
+
+    Args:
+        written: as of ``Columns.written``.
+        actions: how many there are; 0: they are no numbers of actions.
+    """
+    w, steps = written, written.get("steps", np.ones(1))
+    action, newest = w["action"], w["newest"]
+    right: dict[str, Any] = {
+        "kind": (w["kind"] <= 2).all(),
+        "newest": ((newest >= -1) & (newest < 2**53)).all(),
+        "action": not actions or action.dtype.kind not in "iu"
+        or ((action >= 0) & (action < actions)).all(),
+        "steps": ((steps >= 1) & (steps < 2**31)).all(),
+    }  # fmt: skip
+    for name, array in w.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            right[name] = name == "obs" and not np.isnan(array).any()
+    if "call" in w:
+        held = w["kind"] > 0
+        call = w["call"][held]
+        right["call"] = ((call >= 0) & (call + steps[held] <= len(w["rewards"]))).all()
+    if wrong := [name for name, found in right.items() if not found]:
+        raise ValueError(f"{wrong[0]!r} of its replay buffer holds what is never written there")

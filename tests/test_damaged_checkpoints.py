@@ -1,0 +1,124 @@
+"""A checkpoint whose checksum is right, but whose numbers cannot be gone on from, is refused."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from scripts.torture.kinds import KINDS
+from scripts.torture.samples import unfinished
+from skillweave import SkillweaveError
+from skillweave.runs.files import read_tensors, write_tensors
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
+
+CUTS = {
+    "together": 2,
+    "apart, then together, replay": 8,
+    "replay of continuous actions": 3,
+    "population, replay": 2,
+}
+"""By kind of training, after how many checkpoints it was stopped."""
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """Each kind's run, made once."""
+    made = {}
+
+    def of(kind):
+        if kind not in made:
+            made[kind] = tmp_path_factory.mktemp("stopped")
+            unfinished(KINDS[kind], CUTS[kind])(made[kind])
+        return made[kind] / "run"
+
+    return of
+
+
+def infinite(x):
+    return torch.full_like(x, torch.inf)
+
+
+def missing(x):
+    return None
+
+
+DAMAGES = {
+    "infinite": infinite,
+    "NaN": lambda x: torch.full_like(x, torch.nan),
+    "negative": lambda x: torch.full_like(x, -3),
+    "far too large": lambda x: x + 200,
+    "doubles": lambda x: x.double(),
+    "one more axis": lambda x: x[..., None].contiguous(),
+    "flat": lambda x: x.flatten(),
+    "empty": lambda x: x.flatten()[:0],
+    "missing": missing,
+    "short of a row": lambda x: x[:, :-1].contiguous(),
+    "one more": lambda x: x + torch.arange(len(x)),
+}
+LEFT, STORE = "learner.left.0", "learner.left.store"
+CASES = [
+    ("population, replay", "kept.transitions", "infinite"),
+    ("population, replay", "kept.transitions", "empty"),
+    ("replay of continuous actions", "learner.transitions", "infinite"),
+    ("replay of continuous actions", "learner.transitions", "one more"),
+    ("replay of continuous actions", "learner.store.obs", "missing"),
+    ("replay of continuous actions", "learner.store.action", "NaN"),
+    ("replay of continuous actions", "collector.0.engine.episode", "negative"),
+    ("replay of continuous actions", "collector.0.kept.sums", "NaN"),
+    ("apart, then together, replay", "learner.selector.transitions", "negative"),
+    ("apart, then together, replay", f"{STORE}.action", "far too large"),
+    ("apart, then together, replay", f"{STORE}.reward", "infinite"),
+    ("apart, then together, replay", f"{STORE}.kind", "far too large"),
+    ("apart, then together, replay", "learner.selector.store.steps", "negative"),
+    ("apart, then together, replay", f"{STORE}.priority", "infinite"),
+    ("apart, then together, replay", "collector.0.kept.choice", "far too large"),
+    ("together", f"{LEFT}.reward", "flat"),
+    ("together", f"{LEFT}.reward", "doubles"),
+    ("together", f"{LEFT}.obs", "one more axis"),
+    ("together", f"{LEFT}.obs", "NaN"),
+    ("together", f"{LEFT}.next_obs", "short of a row"),
+    ("together", f"{LEFT}.action", "far too large"),
+    ("together", f"{LEFT}.steps", "negative"),
+    ("together", f"{LEFT}.valid", "missing"),
+    ("together", f"{LEFT}.head", "missing"),
+    ("together", "collector.0.kept.skills.skill", "far too large"),
+    ("together", "collector.0.kept.skills.skill", "negative"),
+    ("together", "collector.0.kept.leaf", "far too large"),
+    ("together", "collector.0.kept.choice", "negative"),
+    ("together", "collector.0.open.head", "doubles"),
+    ("together", "collector.0.open.head", "NaN"),
+    ("together", "collector.0.open.obs", "missing"),
+    ("together", "counts", "negative"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "damage"), CASES)
+def test_numbers_that_are_never_written_are_refused(stopped, tmp_path, kind, name, damage):
+    run = tmp_path / "run"
+    shutil.copytree(stopped(kind), run)
+    _change(run, name, DAMAGES[damage])
+    with pytest.raises(SkillweaveError) as error:
+        KINDS[kind].declare().resume(run, quiet=True)
+    assert str(run) in str(error.value)
+
+
+def _change(run: Path, name: str, damage):
+    """Write the checkpoint anew with one tensor changed; there is none before it."""
+    (run / "checkpoint.previous.safetensors").unlink(missing_ok=True)
+    path = run / "checkpoint.safetensors"
+    tensors, header = read_tensors(path)
+    (full,) = [k for k in tensors if k.endswith(f".{name}")]
+    tensors[full] = damage(tensors[full])
+    if tensors[full] is None:
+        del tensors[full]
+    header.pop("sha256", None)
+    write_tensors(path, tensors, header, make_directories=False)
+
+
+@pytest.mark.parametrize("kind", CUTS)
+def test_what_is_not_damaged_is_gone_on_from(stopped, tmp_path, kind):
+    run = tmp_path / "run"
+    shutil.copytree(stopped(kind), run)
+    assert KINDS[kind].declare().resume(run, quiet=True).info()["status"] == "done"
