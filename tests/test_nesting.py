@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from small_runs import MEMORY, OFF, ON, Balance, Left, Push, Whole, lines, policies, stopped_run
@@ -84,6 +85,40 @@ def three():
     return Hierarchy(skills=[Left(), middle], **options(call_steps=7, learn="together"))
 
 
+class InParts(gym.ObservationWrapper):
+    """CartPole that shows cart and pole apart."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        part = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.observation_space = gym.spaces.Dict(cart=part, pole=part)
+
+    def observation(self, observation):
+        return {"cart": observation[:2], "pole": observation[2:]}
+
+
+class LeansLeft(Skill):
+    """Is paid for a pole that leans to the left."""
+
+    def reward(self, step):
+        return -step.next_obs["pole"][:, 0]
+
+
+class LeansRight(Skill):
+    """Is paid for a pole that leans to the right."""
+
+    def reward(self, step):
+        return step.next_obs["pole"][:, 0]
+
+
+def in_parts():
+    env = replace(CARTPOLE, wrappers=[InParts])
+    inner = inside(LeansLeft(), LeansRight(), env=env)
+    return Hierarchy(
+        skills=[LeansRight(), inner], **options(call_steps=7, learn="together", env=env)
+    )
+
+
 BUSY = {"call_steps": Lengths(1, ..., 8), "interrupt": True}
 SHORT = {"skill_steps": 100, "selector_steps": 100, "together_steps": 300}
 MODES = Automaton({"low": ["balance", "right"], "high": "right"}, {
@@ -108,6 +143,7 @@ KINDS = {
         inside(Balance(), learn="apart, then together", together_steps=200)
     ),
     "three": three,
+    "observations in parts": in_parts,
     "guides": lambda: declare(
         inside(guide=MODES, guide_nats=0.05, reflexes=[Reflex(leans, 0)]),
         learn="together",

@@ -126,6 +126,19 @@ class Priorities:
         """No slot has a priority."""
         self._trees.leaves[:] = 0.0
 
-    def rebuild(self) -> None:
-        """Sum everything anew, after what ``written`` gave was written to."""
+    def rebuild(self, member: Array, slot: Array) -> None:
+        """Sum everything anew, after what ``written`` gave was written to.
+
+        Args:
+            member, slot: (K,), where a transition is, so there must be a priority.
+
+        Raises:
+            ValueError: those are no priorities.
+        """
+        leaves = self._trees.leaves
+        for found in leaves, self._highest:
+            if not np.isfinite(found).all() or (found < 0).any():
+                raise ValueError("a priority of its replay buffer is negative or not finite")
+        if not leaves[member, slot].all():
+            raise ValueError("a transition of its replay buffer has no priority")
         self._trees.rebuild()

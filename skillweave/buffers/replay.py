@@ -223,12 +223,13 @@ class ReplayStore:
 
         Raises:
             SkillweaveError: it is of other settings, or of an older version.
+            ValueError: a number in it is none that is written here.
         """
         self._columns.load(state)
         if self._priorities is not None:
             self._priorities.forget()
             copy_into(self._written_priorities(), state)
-            self._priorities.rebuild()
+            self._priorities.rebuild(*self._places(self._columns.data["kind"].nonzero()[0]))
 
     def _written_priorities(self) -> dict[str, Array]:
         if self._priorities is None:

@@ -164,6 +164,9 @@ def resumed(log: StageLog, restore: Callable[[], T]) -> T:
     """
     try:
         return restore()
+    except SkillweaveError as error:
+        run = str(log.run.path)
+        raise error if run in str(error) else SkillweaveError(f"{run}: {error}") from error
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise SkillweaveError(
             f"{log.run.path}: the checkpoint of stage {log.entry['name']!r} does not hold "

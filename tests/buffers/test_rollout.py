@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.experience import Experience, Rollout
-from skillweave.spaces import obs_dtype
+from skillweave.spaces import action_codec, obs_dtype
 
 T, P, B, A, M = 3, 2, 2, 3, 5
 GAMMA = torch.tensor([0.9, 0.5])
+SPACE, CODEC = gym.spaces.Box(-1, 1, (2,)), action_codec(gym.spaces.Discrete(1000))
 
 
 def experience(rows=T, terminated=(), truncated=(), steps=1, columns=P * B) -> Experience:
@@ -235,7 +236,7 @@ def test_each_experience_keeps_the_deviation_that_it_was_acted_with():
     e = experience(2)
     e.valid = np.array([[1, 0, 1, 1], [1, 0, 0, 1]], bool)  # a column of member 0 is empty
     store.add(e, first)
-    again.load(store.state())
+    again.load(store.state(), SPACE, CODEC)
     for each in store, again:
         each.add(experience(3), second)
         r = each.rollout(GAMMA)
@@ -294,7 +295,7 @@ def test_a_state_goes_on_exactly_and_is_a_copy():
     for _ in range(3):
         store.add(e)
     other.add(experience())  # gives way
-    other.load(store.state())
+    other.load(store.state(), SPACE, CODEC)
     found = []
     for each in store, other:
         assert each.rollout(GAMMA) is None
