@@ -74,7 +74,8 @@ class Columns:
         """(N,) the newest slot of each column, counted from its first one ever."""
         self._column = np.arange(num_envs)
         self._open = np.zeros(num_envs, bool)  # the trajectory goes on there
-        self._mask_size, self._keeps_rewards = mask_size or 0, keep_rewards
+        self._space, self._mask_size = observation_space, mask_size or 0
+        self._keeps_rewards = keep_rewards
         # The rewards of calls one after another; "call" says where those of a slot begin.
         self._rewards, self._rewards_used = np.zeros(64 * keep_rewards, np.float32), 0
 
@@ -161,7 +162,7 @@ class Columns:
         self._rewards = np.zeros(max(self._rewards_used, len(self._rewards)), np.float32)
         copy_into({"newest": self.newest}, state)
         copy_into(self.written(), state)
-        check_columns(self.written(), self._mask_size)
+        check_columns(self.written(), self._space, self._mask_size)
 
     def written(self) -> dict[str, Array]:
         """Views of all that was written, by name."""

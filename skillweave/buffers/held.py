@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.spaces import ActionCodec, obs_dtype, obs_shape, to_tensor
+from skillweave.spaces import ActionCodec, obs_codec, obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array
 
 DTYPES = {
@@ -42,6 +42,7 @@ def check_held(
         codec: of the actions.
     """
     obs = to_tensor(np.zeros((1, *obs_shape(observation_space)), obs_dtype(observation_space)))
+    seen = obs_codec(observation_space)
     for rows in held:
         # Where all actions are allowed, an experience has no mask.
         names, first = rows.keys() - {"obs_mask"}, held[0].keys() - {"obs_mask"}
@@ -52,6 +53,8 @@ def check_held(
             raise ValueError(f"its rows are {tuple(lead)} for {members} members")
         for name, x in rows.items():
             _check_field(name, x, lead, obs, codec)
+        for name in ("obs", "next_obs"):
+            seen.check(rows[name])
         _check_actions(rows["action"], codec)
         if int(rows["steps"].min()) < 1:
             raise ValueError("a row of it took no step")
@@ -73,7 +76,7 @@ def _check_field(
     shapes = [(lead[0], rows, n, *item) for n in columns]
     if x.dtype != dtype or tuple(x.shape) not in shapes or (name in VECTORS and len(item) != 1):
         raise ValueError(f"{name!r} of its rows is {x.dtype} {tuple(x.shape)}")
-    if x.is_floating_point() and bool(x.isnan().any()):
+    if name in DTYPES and x.is_floating_point() and bool(x.isnan().any()):
         raise ValueError(f"{name!r} of its rows holds NaN")
 
 
@@ -85,7 +88,9 @@ def _check_actions(action: Tensor, codec: ActionCodec) -> None:
             raise ValueError("an action of its rows does not exist")
 
 
-def check_columns(written: Mapping[str, Array], actions: int) -> None:
+def check_columns(
+    written: Mapping[str, Array], observation_space: gym.Space[Any], actions: int
+) -> None:
     """Raise a ValueError where a replay buffer holds numbers that are never written.
 
     Args:
@@ -102,11 +107,13 @@ def check_columns(written: Mapping[str, Array], actions: int) -> None:
         "steps": ((steps >= 1) & (steps < 2**31)).all(),
     }  # fmt: skip
     for name, array in w.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            right[name] = name == "obs" and not np.isnan(array).any()
+        if array.dtype.kind == "f":
+            right[name] = right.get(name, True) and np.isfinite(array).all()
     if "call" in w:
         held = w["kind"] > 0
         call = w["call"][held]
         right["call"] = ((call >= 0) & (call + steps[held] <= len(w["rewards"]))).all()
+    rows = np.arange(len(w["kind"]) // len(newest))[:, None] <= newest  # that were written to
+    obs_codec(observation_space).check(to_tensor(w["obs"][rows.ravel()]))
     if wrong := [name for name, found in right.items() if not found]:
         raise ValueError(f"{wrong[0]!r} of its replay buffer holds what is never written there")

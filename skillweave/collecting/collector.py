@@ -147,7 +147,8 @@ class Collector:
         check_numbers(self.kept, self.ranges)
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs, self.begun = np.array(obs), True
-        self.open = opened(unprefixed("open", state), self.kept, self.obs)
+        space = self.engine.observation_space
+        self.open = opened(unprefixed("open", state), self.kept, self.obs, space)
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         return self._begin_anew(np.union1d(early, other))
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.calls import SkillSet, skills_below
+from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Memory, prefixed
 
 
@@ -30,7 +32,12 @@ def check_numbers(kept: Mapping[str, Array], ranges: Mapping[str, range]) -> Non
             raise ValueError(f"{name!r} of open episodes holds NaN")
 
 
-def opened(open_calls: Mapping[str, Array], kept: Mapping[str, Array], obs: Array) -> Memory:
+def opened(
+    open_calls: Mapping[str, Array],
+    kept: Mapping[str, Array],
+    obs: Array,
+    observation_space: gym.Space[Any],
+) -> Memory:
     """What a checkpoint says of open calls, copied; observations as the environments have them.
 
     Args:
@@ -41,18 +48,23 @@ def opened(open_calls: Mapping[str, Array], kept: Mapping[str, Array], obs: Arra
     Raises:
         ValueError: it is not of these environments.
     """
-    found = {}
+    found, codec = {}, obs_codec(observation_space)
     for name, value in open_calls.items():
         if name.replace("/", ".").rpartition(".")[2] == "obs":
             found[name] = value.copy().view(obs.dtype).reshape(obs.shape)
+            codec.check(to_tensor(found[name]))
             continue
         if value.ndim != 2 or len(value) != len(obs) or value.dtype != np.float32:
             raise ValueError(f"{name!r} of open calls is {value.dtype} {value.shape}")
         if np.isnan(value).any():
             raise ValueError(f"{name!r} of open calls holds NaN")
         found[name] = value.copy()
-    if not kept.get("over", np.ones(1, bool)).all() and "obs" not in found:
-        raise ValueError("it does not say where open calls began")
+    if "over" in kept:
+        runs = ~kept["over"]
+        if runs.any() and "obs" not in found:
+            raise ValueError("it does not say where open calls began")
+        if (kept["skills.skill"][runs] < 0).any():
+            raise ValueError("a call is open, and no skill runs")
     return found
 
 

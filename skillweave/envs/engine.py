@@ -174,13 +174,15 @@ class GymnasiumEngine:
 
     def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
         """Play the open episodes again; observations (N, *obs_shape), and who ended early."""
-        self._root = int(state["root"][0])
-        for name, most in (("episode", 2**62), ("seed", 2**31)):
+        n = self.num_envs
+        largest = (("root", 1, 2**63 - 1), ("episode", n, 2**62), ("seed", n, 2**31 - 1))
+        for name, rows, most in largest:
             found = state[name]
-            if found.shape != (self.num_envs,) or found.dtype.kind != "i":
-                raise ValueError(f"{name} is no whole number for each environment")
-            if not ((found >= 0) & (found < most)).all():
+            if found.shape != (rows,) or found.dtype.kind != "i":
+                raise ValueError(f"{name} is {found.dtype} {found.shape}, not whole numbers")
+            if not ((found >= 0) & (found <= most)).all():
                 raise ValueError(f"{name} is out of its range")
+        self._root = int(state["root"][0])
         self._episode, self._seed = state["episode"].copy(), state["seed"].copy()
         self._history.load(state)
         obs, early = self._begin(self._all), [np.zeros(0, np.int64)]

@@ -139,6 +139,20 @@ class ObsCodec:
         nothing = raw[0].new_empty((*lead, 0), dtype=torch.float32)
         return torch.cat(vectors, dim=-1) if vectors else nothing, tuple(images)
 
+    def check(self, obs: Tensor) -> None:
+        """Raise a ValueError where raw observations (*lead, *item) cannot be of this space.
+
+        They hold a number that is not finite, or a choice that does not exist.
+        """
+        for leaf in self.leaves:
+            x = leaf.read(obs)
+            if x.is_floating_point() and not bool(x.isfinite().all()):
+                raise ValueError("an observation is not finite")
+            if leaf.choices:
+                flat = x.reshape(-1, len(leaf.choices)).long() - torch.tensor(leaf.start)
+                if not bool(((flat >= 0) & (flat < torch.tensor(leaf.choices))).all()):
+                    raise ValueError("an observation holds a choice that does not exist")
+
     def pixels(self, image: Tensor, i: int) -> Tensor:
         """Image ``i`` as a network takes it: float32, integers scaled to [0, 1]."""
         peak = self.peaks[i]

@@ -233,7 +233,9 @@ def test_a_run_goes_on_on_ray_and_ends_the_same_though_an_actor_is_killed(
         agent(fatal=fatal).train(tmp_path / "run", quiet=True, evolve=EVOLVE)
     monkeypatch.undo()
     fatal.touch()
-    ray.init(num_cpus=2, include_dashboard=False, logging_level="ERROR", log_to_driver=False)
+    ray.init(
+        "local", num_cpus=2, include_dashboard=False, logging_level="ERROR", log_to_driver=False
+    )
     try:
         with pytest.raises(SkillweaveError, match="begun with 2 collectors, and goes on with as"):
             agent().resume(tmp_path / "run", quiet=True, cluster=Ray(collectors=3))
