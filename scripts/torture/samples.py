@@ -287,14 +287,14 @@ SAMPLES: dict[str, Sample] = {
     ),
     "unfinished replay": Sample(
         unfinished(KINDS["replay of continuous actions"], 3),
-        resumed(KINDS["replay of continuous actions"]), share=0.04,
+        resumed(KINDS["replay of continuous actions"]), share=0.2,
     ),
     "unfinished together": Sample(
-        unfinished(KINDS["together"], 2), resumed(KINDS["together"]), share=0.04
+        unfinished(KINDS["together"], 2), resumed(KINDS["together"]), share=0.2
     ),
     "unfinished together, replay": Sample(
         unfinished(KINDS["apart, then together, replay"], 8),
-        resumed(KINDS["apart, then together, replay"]), share=0.04,
+        resumed(KINDS["apart, then together, replay"]), share=0.2,
     ),
     "weights": Sample(
         weights("skills and selector"), weights_file(KINDS["skills and selector"])
