@@ -32,6 +32,8 @@ from skillweave.api import Agent, Run
 SEED = 3
 """Of every training."""
 CART, TINY = "CartPole-v1", "TortureTiny-v0"
+IN_PYTHON = EnvSpec(CART, engine="sync", workers=1)
+"""One process, said: how many are best is measured, and may differ while other programs run."""
 
 
 class Tiny(gym.Env[Any, Any]):
@@ -128,7 +130,7 @@ EVOLVES: dict[str, Any] = {
 def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
     """Two skills and a selector."""
     return Hierarchy(
-        EnvSpec(CART, engine="sync"), [Left(), Balance()], call_steps=6, algorithm=skill,
+        IN_PYTHON, [Left(), Balance()], call_steps=6, algorithm=skill,
         selector=selector, skill_steps=steps, selector_steps=steps, cut_every=steps // 4,
     )  # fmt: skip
 
@@ -146,11 +148,14 @@ KINDS: dict[str, Kind] = {
         lambda: woven(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS))
     ),
     "replay of continuous actions": Kind(
-        lambda: alone(TINY, SAC(**REPLAYS, normalize_obs=True, n_step=3), 800)
+        lambda: alone(
+            EnvSpec(TINY, engine="sync", workers=1),
+            SAC(**REPLAYS, normalize_obs=True, n_step=3), 800,
+        )
     ),
     "recurrent": Kind(
         lambda: alone(
-            EnvSpec(CART, engine="sync"),
+            IN_PYTHON,
             PPO(**LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))),
             2000,
         )
@@ -162,12 +167,12 @@ KINDS: dict[str, Kind] = {
         lambda: alone(EnvSpec(CART, engine="sync", workers=2), PPO(**LEARNS, network=NET), 2000)
     ),
     "population": Kind(
-        lambda: alone(EnvSpec(CART, engine="sync"), PPO(**LEARNS, network=NET), 800),
+        lambda: alone(IN_PYTHON, PPO(**LEARNS, network=NET), 800),
         evolve=Evolution(**EVOLVES),
     ),
     "search for a start": Kind(
         lambda: Hierarchy(
-            EnvSpec(CART, engine="sync"), [Leaning(), Balance()], call_steps=4, skill_steps=600,
+            IN_PYTHON, [Leaning(), Balance()], call_steps=4, skill_steps=600,
             algorithm=PPO(**LEARNS, network=NET), selector=DQN(**REPLAYS | {"update_ratio": 0.02}),
             selector_steps=600, cut_every=150, eval_every=200, eval_episodes=2,
             reflexes=[Reflex(leans_left, 0)],
@@ -175,7 +180,7 @@ KINDS: dict[str, Kind] = {
     ),
     "populations of skills and selector": Kind(
         lambda: Hierarchy(
-            EnvSpec(CART, engine="sync"), [Leaning(), Balance()], call_steps=4, skill_steps=300,
+            IN_PYTHON, [Leaning(), Balance()], call_steps=4, skill_steps=300,
             algorithm=PPO(
                 **LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))
             ),
@@ -185,7 +190,7 @@ KINDS: dict[str, Kind] = {
     ),
     "together": Kind(
         lambda: Hierarchy(
-            EnvSpec(CART, engine="sync"), [Left(), Leaning()], call_steps=Lengths(2, 4, 8),
+            IN_PYTHON, [Left(), Leaning()], call_steps=Lengths(2, 4, 8),
             interrupt=True, learn="together", together_steps=1200, cut_every=300,
             together=Together(quota=1.0),  # so that a checkpoint holds rows to learn from
             algorithm=PPO(**LEARNS, network=NET), selector=PPO(**LEARNS, network=NET),
@@ -193,13 +198,13 @@ KINDS: dict[str, Kind] = {
     ),
     "apart, then together, replay": Kind(
         lambda: Hierarchy(
-            EnvSpec(CART, engine="sync"), [Left(), Leaning()], call_steps=4,
+            IN_PYTHON, [Left(), Leaning()], call_steps=4,
             learn="apart, then together", skill_steps=200, selector_steps=200, together_steps=400,
             cut_every=100, algorithm=DQN.rainbow(**REPLAYS), selector=SAC(**REPLAYS),
         ),
     ),
     "population, replay": Kind(
-        lambda: alone(EnvSpec(CART, engine="sync"), DQN(**REPLAYS), 300),
+        lambda: alone(IN_PYTHON, DQN(**REPLAYS), 300),
         evolve=Evolution(**EVOLVES),
     ),
 }  # fmt: skip

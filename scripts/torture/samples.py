@@ -17,8 +17,8 @@ import torch
 from gymnasium.spaces import Dict
 
 from scripts.torture.compare import tensors_and_header
-from scripts.torture.kinds import CART, KINDS, LEARNS, NET, Balance, Kind, Tiny, woven
-from skillweave import PPO, EnvSpec, Hierarchy, Skill, from_onnx
+from scripts.torture.kinds import CART, IN_PYTHON, KINDS, LEARNS, NET, Balance, Kind, Tiny, woven
+from skillweave import PPO, Hierarchy, Skill, from_onnx
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
@@ -246,10 +246,14 @@ def _with_onnx(folder: Path) -> Hierarchy:
     class Model(Skill):
         policy = from_onnx(folder / "model.onnx")
 
-    spec = EnvSpec(CART, engine="sync")
     ppo = PPO(**LEARNS, network=NET)
     return Hierarchy(
-        spec, [Model(), Balance()], algorithm=ppo, selector=ppo, skill_steps=64, selector_steps=64
+        IN_PYTHON,
+        [Model(), Balance()],
+        algorithm=ppo,
+        selector=ppo,
+        skill_steps=64,
+        selector_steps=64,
     )
 
 
@@ -262,7 +266,7 @@ def onnx_run(folder: Path) -> None:
 def agent(folder: Path) -> None:
     """Make one plain agent's run."""
     ppo = PPO(**LEARNS, network=NET, normalize_obs=True)
-    train_agent(EnvSpec(CART, engine="sync"), ppo, 128, folder / "run", quiet=True)
+    train_agent(IN_PYTHON, ppo, 128, folder / "run", quiet=True)
 
 
 SHORT = Kind(
