@@ -90,11 +90,15 @@ class InParts(gym.ObservationWrapper):
 
     def __init__(self, env):
         super().__init__(env)
-        part = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-        self.observation_space = gym.spaces.Dict(cart=part, pole=part)
+        self.observation_space = gym.spaces.Dict(  # with a gap between the parts
+            cart=gym.spaces.Box(-np.inf, np.inf, (1,), np.float32),
+            pole=gym.spaces.Box(-np.inf, np.inf, (2,), np.float64),
+            side=gym.spaces.Discrete(2, start=1),  # what nobody has seen yet is none of these
+        )
 
     def observation(self, observation):
-        return {"cart": observation[:2], "pole": observation[2:]}
+        side = 1 + int(observation[0] > 0)
+        return {"cart": observation[:1], "pole": observation[2:].astype(np.float64), "side": side}
 
 
 class LeansLeft(Skill):

@@ -139,6 +139,6 @@ class Priorities:
         for found in leaves, self._highest:
             if not np.isfinite(found).all() or (found < 0).any():
                 raise ValueError("a priority of its replay buffer is negative or not finite")
-        if not leaves[member, slot].all():
-            raise ValueError("a transition of its replay buffer has no priority")
+        if not leaves[member, slot].all() or np.count_nonzero(leaves) != len(member):
+            raise ValueError("not the transitions of its replay buffer have the priorities")
         self._trees.rebuild()

@@ -11,6 +11,7 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import as_wide
 from skillweave.collecting.guide import Guide, as_logits
+from skillweave.collecting.restored import known
 from skillweave.experience import Experience
 from skillweave.types import Array, Memory
 
@@ -69,10 +70,11 @@ class OpenCalls:
         kept["choice"][ids] = choice
         kept["reward"][ids], kept["discount"][ids], kept["tau"][ids] = 0.0, 1.0, 0
         if before is not None:
-            kept["before"][ids] = before
+            kept["before"][ids] = known(before)
         if (rewards := self.opened("rewards")) is not None:
             rewards[ids] = 0.0
-        for name, value in (("obs", obs), ("head", acted.head)):
+        head = None if acted.head is None else known(acted.head)
+        for name, value in (("obs", obs), ("head", head)):
             if value is not None:
                 held = self.opened(name)
                 if held is None or held.shape[1:] != value.shape[1:]:

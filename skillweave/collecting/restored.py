@@ -12,6 +12,18 @@ from skillweave.collecting.calls import SkillSet, skills_below
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Memory, prefixed
 
+COUNTS = range(-1, 2**31)
+"""What a number of steps or calls may be."""
+OF_OTHERS = ("skills.", "guide.", "starters.")
+"""How names begin of what others remember, who may be a user's: that may be anything."""
+RUNNING = (("over", False, "skills.skill"), ("starters.called", True, "starters.skill"))
+"""Where a skill must be running: by what, its value there, and the name of the skill."""
+
+
+def known(x: Array) -> Array:
+    """A copy in which NaN is 0: who takes a diverged member's place goes on with its open calls."""
+    return np.where(np.isnan(x), np.float32(0), x)
+
 
 def check_numbers(kept: Mapping[str, Array], ranges: Mapping[str, range]) -> None:
     """Raise a ValueError where numbers are none that a collector keeps.
@@ -20,16 +32,20 @@ def check_numbers(kept: Mapping[str, Array], ranges: Mapping[str, range]) -> Non
         kept: of each environment, (N, …) each.
         ranges: by name, what numbers that choose among something may be.
     """
-    for name, those in ranges.items():
-        found = kept[name]
-        if found.min(initial=those[0]) < those[0] or found.max(initial=those[0]) > those[-1]:
+    own = {name: x for name, x in kept.items() if not name.startswith(OF_OTHERS)}
+    counts = {name: COUNTS for name, x in own.items() if x.dtype == np.int64}
+    for name, those in (counts | dict(ranges)).items():
+        wrong = kept[name][(kept[name] < those[0]) | (kept[name] > those[-1])]
+        if len(wrong):
             raise ValueError(
-                f"{name!r} of open episodes is {found.tolist()}, not from {those[0]} to {those[-1]}"
+                f"{name!r} of an open episode is {wrong[0]}, not from {those[0]} to {those[-1]}"
             )
-    for name, found in kept.items():
-        own = not name.startswith("skills.")  # what a user's policy remembers may be anything
-        if own and found.dtype.kind == "f" and bool(np.isnan(found).any()):
-            raise ValueError(f"{name!r} of open episodes holds NaN")
+    for name, x in own.items():
+        if x.dtype.kind == "f" and not np.isfinite(x).all():
+            raise ValueError(f"{name!r} of open episodes is not finite")
+    for about, value, skill in RUNNING:
+        if about in kept and (kept[skill][kept[about] == value] < 0).any():
+            raise ValueError("a call is open, and no skill runs")
 
 
 def opened(
@@ -50,27 +66,28 @@ def opened(
     """
     found, codec = {}, obs_codec(observation_space)
     for name, value in open_calls.items():
-        if name.replace("/", ".").rpartition(".")[2] == "obs":
+        prefix, _, what = name.rpartition("/")  # of a hierarchy below: "inner/obs"
+        if what == "obs":
             found[name] = value.copy().view(obs.dtype).reshape(obs.shape)
-            codec.check(to_tensor(found[name]))
+            # Where no call has begun yet, nothing was written.
+            begun = kept[f"{prefix}/tau" if prefix else "tau"] > 0
+            codec.check(to_tensor(found[name][begun]))
             continue
         if value.ndim != 2 or len(value) != len(obs) or value.dtype != np.float32:
             raise ValueError(f"{name!r} of open calls is {value.dtype} {value.shape}")
-        if np.isnan(value).any():
-            raise ValueError(f"{name!r} of open calls holds NaN")
-        found[name] = value.copy()
-    if "over" in kept:
-        runs = ~kept["over"]
-        if runs.any() and "obs" not in found:
-            raise ValueError("it does not say where open calls began")
-        if (kept["skills.skill"][runs] < 0).any():
-            raise ValueError("a call is open, and no skill runs")
+        found[name] = known(value)
+        if not np.isfinite(found[name]).all():
+            raise ValueError(f"{name!r} of open calls is not finite")
+    if not kept.get("over", np.ones(1, bool)).all() and "obs" not in found:
+        raise ValueError("it does not say where open calls began")
     return found
 
 
 def ranges_of(skills: SkillSet) -> dict[str, range]:
     """What numbers in the memory of skills may be, by name; of those below them, too."""
-    found = {"skill": range(-1, len(skills.skills))}
+    found = {"skill": range(-1, len(skills.skills)), "elapsed": range(2**31)}
+    if skills.lengths:
+        found["limit"] = range(max(skills.lengths) + 1)
     for i, policy in enumerate(skills.policies):
         below, guide = skills_below(policy), getattr(policy, "guide", None)
         if below is not None:

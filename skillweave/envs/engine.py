@@ -175,8 +175,8 @@ class GymnasiumEngine:
     def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
         """Play the open episodes again; observations (N, *obs_shape), and who ended early."""
         n = self.num_envs
-        largest = (("root", 1, 2**63 - 1), ("episode", n, 2**62), ("seed", n, 2**31 - 1))
-        for name, rows, most in largest:
+        belongs = (("root", 1, 2**63 - 1), ("episode", n, 2**62), ("seed", n, 2**31 - 1))
+        for name, rows, most in belongs:
             found = state[name]
             if found.shape != (rows,) or found.dtype.kind != "i":
                 raise ValueError(f"{name} is {found.dtype} {found.shape}, not whole numbers")

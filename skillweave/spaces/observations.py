@@ -139,6 +139,11 @@ class ObsCodec:
         nothing = raw[0].new_empty((*lead, 0), dtype=torch.float32)
         return torch.cat(vectors, dim=-1) if vectors else nothing, tuple(images)
 
+    @property
+    def may_be_wrong(self) -> bool:
+        """Whether ``check`` could find something: all bytes of an image are right, say."""
+        return any(leaf.choices or leaf.dtype.is_floating_point for leaf in self.leaves)
+
     def check(self, obs: Tensor) -> None:
         """Raise a ValueError where raw observations (*lead, *item) cannot be of this space.
 

@@ -86,7 +86,8 @@ def pack(space: gym.Space[Any], batched: Any) -> Array:
     """
     if parts(space) is None or isinstance(batched, np.ndarray):
         return np.asarray(batched)
-    packed = np.empty(_lead(space, batched), obs_dtype(space))
+    # Zeros, so that the bytes between aligned parts are always the same: checksums see them.
+    packed = np.zeros(_lead(space, batched), obs_dtype(space))
     _fill(space, packed, batched)
     return packed
 

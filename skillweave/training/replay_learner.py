@@ -200,7 +200,7 @@ def check_counts(kept: dict[str, Tensor], num_envs: int) -> None:
     # A clean cut is made after learning, so nothing was collected since.
     learnt, now = made.tolist()
     if learnt != now or not 0.0 <= now < 2.0**53:
-        raise ValueError(f"it has learnt from {learnt} of {now} transitions")
+        raise ValueError(f"it has learnt from {learnt} of {now} transitions: they must be equal")
     returns = kept.get("returns")
     if returns is not None and (
         returns.shape != (num_envs,)

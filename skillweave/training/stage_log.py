@@ -169,6 +169,6 @@ def resumed(log: StageLog, restore: Callable[[], T]) -> T:
         raise error if run in str(error) else SkillweaveError(f"{run}: {error}") from error
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise SkillweaveError(
-            f"{log.run.path}: the checkpoint of stage {log.entry['name']!r} does not hold "
-            f"episodes of these environments: {error!r}"
+            f"{log.run.path}: training cannot go on from the checkpoint of stage "
+            f"{log.entry['name']!r}: {error!r}"
         ) from error

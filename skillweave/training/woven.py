@@ -126,7 +126,9 @@ class WovenAgents(OneAgent):
         if extra:
             told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
             if not ((told >= 0) & (told < 2**53)).all():
-                raise SkillweaveError(f"{log.run.path}: its counts of rows and updates are none")
+                raise SkillweaveError(
+                    f"{log.run.path}: its counts of rows and updates are out of range"
+                )
             found.counts = dict(zip(parts, told.tolist(), strict=True))
         return found
 
