@@ -117,6 +117,17 @@ def test_raw_observations_are_checked_part_by_part(part, value, wrong):
         obs_codec(PARTS).check(raw)
 
 
+def test_between_the_parts_of_an_observation_is_nothing():
+    space = Dict({"a": Box(-1, 1, (2,), np.float64), "b": MultiBinary(3)})
+    batched = {"a": np.ones((4, 2)), "b": np.ones((4, 3), np.int8)}
+    assert obs_dtype(space).itemsize > 2 * 8 + 3
+    found = set()
+    for i in range(20):
+        np.full(4 * obs_dtype(space).itemsize, i, np.uint8)  # what memory held before
+        found.add(pack(space, batched).tobytes())
+    assert len(found) == 1
+
+
 @pytest.mark.parametrize("space", [Text(3), Dict({"a": Tuple((Text(3),))})], ids=str)
 def test_an_unsupported_observation_space_says_which_are_supported(space):
     with pytest.raises(

@@ -1,0 +1,69 @@
+"""What a checkpoint says of open calls, by hand."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from skillweave.collecting.restored import check_numbers, opened
+
+SPACE = gym.spaces.Discrete(5, start=1)
+SEEN = np.array([1, 4, 5])
+
+
+def kept(tau, prefix=""):
+    return {f"{prefix}tau": np.array(tau)}
+
+
+@pytest.mark.parametrize("prefix", ["", "inner/", "inner/deepest/"])
+def test_only_where_a_call_has_begun_is_an_observation_looked_at(prefix):
+    written = {f"{prefix}obs": np.array([2, 0, 3])}  # nothing was written for the second
+    found = opened(written, kept([4, 0, 1], prefix), SEEN, SPACE)
+    assert found[f"{prefix}obs"].tolist() == [2, 0, 3]
+    with pytest.raises(ValueError, match="a choice that does not exist"):
+        opened(written, kept([4, 1, 1], prefix), SEEN, SPACE)
+
+
+def test_what_a_diverged_member_decided_by_is_nought_and_infinity_is_refused():
+    head = np.array([[1, np.nan], [0, 2]], np.float32)
+    assert opened({"head": head}, {}, SEEN[:2], SPACE)["head"].tolist() == [[1, 0], [0, 2]]
+    head[0, 1] = np.inf
+    with pytest.raises(ValueError, match="'head' of open calls is not finite"):
+        opened({"head": head}, {}, SEEN[:2], SPACE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "refused"),
+    [
+        ("choice", 2, False),
+        ("choice", 3, True),
+        ("choice", -1, True),
+        ("tau", 2**31 - 1, False),
+        ("tau", 2**31, True),
+        ("tau", -2, True),
+        ("calls_left", -1, False),  # it is to be drawn
+        ("reward", 1e9, False),
+        ("reward", np.nan, True),
+        ("skills.0.own", np.nan, False),  # a user's
+        ("guide.own", np.inf, False),
+        ("starters.0.own", -(2**40), False),
+    ],
+)
+def test_own_numbers_have_ranges_and_a_users_may_be_anything(name, value, refused):
+    own = {"choice": np.zeros(2, np.int64), name: np.array([0, value])}
+    if not refused:
+        check_numbers(own, {"choice": range(3)})
+        return
+    with pytest.raises(ValueError, match=repr(name)):
+        check_numbers(own, {"choice": range(3)})
+
+
+@pytest.mark.parametrize(
+    ("about", "runs", "skill"),
+    [("over", False, "skills.skill"), ("starters.called", True, "starters.skill")],
+)
+def test_where_a_call_is_open_a_skill_runs(about, runs, skill):
+    both = {about: np.array([runs, not runs]), skill: np.array([1, -1])}
+    check_numbers(both, {})
+    both[about] = ~both[about]
+    with pytest.raises(ValueError, match="no skill runs"):
+        check_numbers(both, {})
