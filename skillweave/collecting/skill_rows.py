@@ -11,14 +11,13 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import Columns
-from skillweave.collecting.restored import ranges_of
 from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
 from skillweave.experience import Experience
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
-from skillweave.types import Array, SkillweaveError, Step, prefixed
+from skillweave.types import Array, SkillweaveError, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""
@@ -86,8 +85,7 @@ class SkillCollector(Collector):
             self.kept["calls_left"] = np.zeros(n, np.int64)  # that come first; −1: to be drawn
             self._starters = Starters(starters, n, engine.action_space)
             self.kept |= self._starters.kept
-            if starters is not None:
-                self.ranges |= prefixed("starters", ranges_of(starters))
+            self.ranges |= self._starters.ranges
 
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
         """The same over other environments."""

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.calls import SkillSet, Why
+from skillweave.collecting.restored import ranges_of
 from skillweave.envs.engine import RawStep
 from skillweave.envs.infos import allowed_rows, info_rows, random_actions
 from skillweave.types import Array, Memory, Step, prefixed
@@ -34,7 +35,10 @@ class Starters:
         self._calls: Memory = {} if skills is None else skills.start(num_envs)
         self.kept: dict[str, Array] = prefixed("starters", self._calls)
         """What is kept of each environment, (N, …) each; changed in place."""
+        self.ranges: dict[str, range] = {}
+        """As of ``Collector``."""
         if skills is not None:
+            self.ranges |= prefixed("starters", ranges_of(skills))
             self.kept["starters.called"] = np.zeros(num_envs, bool)  # one of them acts
 
     def act(self, ids: Array, obs: Array, mask: Array | None, rng: np.random.Generator) -> Array:
