@@ -59,15 +59,16 @@ def _doorkey(size: str, **settings: Any) -> Task:
     """Three skills on DoorKey.
 
     Args:
-        settings: of who learns apart, where they are not the example's.
+        settings: of skills that learn apart, where they are not the example's.
     """
-    algorithm = functools.partial(doorkey.algorithm, **settings)
     parts = 1, 2, 3, 2  # the key is found soon, the goal is far behind the door
     declare = functools.partial(doorkey.declare, size)
     # With less entropy `goal` settles too early; far from it a decision is worth 0.02.
-    explores = algorithm(ent_coef=0.03)
+    explores = doorkey.algorithm(ent_coef=0.03, **settings)
     apart = {"episode_calls": 8, "call_cost": 0.001, "algorithm": explores}
-    return Task(declare, algorithm, parts, apart, cells=lambda obs: obs.reshape(len(obs), -1))
+    return Task(
+        declare, doorkey.algorithm, parts, apart, cells=lambda obs: obs.reshape(len(obs), -1)
+    )
 
 
 TASKS = {
