@@ -82,13 +82,16 @@ def _doorkey(size: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
 TASKS = {
     "8x8": _doorkey("8x8", (1, 2, 3, 2)),
     # `goal` succeeds once in 1,000 steps at first. It needs most of the steps, more starts behind
-    # the door, and rollouts with several successes: then it settles late with less entropy, too.
+    # the door, more passes over each rollout, and several successes in one: then it settles late
+    # with less entropy, too.
     # Without a limit what the first few teach is not small beside the entropy's bonus.
     # Over skills that are good, a high floor hides from the selector what it does by itself.
     "16x16": _doorkey(
         "16x16",
         (1, 2, 6, 1),
-        goal=replace(doorkey.algorithm(ent_coef=0.015, min_advantage_std=0.0), n_steps=512),
+        goal=replace(
+            doorkey.algorithm(ent_coef=0.015, min_advantage_std=0.0), n_steps=512, update_epochs=10
+        ),
         start_calls=16,
         algorithm=doorkey.algorithm(ent_coef=0.03, min_advantage_std=0.0),
         selector=doorkey.algorithm(floor=0.1, floor_final=0.0),
