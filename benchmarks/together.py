@@ -81,11 +81,10 @@ def _doorkey(size: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
 
 TASKS = {
     "8x8": _doorkey("8x8", (1, 2, 3, 2)),
-    # `goal` succeeds once in 1,000 steps at first. It needs most of the steps, more starts behind
-    # the door, more passes over each rollout, and several successes in one: then it settles late
-    # with less entropy, too.
-    # Without a limit what the first few teach is not small beside the entropy's bonus.
-    # Over skills that are good, a high floor hides from the selector what it does by itself.
+    # `goal` succeeds once in 1,000 steps at first: it needs most of the steps, and rollouts with
+    # several successes. It learns from them without a limit on its advantages: the entropy's bonus
+    # would be larger than what the first few teach. The selector begins with a low floor: a high
+    # one hides from it what it does by itself.
     "16x16": _doorkey(
         "16x16",
         (1, 2, 6, 1),
@@ -142,7 +141,7 @@ def no_least_deviation(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 def less_entropy(task: Task, steps: int, **how: Any) -> Hierarchy:
     """Apart, skills have no more entropy than together."""
-    return apart(task, steps, algorithm=task.algorithm(), **how)
+    return apart(replace(task, last_skill=None), steps, algorithm=task.algorithm(), **how)
 
 
 def flat(task: Task, steps: int, weight: float = 0.0, bonus: float = 0.0, **how: Any) -> Flat:
