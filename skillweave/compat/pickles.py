@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from skillweave.compat.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
+from skillweave.messages import shortened
 from skillweave.reading import check_file, shown
 from skillweave.types import SkillweaveError
 
@@ -90,13 +91,14 @@ def read_torch_pickle(path: Path) -> Any:
             prefix = name.removesuffix("data.pkl")
             return _Plain()(_Reader(io.BytesIO(program), file, prefix).load())[0]
     except zipfile.BadZipFile as error:
+        told = shortened(str(error))  # it may quote much of the file
         raise SkillweaveError(
-            f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {error}"
+            f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {told}"
         ) from error
     except SkillweaveError as error:
         raise SkillweaveError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle can fail in any way
-        told = f"{type(error).__name__}: {str(error)[:300]}"
+        told = f"{type(error).__name__}: {shortened(str(error))}"
         raise SkillweaveError(f"{path} is damaged: {told}") from error
 
 

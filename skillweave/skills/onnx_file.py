@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from gymnasium import Space
 
+from skillweave.messages import shortened
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import Foreign, checksum
 from skillweave.skills.outputs import decoded
@@ -193,4 +194,5 @@ def _session(data: bytes, file: Path) -> Any:
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own errors have no common class
-        raise SkillweaveError(f"{file} cannot be run by onnxruntime: {error}") from error
+        told = shortened(str(error))
+        raise SkillweaveError(f"{file} cannot be run by onnxruntime: {told}") from error

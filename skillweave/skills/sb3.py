@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
 
-from skillweave.messages import short
+from skillweave.messages import short, shortened
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import Foreign, checksum
 from skillweave.skills.outputs import checked_actions
@@ -132,7 +132,7 @@ def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = F
     except Exception as error:
         raise SkillweaveError(
             f"{file} could not be opened as Stable-Baselines3's {kind.__name__}: "
-            f"{type(error).__name__}: {error}"
+            f"{type(error).__name__}: {shortened(str(error))}"
         ) from error
     return SB3Policy(loaded, file, checksum(content))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from gymnasium import Space
 
-from skillweave.messages import short
+from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign, checksum, qualified
 from skillweave.skills.outputs import decoded
 from skillweave.types import Array, Memory, SkillweaveError
@@ -151,5 +151,6 @@ def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
     try:
         found.load_state_dict(safetensors.torch.load(content))
     except (RuntimeError, safetensors.SafetensorError) as error:
-        raise SkillweaveError(f"{who}: the weights in the run do not fit it: {error}") from error
+        told = shortened(str(error))
+        raise SkillweaveError(f"{who}: the weights in the run do not fit it: {told}") from error
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import struct
 import subprocess
 import sys
 import zipfile
@@ -277,6 +278,16 @@ def test_a_tensor_that_repeats_one_number_takes_no_memory(tmp_path):
     found = read_torch_pickle(tmp_path / "x.pt")["x"]
     assert found.shape == (10**12,)
     assert found.untyped_storage().nbytes() == 4
+
+
+def test_a_zip_that_is_quoted_at_length_is_told_in_short(tmp_path):
+    path = write_program(tmp_path / "x.pt", b"N" * 20_000)
+    data = bytearray(path.read_bytes())
+    data[26:28] = struct.pack("<H", 10_000)  # the length of its file's name, which zipfile quotes
+    path.write_bytes(data)
+    with pytest.raises(SkillweaveError, match=r"x\.pt is no checkpoint of torch\.save") as raised:
+        read_torch_pickle(path)
+    assert len(str(raised.value)) < 1_000
 
 
 # BUILD sets attributes: of what `find_class` returned, too, if that lets it.
