@@ -193,6 +193,7 @@ KINDS: dict[str, Kind] = {
             IN_PYTHON, [Left(), Leaning()], call_steps=Lengths(2, 4, 8),
             interrupt=True, learn="together", together_steps=1200, cut_every=300,
             together=Together(quota=1.0),  # so that a checkpoint holds rows to learn from
+            greedy_skills=False,  # else 200 episodes are played; the next kind plays them
             algorithm=PPO(**LEARNS, network=NET), selector=PPO(**LEARNS, network=NET),
         ),
     ),
