@@ -92,13 +92,17 @@ class Flight(Skill):
         reward = 1.0 - self.deviation(step.next_obs) + self.prize * self.success(step)
         return np.where(step.terminated, CRASH, reward)
 
-    def success(self, step: Step) -> Array:
-        """It is in the box around the point, slow and upright."""
-        obs = step.next_obs
+    def there(self, obs: Array) -> Array:
+        """It is in the box around the point, slow and upright, (n,) bool."""
         inside = (np.abs(obs[:, [X, Y]] - self.point) <= self.half).all(axis=1)
         moving = np.hypot(obs[:, VX], obs[:, VY]) + np.abs(obs[:, ANGLE])
-        there: Array = inside & (moving < 0.5) & ~step.terminated
+        there: Array = inside & (moving < 0.5)
         return there
+
+    def success(self, step: Step) -> Array:
+        """It is there, and flies."""
+        flies: Array = self.there(step.next_obs) & ~step.terminated
+        return flies
 
 
 class Hover(Flight):
@@ -113,6 +117,10 @@ class GoLeft(Flight):
     """Fly to the point on the left, until it is reached."""
 
     point, half = POINTS[KINDS.index("left")], HALF[KINDS.index("left")]
+
+    def initiation(self, obs: Array) -> Array:
+        """It is not there yet: a call would end at once, be made again, and end again."""
+        return ~self.there(obs)
 
     def termination(self, step: Step) -> Array:
         """It is there."""
@@ -174,6 +182,8 @@ SELECTOR = PPO(
     network=RELU,
 )
 SKILLS = (Hover, GoLeft, GoRight, Land)
+WEAVING_STEPS = 300_000
+"""Of a selector for one mission, over skills that are there already."""
 
 
 def environment(mission: str = "any", gusts: bool = False) -> Any:
@@ -207,7 +217,8 @@ def with_skills(
     mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
 ) -> Hierarchy:
     """The hierarchy on a mission with skills that are there already, by name."""
-    found = declare(mission, gusts, **how)
+    steps = {} if mission == "any" else {"selector_steps": WEAVING_STEPS}
+    found = declare(mission, gusts, **(steps | how))
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found

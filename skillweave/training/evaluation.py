@@ -17,7 +17,13 @@ from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
-from skillweave.training.skill_report import SkillReport, SkillTally, all_steps, skill_table
+from skillweave.training.skill_report import (
+    SkillReport,
+    SkillTally,
+    all_steps,
+    ends_at_once,
+    skill_table,
+)
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
@@ -94,8 +100,9 @@ class Evaluation:
         }
 
     def for_people(self) -> str:
-        """``str()``, and for a hierarchy a table with a line for each skill."""
-        return "\n".join([str(self), *([skill_table(self.skills)] if self.skills else [])])
+        """``str()``, and for a hierarchy a table with a line for each skill, and what is wrong."""
+        table = [skill_table(self.skills)] if self.skills else []
+        return "\n".join([str(self), *table, *ends_at_once(self.skills)])
 
     def __str__(self) -> str:
         j = self.to_json()

@@ -261,6 +261,20 @@ def skill_table(skills: Mapping[str, SkillReport]) -> str:
     )
 
 
+def ends_at_once(skills: Mapping[str, SkillReport]) -> list[str]:
+    """A sentence about each skill that is called again and again where it ends after one step."""
+    found = []
+    for name, report in skills.items():
+        again, own = report.followed.get(name, 0), report.ended.get("own", 0)
+        short = report.length_mean is not None and report.length_mean < 2.0
+        if short and min(again, own) > report.calls / 2:
+            found.append(
+                f"Most of the {report.calls:,} calls of {name!r} ended at once, where it had ended "
+                "before: let its initiation() be False where its termination() is True."
+            )
+    return found
+
+
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.0%}"
 

@@ -207,6 +207,32 @@ def test_the_table_for_people():
     ]
 
 
+def test_a_skill_that_ends_where_it_is_called_again_is_told():
+    def told(choose, *kinds):
+        skills = tuple(k() for k in kinds)
+        whole = SkillSet(skills, tuple(s.policy for s in skills), call_steps=4)
+        selector = ScriptedPolicy(choose, Walk.observation_space, Discrete(2))
+        found = evaluate(HierarchyPolicy(selector, whole), EnvSpec(Walk), episodes=20)
+        return found.skills, found.for_people().splitlines()
+
+    def first(obs):
+        return np.zeros(len(obs), np.int64)
+
+    found, lines = told(first, Steady, Left)  # there after a few steps, and called on and on
+    calls = found["steady"].calls
+    assert calls > 20
+    assert lines[-1] == (
+        f"Most of the {calls:,} calls of 'steady' ended at once, where it had ended before: let "
+        "its initiation() be False where its termination() is True."
+    )
+
+    def where_it_is_not_there(obs):
+        return (obs[:, POSITION] >= 2).astype(np.int64)
+
+    for found, lines in (told(where_it_is_not_there, Steady, Left), told(first, Left, Steady)):
+        assert lines[1:] == skill_table(found).splitlines()
+
+
 def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():
     inner = woven(Paid, Lucky, Zigzag)
 
