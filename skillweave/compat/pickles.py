@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from skillweave.compat.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
-from skillweave.messages import shortened
+from skillweave.messages import short, shortened
 from skillweave.reading import check_file, shown
 from skillweave.types import SkillweaveError
 
@@ -188,7 +188,7 @@ class _DType:
     def __init__(self, kind: Any, *_: Any) -> None:
         self.real = np.dtype(kind)
         if self.real.kind not in "biufcSU":
-            raise SkillweaveError(f"refused: the pickle holds an array of {self.real}")
+            raise SkillweaveError(f"refused: the pickle holds an array of {short(self.real)}")
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self.real = self.real.newbyteorder(state[1])

@@ -119,7 +119,7 @@ class GoLeft(Flight):
     point, half = POINTS[KINDS.index("left")], HALF[KINDS.index("left")]
 
     def initiation(self, obs: Array) -> Array:
-        """It is not there yet: a call would end at once, be made again, and end again."""
+        """Where it is not there yet. There a call would end at once, and could be made again."""
         return ~self.there(obs)
 
     def termination(self, step: Step) -> Array:

@@ -12,7 +12,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector.utils import batch_space
 
-from skillweave.messages import shortened
+from skillweave.messages import short, shortened
 from skillweave.types import Array, Memory, Memoryless, Policy, SkillweaveError
 
 
@@ -89,7 +89,7 @@ class Foreign(Memoryless):
             raise
         except Exception as error:
             raise SkillweaveError(
-                f"{self._who} fails on observations of {self.observation_space}: "
+                f"{self._who} fails on observations of {short(self.observation_space, 300)}: "
                 f"{type(error).__name__}: {shortened(str(error))}"
             ) from error
 

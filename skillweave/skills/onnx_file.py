@@ -44,13 +44,14 @@ class OnnxPolicy(Foreign):
         self._session = _session(data, file)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or not inputs[0].shape or inputs[0].type not in NUMBERS:
-            found = ", ".join(f"{i.name} {i.type}{i.shape}" for i in inputs)
+            found = shortened(", ".join(f"{i.name} {i.type}{i.shape}" for i in inputs))
             raise SkillweaveError(
                 f"{file} takes {found or 'nothing'}; it must take one batch of observations"
             )
         names = [o.name for o in outputs]
         if output is not None and output not in names:
-            raise SkillweaveError(f"{file} has no output {output!r}; it has: {', '.join(names)}")
+            has = shortened(", ".join(names))
+            raise SkillweaveError(f"{file} has no output {output!r}; it has: {has}")
         self._input, self.output = inputs[0], output or names[0]
         batch = self._input.shape[0]
         if isinstance(batch, int) and batch != 1:

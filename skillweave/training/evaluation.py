@@ -21,7 +21,7 @@ from skillweave.training.skill_report import (
     SkillReport,
     SkillTally,
     all_steps,
-    ends_at_once,
+    idle_calls,
     skill_table,
 )
 from skillweave.types import Array, Policy, SkillweaveError
@@ -100,9 +100,9 @@ class Evaluation:
         }
 
     def for_people(self) -> str:
-        """``str()``, and for a hierarchy a table with a line for each skill, and what is wrong."""
+        """``str()``, and for a hierarchy a table of its skills, and who was called in vain."""
         table = [skill_table(self.skills)] if self.skills else []
-        return "\n".join([str(self), *table, *ends_at_once(self.skills)])
+        return "\n".join([str(self), *table, *idle_calls(self.skills)])
 
     def __str__(self) -> str:
         j = self.to_json()

@@ -47,6 +47,8 @@ class SkillReport:
     followed: dict[str, Count] = field(default_factory=dict, compare=False)
     """How many of its calls a call of each skill followed; the others were the last of an episode.
     Empty: not known, as in files of older versions."""
+    idle: Count = field(default=0, compare=False)
+    """Calls that ended by themselves after one step, right after a call of it that had ended so."""
 
     @property
     def length_mean(self) -> float | None:
@@ -131,6 +133,8 @@ class SkillTally:
             if skills_below(own) is not None
         }
         self._open = np.full(episodes, -1)  # by episode, the skill whose call may go on
+        self._idle = np.zeros(count, np.int64)
+        self._done = np.full(episodes, -1)  # by episode, the skill that has just ended by itself
 
     def add(self, played: Played) -> None:
         """Count one step of each environment."""
@@ -149,6 +153,9 @@ class SkillTally:
             own = judged.reward
             ended = np.flatnonzero(judged.why != Why.RUNNING)
             np.add.at(self._ended, (acting[ended], judged.why[ended]), 1)
+            done, again = judged.why == Why.OWN, self._done[played.episode] == acting
+            self._idle += np.bincount(acting[done & again], minlength=count)
+            self._done[played.episode] = np.where(done, acting, -1)
             np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
         self._returns[played.episode, acting] += own
         for i, tally in self._below.items():
@@ -163,6 +170,7 @@ class SkillTally:
         if len(over):
             np.add.at(self._ended[:, Why.LIMIT], self._open[over], 1)
             self._open[over] = -1
+        self._done[episodes] = -1
         for tally in self._below.values():
             tally.cut(episodes)
 
@@ -174,7 +182,7 @@ class SkillTally:
             found[name] = SkillReport(
                 int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
                 float(returns[i]) if self._known(i) else None, int(self._next[0, i]),
-                dict(zip(paths, self._next[1 + i].tolist(), strict=True)),
+                dict(zip(paths, self._next[1 + i].tolist(), strict=True)), int(self._idle[i]),
             )  # fmt: skip
             if i in self._below:
                 found |= self._below[i].reports()
@@ -261,16 +269,19 @@ def skill_table(skills: Mapping[str, SkillReport]) -> str:
     )
 
 
-def ends_at_once(skills: Mapping[str, SkillReport]) -> list[str]:
-    """A sentence about each skill that is called again and again where it ends after one step."""
+def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """A sentence about each skill most of whose calls are idle, while the others take time.
+
+    A skill whose calls all take a step or two, as a move does, is not meant.
+    """
     found = []
     for name, report in skills.items():
-        again, own = report.followed.get(name, 0), report.ended.get("own", 0)
-        short = report.length_mean is not None and report.length_mean < 2.0
-        if short and min(again, own) > report.calls / 2:
+        others = report.calls - report.idle
+        if report.idle > others and report.steps - report.idle > 2 * others:
             found.append(
-                f"Most of the {report.calls:,} calls of {name!r} ended at once, where it had ended "
-                "before: let its initiation() be False where its termination() is True."
+                f"{report.idle:,} of {report.calls:,} calls of {name!r} ended after one step, "
+                "right after a call of it had ended. If its work is done there, let its "
+                "initiation() be False there; some other skill must be able to start."
             )
     return found
 

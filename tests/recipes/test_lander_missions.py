@@ -196,6 +196,25 @@ def test_a_skill_has_arrived_only_where_the_missions_leg_is_done(skill):
         assert skill.success(step_of(lander(SKY), lander(place)))[0] == inside
 
 
+@pytest.mark.parametrize("skill", [missions.GoLeft(), missions.GoRight()])
+def test_a_skill_may_not_start_where_it_would_end_at_once(skill):
+    rng = np.random.default_rng(0)
+    ends = []
+    for place in skill.point + rng.uniform(-0.3, 0.3, (200, 2)):
+        step = step_of(lander(SKY), lander(place, speed=rng.uniform(-0.6, 0.6, 2)))
+        ends.append(skill.termination(step)[0])
+        assert skill.initiation(step.next_obs)[0] == (not ends[-1])
+    assert 20 < sum(ends) < 180
+
+
+def test_a_selector_for_one_mission_takes_fewer_steps():
+    skills = dict.fromkeys([s().name for s in missions.SKILLS])
+    assert missions.with_skills("tour", skills).selector_steps == missions.WEAVING_STEPS
+    every = missions.declare().selector_steps
+    assert missions.with_skills("any", skills).selector_steps == every > missions.WEAVING_STEPS
+    assert missions.with_skills("tour", skills, selector_steps=9).selector_steps == 9
+
+
 @pytest.mark.parametrize(
     ("skill", "most"), [(missions.GoLeft(), 1.0), (missions.GoRight(), 1.0), (missions.Land(), 2.0)]
 )

@@ -207,30 +207,91 @@ def test_the_table_for_people():
     ]
 
 
-def test_a_skill_that_ends_where_it_is_called_again_is_told():
-    def told(choose, *kinds):
-        skills = tuple(k() for k in kinds)
-        whole = SkillSet(skills, tuple(s.policy for s in skills), call_steps=4)
-        selector = ScriptedPolicy(choose, Walk.observation_space, Discrete(2))
-        found = evaluate(HierarchyPolicy(selector, whole), EnvSpec(Walk), episodes=20)
-        return found.skills, found.for_people().splitlines()
+class Far(Steady):
+    """Goes to 4."""
 
-    def first(obs):
-        return np.zeros(len(obs), np.int64)
+    name = "far"
 
-    found, lines = told(first, Steady, Left)  # there after a few steps, and called on and on
-    calls = found["steady"].calls
-    assert calls > 20
-    assert lines[-1] == (
-        f"Most of the {calls:,} calls of 'steady' ended at once, where it had ended before: let "
-        "its initiation() be False where its termination() is True."
+    def termination(self, step):
+        return step.next_obs[:, POSITION] >= 4
+
+
+class Move(Steady):
+    """One step is all that it does."""
+
+    name = "move"
+
+    def termination(self, step):
+        return np.ones(len(step.reward), bool)
+
+
+def told(choose, *kinds, call_steps=50):
+    skills = tuple(k() for k in kinds)
+    whole = SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps)
+    selector = ScriptedPolicy(choose, Walk.observation_space, Discrete(len(kinds)))
+    policy = HierarchyPolicy(selector, whole)
+    return policy, evaluate(policy, EnvSpec(Walk), episodes=20)
+
+
+def first(obs):
+    return np.zeros(len(obs), np.int64)
+
+
+def until_it_is_there(obs):
+    return (obs[:, POSITION] >= 4).astype(np.int64)
+
+
+def until_there_and_once_more(obs):
+    return (obs[:, T] >= 5).astype(np.int64)
+
+
+def by_turns(obs):
+    return obs[:, T].astype(np.int64) % 2
+
+
+@pytest.mark.parametrize("call_steps", [50, 3])
+def test_a_skill_that_is_called_where_its_work_is_done_is_told(call_steps):
+    found = told(first, Far, Left, call_steps=call_steps)[1]
+    far = found.skills["far"]
+    # Four steps, the fourth perhaps in a call of its own, which a limit made necessary. Then one
+    # call for each step, the last of which the episode's end cuts.
+    before = [1 + (call_steps == 3 and n > 3) for n in found.lengths]
+    assert far.calls == sum(k + max(0, n - 4) for k, n in zip(before, found.lengths, strict=True))
+    assert far.idle == sum(max(0, n - 5) for n in found.lengths) > far.calls / 2
+    if call_steps == 3:
+        return  # its other calls are about as short
+    assert found.for_people().splitlines()[-1] == (
+        f"{far.idle:,} of {far.calls:,} calls of 'far' ended after one step, right after a call of "
+        "it had ended. If its work is done there, let its initiation() be False there; some other "
+        "skill must be able to start."
     )
 
-    def where_it_is_not_there(obs):
-        return (obs[:, POSITION] >= 2).astype(np.int64)
 
-    for found, lines in (told(where_it_is_not_there, Steady, Left), told(first, Left, Steady)):
-        assert lines[1:] == skill_table(found).splitlines()
+@pytest.mark.parametrize(
+    ("choose", "kinds", "call_steps"),
+    [
+        (until_it_is_there, (Far, Left), 50),
+        (until_there_and_once_more, (Far, Left), 50),
+        (first, (Left, Far), 3),  # a limit ends its calls
+        (first, (Left, Far), 1),
+        (first, (Move, Left), 50),  # as all its calls
+    ],
+)
+def test_calls_that_end_otherwise_are_not_told(choose, kinds, call_steps):
+    found = told(choose, *kinds, call_steps=call_steps)[1]
+    assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+
+
+def test_a_call_after_another_skill_is_not_idle_within_a_hierarchy():
+    class Nested(Skill):
+        policy = told(first, Far, Left)[0]
+        max_steps = 1
+
+    alone = told(first, Nested, Left)[1].skills["nested/far"]
+    assert alone.calls > alone.idle > 20
+    mixed = told(by_turns, Nested, Right)[1].skills["nested/far"]
+    assert mixed.calls > 20
+    assert mixed.idle == 0
 
 
 def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():
