@@ -62,7 +62,7 @@ def suite() -> Suite:
         cells=cells,
         bonus=0.01,
         fixed={"by-leg": by_leg},
-        # More than learns the first task, skills included; a further task takes a thirteenth.
+        # More than learns the first task, skills included; a further task takes a seventh.
         flat_steps=4_000_000,
         evaluations=8,
     )

@@ -182,8 +182,6 @@ SELECTOR = PPO(
     network=RELU,
 )
 SKILLS = (Hover, GoLeft, GoRight, Land)
-WEAVING_STEPS = 300_000
-"""Of a selector for one mission, over skills that are there already."""
 
 
 def environment(mission: str = "any", gusts: bool = False) -> Any:
@@ -217,8 +215,7 @@ def with_skills(
     mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
 ) -> Hierarchy:
     """The hierarchy on a mission with skills that are there already, by name."""
-    steps = {} if mission == "any" else {"selector_steps": WEAVING_STEPS}
-    found = declare(mission, gusts, **(steps | how))
+    found = declare(mission, gusts, **how)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found

@@ -207,14 +207,6 @@ def test_a_skill_may_not_start_where_it_would_end_at_once(skill):
     assert 20 < sum(ends) < 180
 
 
-def test_a_selector_for_one_mission_takes_fewer_steps():
-    skills = dict.fromkeys([s().name for s in missions.SKILLS])
-    assert missions.with_skills("tour", skills).selector_steps == missions.WEAVING_STEPS
-    every = missions.declare().selector_steps
-    assert missions.with_skills("any", skills).selector_steps == every > missions.WEAVING_STEPS
-    assert missions.with_skills("tour", skills, selector_steps=9).selector_steps == 9
-
-
 @pytest.mark.parametrize(
     ("skill", "most"), [(missions.GoLeft(), 1.0), (missions.GoRight(), 1.0), (missions.Land(), 2.0)]
 )
