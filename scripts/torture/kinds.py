@@ -31,8 +31,9 @@ from skillweave.api import Agent, Run
 
 SEED = 3
 """Of every training."""
-CART, TINY = "CartPole-v1", "TortureTiny-v0"
-IN_PYTHON = EnvSpec(CART, engine="sync", workers=1)
+CART, SHORT_CART, TINY = "CartPole-v1", "TortureCart-v0", "TortureTiny-v0"
+IN_PYTHON = EnvSpec(SHORT_CART, engine="sync", workers=1)
+TINY_IN_PYTHON = EnvSpec(TINY, engine="sync", workers=1)
 """One process, said: how many are best is measured, and may differ while other programs run."""
 
 
@@ -64,6 +65,10 @@ class Tiny(gym.Env[Any, Any]):
 
 if TINY not in gym.registry:
     gym.register(TINY, Tiny)
+    # Episodes of 60 steps: a case plays some, and there are many cases.
+    gym.register(
+        SHORT_CART, "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=60
+    )
 
 
 class Left(Skill):
@@ -140,6 +145,26 @@ def alone(env: Any, algorithm: Any, steps: int) -> Agent:
     return Agent(env, algorithm, steps, cut_every=max(1, steps // 5))
 
 
+def together(steps: int) -> Hierarchy:
+    """Two skills and a selector that learn at once, on-policy."""
+    return Hierarchy(
+        IN_PYTHON, [Left(), Leaning()], call_steps=Lengths(2, 4, 8),
+        interrupt=True, learn="together", together_steps=steps, cut_every=steps // 4,
+        together=Together(quota=1.0),  # so that a checkpoint holds rows to learn from
+        greedy_skills=False,  # else 200 episodes are played; `together_replay` plays them
+        algorithm=PPO(**LEARNS, network=NET), selector=PPO(**LEARNS, network=NET),
+    )  # fmt: skip
+
+
+def together_replay(steps: int) -> Hierarchy:
+    """Two skills and a selector that learn from replay, apart, then together."""
+    return Hierarchy(
+        IN_PYTHON, [Left(), Leaning()], call_steps=4, learn="apart, then together",
+        skill_steps=steps, selector_steps=steps, together_steps=2 * steps, cut_every=steps // 2,
+        algorithm=DQN.rainbow(**REPLAYS), selector=SAC(**REPLAYS),
+    )  # fmt: skip
+
+
 KINDS: dict[str, Kind] = {
     "skills and selector": Kind(
         lambda: woven(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
@@ -148,10 +173,7 @@ KINDS: dict[str, Kind] = {
         lambda: woven(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS))
     ),
     "replay of continuous actions": Kind(
-        lambda: alone(
-            EnvSpec(TINY, engine="sync", workers=1),
-            SAC(**REPLAYS, normalize_obs=True, n_step=3), 800,
-        )
+        lambda: alone(TINY_IN_PYTHON, SAC(**REPLAYS, normalize_obs=True, n_step=3), 800)
     ),
     "recurrent": Kind(
         lambda: alone(
@@ -188,22 +210,8 @@ KINDS: dict[str, Kind] = {
         ),
         evolve=Evolution(**EVOLVES | {"population": 2, "generations": 2}),
     ),
-    "together": Kind(
-        lambda: Hierarchy(
-            IN_PYTHON, [Left(), Leaning()], call_steps=Lengths(2, 4, 8),
-            interrupt=True, learn="together", together_steps=1200, cut_every=300,
-            together=Together(quota=1.0),  # so that a checkpoint holds rows to learn from
-            greedy_skills=False,  # else 200 episodes are played; the next kind plays them
-            algorithm=PPO(**LEARNS, network=NET), selector=PPO(**LEARNS, network=NET),
-        ),
-    ),
-    "apart, then together, replay": Kind(
-        lambda: Hierarchy(
-            IN_PYTHON, [Left(), Leaning()], call_steps=4,
-            learn="apart, then together", skill_steps=200, selector_steps=200, together_steps=400,
-            cut_every=100, algorithm=DQN.rainbow(**REPLAYS), selector=SAC(**REPLAYS),
-        ),
-    ),
+    "together": Kind(lambda: together(1200)),
+    "apart, then together, replay": Kind(lambda: together_replay(200)),
     "population, replay": Kind(
         lambda: alone(IN_PYTHON, DQN(**REPLAYS), 300),
         evolve=Evolution(**EVOLVES),

@@ -17,8 +17,23 @@ import torch
 from gymnasium.spaces import Dict
 
 from scripts.torture.compare import tensors_and_header
-from scripts.torture.kinds import CART, IN_PYTHON, KINDS, LEARNS, NET, Balance, Kind, Tiny, woven
-from skillweave import PPO, Hierarchy, Skill, from_onnx
+from scripts.torture.kinds import (
+    CART,
+    IN_PYTHON,
+    KINDS,
+    LEARNS,
+    NET,
+    REPLAYS,
+    TINY_IN_PYTHON,
+    Balance,
+    Kind,
+    Tiny,
+    alone,
+    together,
+    together_replay,
+    woven,
+)
+from skillweave import PPO, SAC, Hierarchy, Skill, from_onnx
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
@@ -269,10 +284,13 @@ def agent(folder: Path) -> None:
     train_agent(IN_PYTHON, ppo, 128, folder / "run", quiet=True)
 
 
-SHORT = Kind(
-    lambda: woven(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
-)  # fmt: skip
-"""Few steps to resume."""
+# Few steps to resume: there are many cases.
+SHORT = Kind(lambda: woven(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)))
+SHORT_REPLAY = Kind(
+    lambda: alone(TINY_IN_PYTHON, SAC(**REPLAYS, normalize_obs=True, n_step=3), 200)
+)
+SHORT_TOGETHER = Kind(lambda: together(576))
+SHORT_TOGETHER_REPLAY = Kind(lambda: together_replay(80))
 SAMPLES: dict[str, Sample] = {
     "hierarchy": Sample(
         whole("skills and selector, replay"), declared(KINDS["skills and selector, replay"])
@@ -290,15 +308,13 @@ SAMPLES: dict[str, Sample] = {
         share=0.1,
     ),
     "unfinished replay": Sample(
-        unfinished(KINDS["replay of continuous actions"], 3),
-        resumed(KINDS["replay of continuous actions"]), share=0.2,
+        unfinished(SHORT_REPLAY, 3), resumed(SHORT_REPLAY), share=0.2
     ),
     "unfinished together": Sample(
-        unfinished(KINDS["together"], 2), resumed(KINDS["together"]), share=0.2
+        unfinished(SHORT_TOGETHER, 2), resumed(SHORT_TOGETHER), share=0.2
     ),
     "unfinished together, replay": Sample(
-        unfinished(KINDS["apart, then together, replay"], 8),
-        resumed(KINDS["apart, then together, replay"]), share=0.2,
+        unfinished(SHORT_TOGETHER_REPLAY, 8), resumed(SHORT_TOGETHER_REPLAY), share=0.2
     ),
     "weights": Sample(
         weights("skills and selector"), weights_file(KINDS["skills and selector"])
