@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import signal
 from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # here, in each worker, and in what tests start
@@ -11,6 +12,9 @@ import torch
 from hypothesis import settings
 
 torch.set_num_threads(1)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell that runs the tests in the background has Ctrl-C ignored by all that it starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("skillweave", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("skillweave")
 
