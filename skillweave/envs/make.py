@@ -151,7 +151,7 @@ class EnvSpec:
             near = difflib.get_close_matches(env_id, list(gym.registry), n=4, cutoff=0.6)
             hint = f" Close matches: {', '.join(near)}." if near else ""
             raise SkillweaveError(
-                f"no environment {short(env_id)}: {shortened(str(error))}.{hint}"
+                f"no environment {short(env_id)}: {shortened(str(error)).rstrip('.')}.{hint}"
             ) from error
 
     @property

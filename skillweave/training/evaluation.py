@@ -22,6 +22,7 @@ from skillweave.training.skill_report import (
     SkillTally,
     all_steps,
     idle_calls,
+    late_calls,
     skill_table,
 )
 from skillweave.types import Array, Policy, SkillweaveError
@@ -100,9 +101,10 @@ class Evaluation:
         }
 
     def for_people(self) -> str:
-        """``str()``, and for a hierarchy a table of its skills, and who was called in vain."""
+        """``str()``, and for a hierarchy a table of its skills, and what looks like a mistake."""
         table = [skill_table(self.skills)] if self.skills else []
-        return "\n".join([str(self), *table, *idle_calls(self.skills)])
+        hints = [*idle_calls(self.skills), *late_calls(self.skills)]
+        return "\n".join([str(self), *table, *hints])
 
     def __str__(self) -> str:
         j = self.to_json()

@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.collecting.calls import SkillSet, Why, skill_step, skills_below
 from skillweave.reading import Count
 from skillweave.skills import asked
-from skillweave.skills.base import RecordedSkill
+from skillweave.skills.base import RecordedSkill, Skill
 from skillweave.training.play import Played
 from skillweave.types import Array, Policy, unprefixed
 
@@ -49,6 +49,9 @@ class SkillReport:
     Empty: not known, as in files of older versions."""
     idle: Count = field(default=0, compare=False)
     """Calls that ended by themselves after one step, right after a call of it that had ended so."""
+    late: Count = field(default=0, compare=False)
+    """Calls that had succeeded when the hierarchy's limit ended them, of a skill that says neither
+    where it stops nor how long it lasts."""
 
     @property
     def length_mean(self) -> float | None:
@@ -121,6 +124,9 @@ class SkillTally:
         self._steps, self._calls = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._ended = np.zeros((count, len(Why)), np.int64)
         self._succeeded = np.zeros(count, np.int64)
+        self._late = np.zeros(count, np.int64)
+        declared = () if self.skills is None else self.skills.skills
+        self._endless = np.array([_is_endless(skill) for skill in declared], bool)
         # By skill before (the first row: none) and skill after.
         self._next = np.zeros((1 + count, count), np.int64)
         self._before = np.zeros(episodes, np.int64)
@@ -157,6 +163,8 @@ class SkillTally:
             self._idle += np.bincount(acting[done & again], minlength=count)
             self._done[played.episode] = np.where(done, acting, -1)
             np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
+            late = judged.succeeded & (judged.why == Why.LIMIT) & self._endless[acting]
+            self._late += np.bincount(acting[late], minlength=count)
         self._returns[played.episode, acting] += own
         for i, tally in self._below.items():
             tally.cut(played.episode[acting != i])
@@ -183,6 +191,7 @@ class SkillTally:
                 int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
                 float(returns[i]) if self._known(i) else None, int(self._next[0, i]),
                 dict(zip(paths, self._next[1 + i].tolist(), strict=True)), int(self._idle[i]),
+                int(self._late[i]),
             )  # fmt: skip
             if i in self._below:
                 found |= self._below[i].reports()
@@ -201,6 +210,12 @@ class SkillTally:
         if self.skills is None or not self.skills.skills[i].defines("success"):
             return None
         return int(self._succeeded[i])
+
+
+def _is_endless(skill: Skill) -> bool:
+    """Whether a skill says neither where it stops nor how long it lasts."""
+    lasts = (skill.max_steps, skill.call_steps)
+    return lasts == (None, None) and not skill.defines("termination")
 
 
 def played_below(played: Played, i: int, rows: Array) -> Played:
@@ -284,6 +299,17 @@ def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
                 "initiation() be False there; some other skill must be able to start."
             )
     return found
+
+
+def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """A sentence about each skill, a quarter of whose calls are late, or more."""
+    return [
+        f"{report.late:,} of {report.calls:,} calls of {name!r} had succeeded when the hierarchy's "
+        "limit ended them. If its work is done earlier, let its termination() be True there (in "
+        "its class: termination = success); if it shall last so long, give it max_steps."
+        for name, report in skills.items()
+        if 4 * report.late >= report.calls > 0
+    ]
 
 
 def _percent(value: float | None) -> str:

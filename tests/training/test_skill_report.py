@@ -294,6 +294,66 @@ def test_a_call_after_another_skill_is_not_idle_within_a_hierarchy():
     assert mixed.idle == 0
 
 
+class Reaching(Skill):
+    """Says that it is there, and does not stop there."""
+
+    policy = scripted(2)
+
+    def success(self, step):
+        return step.next_obs[:, POSITION] >= 4
+
+
+class Away(Reaching):
+    """Succeeds far away only."""
+
+    def success(self, step):
+        return step.next_obs[:, POSITION] >= 9
+
+
+class Stopping(Reaching):
+    termination = Reaching.success
+
+
+class Lasting(Reaching):
+    max_steps = 6
+
+
+class Called(Reaching):
+    call_steps = 6
+
+
+def test_a_skill_that_does_not_stop_where_it_has_succeeded_is_told():
+    found = told(first, Reaching, Left, call_steps=6)[1]
+    there = found.skills["reaching"]
+    # Where the episode ends with the sixth step, that is why the call ended.
+    assert there.late == sum((n - 1) // 6 for n in found.lengths) > there.calls / 4
+    assert found.for_people().splitlines()[-1] == (
+        f"{there.late:,} of {there.calls:,} calls of 'reaching' had succeeded when the hierarchy's "
+        "limit ended them. If its work is done earlier, let its termination() be True there (in "
+        "its class: termination = success); if it shall last so long, give it max_steps."
+    )
+
+
+@pytest.mark.parametrize("kind", [Stopping, Lasting, Called])
+def test_a_skill_that_says_when_it_stops_is_not_told(kind):
+    found = told(until_it_is_there, kind, Left, call_steps=6)[1]
+    assert found.skills[kind.name].late == 0
+    assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+
+
+def test_calls_that_had_not_succeeded_at_the_limit_are_not_told():
+    found = told(first, Reaching, Left, call_steps=3)[1]  # the first of an episode's calls
+    late = found.skills["reaching"].late
+    assert late == sum(max(0, (n - 1) // 3 - 1) for n in found.lengths) > 0
+
+
+def test_a_few_late_calls_are_not_told():
+    found = told(first, Away, Left, call_steps=1)[1]
+    assert 4 * found.skills["away"].late < found.skills["away"].calls
+    assert found.skills["away"].late > 0
+    assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+
+
 def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():
     inner = woven(Paid, Lucky, Zigzag)
 
