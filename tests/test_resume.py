@@ -69,7 +69,7 @@ hierarchy = Hierarchy(
     algorithm=small,
     selector=small,
     skill_steps=600,
-    selector_steps=600,
+    selector_steps=1500,
     cut_every=150,
     greedy_skills=False,
 )

@@ -34,7 +34,7 @@ SEED = 3
 CART, SHORT_CART, TINY = "CartPole-v1", "TortureCart-v0", "TortureTiny-v0"
 IN_PYTHON = EnvSpec(SHORT_CART, engine="sync", workers=1)
 TINY_IN_PYTHON = EnvSpec(TINY, engine="sync", workers=1)
-"""One process, said: how many are best is measured, and may differ while other programs run."""
+# One process, said: how many are best is measured, and may differ while other programs run.
 
 
 class Tiny(gym.Env[Any, Any]):

@@ -1,9 +1,5 @@
 """Jobs side by side, each in a fresh process that ends when this one does, however it ends.
 
-On Linux such a process is forked from one that has imported this library and nothing else, and so
-begins at once and shares its memory. Elsewhere forking after such imports is not safe: there, each
-process imports the library itself.
-
 ``ProcessPoolExecutor`` does not serve: where each of its processes does one job alone
 (``max_tasks_per_child=1``), it may wait for ever as it is shut down.
 """
@@ -13,7 +9,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -21,15 +16,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
-
 from skillweave.types import SkillweaveError
 
 PATIENCE = 1.0
 """Seconds between looks whether a job's process is still there."""
-_START: Any = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
-if sys.platform == "linux":
-    _START.set_forkserver_preload(["skillweave.cli.execute"])
+_START = multiprocessing.get_context("spawn")
 
 
 class ProcessEnded(SkillweaveError):
@@ -111,8 +102,6 @@ def processes(count: int) -> Iterator[Processes]:
 def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
     """Do a job, and send its result or its error."""
     _end_with_parent()
-    # A forked process has a copy of NumPy's own generator: without this all jobs draw the same.
-    np.random.seed()  # noqa: NPY002
     result: Any = None
     problem: Exception | None = None
     try:

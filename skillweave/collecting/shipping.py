@@ -56,7 +56,9 @@ def unpacked(data: bytes) -> Any:
 def _own_code() -> Iterator[None]:
     """Pickle modules by their content where they are not installed."""
     known = cloudpickle.list_registry_pickle_by_value()
-    found = [m for m in list(sys.modules.values()) if is_own_code(m) and m.__name__ not in known]
+    # Each once: where a process was spawned, the user's script stands there by two names.
+    modules = dict.fromkeys(sys.modules.values())
+    found = [m for m in modules if is_own_code(m) and m.__name__ not in known]
     for module in found:
         cloudpickle.register_pickle_by_value(module)
     try:

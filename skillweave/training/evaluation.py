@@ -17,14 +17,8 @@ from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
-from skillweave.training.skill_report import (
-    SkillReport,
-    SkillTally,
-    all_steps,
-    idle_calls,
-    late_calls,
-    skill_table,
-)
+from skillweave.training.skill_report import SkillReport, SkillTally, all_steps
+from skillweave.training.skill_text import idle_calls, late_calls, skill_table
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000

@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.collecting.calls import SkillSet, Why, skill_step, skills_below
 from skillweave.reading import Count
 from skillweave.skills import asked
-from skillweave.skills.base import RecordedSkill, Skill
+from skillweave.skills.base import RecordedSkill
 from skillweave.training.play import Played
 from skillweave.types import Array, Policy, unprefixed
 
@@ -50,7 +50,7 @@ class SkillReport:
     idle: Count = field(default=0, compare=False)
     """Calls that ended by themselves after one step, right after a call of it that had ended so."""
     late: Count = field(default=0, compare=False)
-    """Calls that had succeeded when the hierarchy's limit ended them, of a skill that says neither
+    """Calls that went on to their limit after they had succeeded, of a skill that says neither
     where it stops nor how long it lasts."""
 
     @property
@@ -88,6 +88,7 @@ class Judged:
     why: Array  # (k,) int8, ``Why`` its call has ended; RUNNING: it goes on
     reward: Array  # (k,) the running skill's own; the environment's where it defines none
     succeeded: Array  # (k,) bool, the call is over, and its skill's ``success`` says yes
+    has_succeeded: Array  # (k,) bool, ``success`` says yes; endless skills are asked at every step
 
 
 def judge(skills: SkillSet, played: Played) -> Judged:
@@ -98,13 +99,22 @@ def judge(skills: SkillSet, played: Played) -> Judged:
     acting, why = played.acting, played.why.copy()
     why[(why == Why.RUNNING) & played.over] = Why.EPISODE
     over = why != Why.RUNNING
-    own, succeeded = played.reward.copy(), np.zeros(len(acting), bool)
+    own, success = played.reward.copy(), np.zeros(len(acting), bool)
     for i, skill in enumerate(skills.skills):
         if skill.defines("reward") and len(rows := np.flatnonzero(acting == i)):
             own[rows] = _ask(skills, i, "reward", played, played.elapsed, rows)
-        if skill.defines("success") and len(rows := np.flatnonzero(over & (acting == i))):
-            succeeded[rows] = _ask(skills, i, "success", played, played.elapsed, rows)
-    return Judged(why, own, succeeded)
+        due = (acting == i) & (over | is_endless(skills, i))
+        if skill.defines("success") and len(rows := np.flatnonzero(due)):
+            success[rows] = _ask(skills, i, "success", played, played.elapsed, rows)
+    return Judged(why, own, success & over, success)
+
+
+def is_endless(skills: SkillSet, i: int) -> bool:
+    """Whether skill ``i`` is no hierarchy, and says neither where it stops nor how long."""
+    skill = skills.skills[i]
+    if skill.max_steps is not None or skill.call_steps is not None or skill.defines("termination"):
+        return False
+    return skills_below(skills.policies[i]) is None
 
 
 class SkillTally:
@@ -125,8 +135,10 @@ class SkillTally:
         self._ended = np.zeros((count, len(Why)), np.int64)
         self._succeeded = np.zeros(count, np.int64)
         self._late = np.zeros(count, np.int64)
-        declared = () if self.skills is None else self.skills.skills
-        self._endless = np.array([_is_endless(skill) for skill in declared], bool)
+        self._endless = np.array(
+            [self.skills is not None and is_endless(self.skills, i) for i in range(count)], bool
+        )
+        self._has_succeeded = np.zeros(episodes, bool)  # by episode, the call at its last step
         # By skill before (the first row: none) and skill after.
         self._next = np.zeros((1 + count, count), np.int64)
         self._before = np.zeros(episodes, np.int64)
@@ -163,8 +175,11 @@ class SkillTally:
             self._idle += np.bincount(acting[done & again], minlength=count)
             self._done[played.episode] = np.where(done, acting, -1)
             np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
-            late = judged.succeeded & (judged.why == Why.LIMIT) & self._endless[acting]
+            assert played.begun is not None
+            before = self._has_succeeded[played.episode] & ~played.begun & self._endless[acting]
+            late = before & judged.succeeded & (judged.why == Why.LIMIT)
             self._late += np.bincount(acting[late], minlength=count)
+            self._has_succeeded[played.episode] = judged.has_succeeded
         self._returns[played.episode, acting] += own
         for i, tally in self._below.items():
             tally.cut(played.episode[acting != i])
@@ -212,12 +227,6 @@ class SkillTally:
         return int(self._succeeded[i])
 
 
-def _is_endless(skill: Skill) -> bool:
-    """Whether a skill says neither where it stops nor how long it lasts."""
-    lasts = (skill.max_steps, skill.call_steps)
-    return lasts == (None, None) and not skill.defines("termination")
-
-
 def played_below(played: Played, i: int, rows: Array) -> Played:
     """A step of ``rows`` (m,) as it was in the hierarchy that is skill ``i``."""
     assert played.elapsed is not None
@@ -253,68 +262,3 @@ def _ask(
     skill = skills.skills[i]
     step = skill_step(played.step, rows, elapsed[rows], skill.max_steps)
     return asked(skill, method, step, len(rows), elapsed[rows], played.rows[rows])
-
-
-def skill_table(skills: Mapping[str, SkillReport]) -> str:
-    """The reports as an aligned table for people, a line for each skill."""
-    total = all_steps(skills)
-    head = ["skill", "share", "calls", "length", *ENDS.values()]
-    rows = [[*head, "success", "return"]]
-    for name, report in skills.items():
-        ends = [
-            _percent(report.ended[end] / report.calls) if report.ended and report.calls else "–"
-            for end in ENDS.values()
-        ]
-        rows.append(
-            [
-                name, _percent(report.steps / total if total else 0.0), f"{report.calls:,}",
-                _number(report.length_mean), *ends, _percent(report.success_rate),
-                _number(report.return_mean),
-            ]
-        )  # fmt: skip
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            [
-                row[0].ljust(widths[0]),
-                *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
-            ]
-        )
-        for row in rows
-    )
-
-
-def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """A sentence about each skill most of whose calls are idle, while the others take time.
-
-    A skill whose calls all take a step or two, as a move does, is not meant.
-    """
-    found = []
-    for name, report in skills.items():
-        others = report.calls - report.idle
-        if report.idle > others and report.steps - report.idle > 2 * others:
-            found.append(
-                f"{report.idle:,} of {report.calls:,} calls of {name!r} ended after one step, "
-                "right after a call of it had ended. If its work is done there, let its "
-                "initiation() be False there; some other skill must be able to start."
-            )
-    return found
-
-
-def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """A sentence about each skill, a quarter of whose calls are late, or more."""
-    return [
-        f"{report.late:,} of {report.calls:,} calls of {name!r} had succeeded when the hierarchy's "
-        "limit ended them. If its work is done earlier, let its termination() be True there (in "
-        "its class: termination = success); if it shall last so long, give it max_steps."
-        for name, report in skills.items()
-        if 4 * report.late >= report.calls > 0
-    ]
-
-
-def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{value:.0%}"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:,.1f}"

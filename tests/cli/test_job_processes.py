@@ -5,11 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 
-import numpy as np
 import pytest
 
 from skillweave.cli.processes import ProcessEnded, processes
@@ -32,14 +30,6 @@ def unsendable() -> threading.Lock:
     return threading.Lock()
 
 
-def drawn() -> float:
-    return np.random.random()  # noqa: NPY002
-
-
-def imported(name: str) -> bool:
-    return name in sys.modules
-
-
 def ended_beside_a_child() -> None:
     """Is killed while a process that it has begun still holds its pipe."""
     multiprocessing.get_context("fork").Process(target=time.sleep, args=(30,)).start()
@@ -57,23 +47,6 @@ def test_jobs_return_or_raise_what_they_did_there():
             wrong[failed].result()
         with pytest.raises(RuntimeError, match="lock"):
             wrong[unsendable].result()
-
-
-def test_no_two_jobs_draw_the_same_from_numpys_own_generator():
-    with processes(2) as pool:
-        results = {pool.submit(drawn).result() for _ in range(4)}
-    assert len(results) == 4
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only there are processes forked")
-def test_a_job_begins_with_the_library_imported_and_with_nothing_else_of_this_process():
-    sys.modules["only_here"] = sys
-    try:
-        with processes(1) as pool:
-            assert pool.submit(imported, "skillweave.cli.execute").result()
-            assert not pool.submit(imported, "only_here").result()
-    finally:
-        del sys.modules["only_here"]
 
 
 def test_a_process_that_is_ended_is_told_at_once_though_another_holds_its_pipe():

@@ -56,6 +56,34 @@ def recipe(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
+SPAWNS = """
+import multiprocessing
+
+class Own:
+    answer = 7
+
+def send():
+    from skillweave.collecting.shipping import packed, unpacked
+
+    for _ in range(2):
+        print(unpacked(packed(Own(), "it")).answer)
+
+if __name__ == "__main__":
+    child = multiprocessing.get_context("spawn").Process(target=send)
+    child.start()
+    child.join()
+    raise SystemExit(child.exitcode)
+"""
+
+
+def test_a_script_sends_its_own_classes_from_a_process_that_it_spawned(tmp_path):
+    (tmp_path / "script.py").write_text(SPAWNS)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout.split()) == (0, ["7", "7"]), done.stderr
+
+
 def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_path):
     file = tmp_path / "packed"
     file.write_bytes(packed(recipes.load(recipe), "it"))

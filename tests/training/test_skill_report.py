@@ -28,7 +28,8 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import FIRST_SEED
-from skillweave.training.skill_report import SkillReport, skill_table
+from skillweave.training.skill_report import SkillReport
+from skillweave.training.skill_text import skill_table
 
 NONE = {"own": 0, "limit": 0, "interrupted": 0, "episode": 0}
 
@@ -314,6 +315,18 @@ class Stopping(Reaching):
     termination = Reaching.success
 
 
+class Failing(Reaching):
+    def termination(self, step):
+        return step.next_obs[:, POSITION] < -99
+
+
+class Passing(Reaching):
+    """Has succeeded in its fifth step only."""
+
+    def success(self, step):
+        return step.next_obs[:, POSITION] == 5
+
+
 class Lasting(Reaching):
     max_steps = 6
 
@@ -328,30 +341,54 @@ def test_a_skill_that_does_not_stop_where_it_has_succeeded_is_told():
     # Where the episode ends with the sixth step, that is why the call ended.
     assert there.late == sum((n - 1) // 6 for n in found.lengths) > there.calls / 4
     assert found.for_people().splitlines()[-1] == (
-        f"{there.late:,} of {there.calls:,} calls of 'reaching' had succeeded when the hierarchy's "
-        "limit ended them. If its work is done earlier, let its termination() be True there (in "
-        "its class: termination = success); if it shall last so long, give it max_steps."
+        f"{there.late:,} of {there.calls:,} calls of 'reaching' went on to their limit after they "
+        "had succeeded. If its work is done then, let its termination() be True where success() "
+        "is; if it is meant to last, give it max_steps."
     )
 
 
-@pytest.mark.parametrize("kind", [Stopping, Lasting, Called])
+@pytest.mark.parametrize("kind", [Stopping, Failing, Lasting, Called])
 def test_a_skill_that_says_when_it_stops_is_not_told(kind):
     found = told(until_it_is_there, kind, Left, call_steps=6)[1]
     assert found.skills[kind.name].late == 0
     assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
 
 
-def test_calls_that_had_not_succeeded_at_the_limit_are_not_told():
-    found = told(first, Reaching, Left, call_steps=3)[1]  # the first of an episode's calls
-    late = found.skills["reaching"].late
-    assert late == sum(max(0, (n - 1) // 3 - 1) for n in found.lengths) > 0
+@pytest.mark.parametrize("call_steps", [1, 3, 4])
+def test_calls_that_succeed_with_their_last_step_are_not_late(call_steps):
+    found = told(first, Reaching, Left, call_steps=call_steps)[1]
+    ends = [e for n in found.lengths for e in range(call_steps, n, call_steps)]
+    # It is there with the fourth step, so calls that end with a later one had been there before.
+    late = sum(e > 4 for e in ends) if call_steps > 1 else 0
+    assert found.skills["reaching"].late == late
+    assert len(ends) > late
+
+
+def test_a_success_that_is_over_at_the_limit_is_not_told():
+    assert told(first, Passing, Left, call_steps=6)[1].skills["passing"].late == 0
 
 
 def test_a_few_late_calls_are_not_told():
-    found = told(first, Away, Left, call_steps=1)[1]
+    found = told(first, Away, Left, call_steps=2)[1]
     assert 4 * found.skills["away"].late < found.skills["away"].calls
     assert found.skills["away"].late > 0
     assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+
+
+def test_a_hierarchy_that_stops_as_nobody_may_start_is_not_late():
+    class Nested(Skill):
+        policy = woven(Right, call_steps=None)
+        initiation = Right.initiation
+
+        def success(self, step):
+            return step.next_obs[:, POSITION] >= 0
+
+    def choose(obs):
+        return (obs[:, POSITION] >= 2).astype(np.int64)
+
+    found = told(choose, Nested, Left, call_steps=1_000)[1].skills["nested"]
+    assert found.succeeded == found.calls > found.ended["limit"] > 10
+    assert found.late == 0
 
 
 def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():

@@ -1,0 +1,72 @@
+"""What the skills of a policy did, for people: a table, and hints where something looks wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from skillweave.training.skill_report import ENDS, SkillReport, all_steps
+
+
+def skill_table(skills: Mapping[str, SkillReport]) -> str:
+    """The reports as an aligned table for people, a line for each skill."""
+    total = all_steps(skills)
+    head = ["skill", "share", "calls", "length", *ENDS.values()]
+    rows = [[*head, "success", "return"]]
+    for name, report in skills.items():
+        ends = [
+            _percent(report.ended[end] / report.calls) if report.ended and report.calls else "–"
+            for end in ENDS.values()
+        ]
+        rows.append(
+            [
+                name, _percent(report.steps / total if total else 0.0), f"{report.calls:,}",
+                _number(report.length_mean), *ends, _percent(report.success_rate),
+                _number(report.return_mean),
+            ]
+        )  # fmt: skip
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(
+            [
+                row[0].ljust(widths[0]),
+                *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
+            ]
+        )
+        for row in rows
+    )
+
+
+def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """A sentence about each skill most of whose calls are idle, while the others take time.
+
+    A skill whose calls all take a step or two, as a move does, is not meant.
+    """
+    found = []
+    for name, report in skills.items():
+        others = report.calls - report.idle
+        if report.idle > others and report.steps - report.idle > 2 * others:
+            found.append(
+                f"{report.idle:,} of {report.calls:,} calls of {name!r} ended after one step, "
+                "right after a call of it had ended. If its work is done there, let its "
+                "initiation() be False there; some other skill must be able to start."
+            )
+    return found
+
+
+def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """A sentence about each skill, a quarter of whose calls are late, or more."""
+    return [
+        f"{report.late:,} of {report.calls:,} calls of {name!r} went on to their limit after they "
+        "had succeeded. If its work is done then, let its termination() be True where success() "
+        "is; if it is meant to last, give it max_steps."
+        for name, report in skills.items()
+        if 4 * report.late >= report.calls > 0
+    ]
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{value:.0%}"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:,.1f}"
