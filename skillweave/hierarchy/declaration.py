@@ -171,7 +171,7 @@ class Declaration(Nestable):
             SkillweaveError: there is none; the message lists them.
         """
         found = dict(every_skill(self.skills))
-        if name not in found:
+        if not isinstance(name, str) or name not in found:
             raise SkillweaveError(f"no skill {short(name)}; there are: {', '.join(found)}")
         return found[name]
 

@@ -136,7 +136,9 @@ class Skill:
 
 def _is_color(value: object) -> bool:
     """Whether a value is red, green and blue, each from 0 to 255."""
-    if not isinstance(value, tuple | list | np.ndarray) or np.shape(value) != (3,):
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, tuple | list) or len(value) != 3:
         return False
     return all(isinstance(v, int | np.integer) and 0 <= v <= 255 for v in value)
 

@@ -172,6 +172,12 @@ def test_a_wrong_declaration_is_not_trained(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("name", [[], [0, 1], {"a": 1}, 7, None], ids=str)
+def test_a_skill_asked_for_by_what_is_no_name_is_answered_so_too(name):
+    with pytest.raises(SkillweaveError, match=r"no skill .*; there are: "):
+        declare().skill(name)
+
+
 def test_a_skill_that_is_not_there_is_answered_with_those_that_are():
     with pytest.raises(SkillweaveError, match=r"'middle'.*center, lean"):
         declare().skill("middle")

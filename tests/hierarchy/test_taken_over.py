@@ -191,7 +191,19 @@ def test_a_distance_from_no_guide_is_refused(nats):
         declare(guide_nats=nats)
 
 
-@pytest.mark.parametrize("color", ["red", (1, 2), (1, 2, 300), (0.1, 0.2, 0.3), 7])
+COLORS = [
+    "red",
+    (1, 2),
+    (1, 2, 300),
+    (0.1, 0.2, 0.3),
+    7,
+    [[1], [1, 2]],
+    [1, [2, 3], 4],
+    np.array(7),
+]
+
+
+@pytest.mark.parametrize("color", COLORS, ids=str)
 def test_a_color_that_is_none_is_refused(color):
     class Painted(Left):
         pass
@@ -199,6 +211,15 @@ def test_a_color_that_is_none_is_refused(color):
     Painted.color = color
     with pytest.raises(SkillweaveError, match=r"skill 'painted' .*color is .*red, green and blue"):
         declare(skills=[Painted()])
+
+
+@pytest.mark.parametrize("color", [(1, 2, 3), [255, 0, 0], np.array([1, 2, 3], np.uint8)], ids=str)
+def test_a_color_may_be_of_any_kind_of_row(color):
+    class Painted(Left):
+        pass
+
+    Painted.color = color
+    assert declare(skills=[Painted()]).skills[0].color is color
 
 
 def test_names_that_are_nearly_those_of_a_skill_are_told():
