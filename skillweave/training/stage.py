@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -14,6 +13,7 @@ from skillweave.collecting import levels
 from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
 from skillweave.ops.device import resolve_device
+from skillweave.reading import LARGEST_FLOAT
 from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy, SkillweaveError
@@ -70,8 +70,10 @@ def target_of(
         raise SkillweaveError(f"{where}: give target_return or target_success, not both")
     for of, value in given.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not math.isfinite(value):
-            raise SkillweaveError(f"{where}: {field}_{of} is {short(value)}; it must be a number")
+        if not number or not abs(value) <= LARGEST_FLOAT:
+            raise SkillweaveError(
+                f"{where}: {field}_{of} is {short(value)}; it must be a number, of float32's range"
+            )
         if of == "success" and not 0.0 < value <= 1.0:
             raise SkillweaveError(
                 f"{where}: target_success is {short(value)}; it is a share of episodes, more than "

@@ -210,6 +210,8 @@ def test_a_population_ends_at_its_stages_target(tmp_path: Path) -> None:
         ({"target_return": 1.0}, "stage 'agent': it has a target_return, .*set eval_every"),
         ({"target_return": "x", "eval_every": 9}, "agent: target_return is 'x'; it must be a"),
         ({"target_return": float("nan"), "eval_every": 9}, "target_return is nan"),
+        ({"target_return": -1e200, "eval_every": 9}, "agent: target_return is -1e.200; .*float32"),
+        ({"target_return": 10**400, "eval_every": 9}, "agent: target_return is .*float32"),
         ({"target_success": 2, "eval_every": 9}, "target_success is 2; it is a share"),
         (
             {"target_success": 0.5, "target_return": 1.0, "eval_every": 9},
