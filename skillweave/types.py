@@ -66,6 +66,16 @@ def finite(array: Array) -> bool:
     return b"\0" not in np.isfinite(array).tobytes()
 
 
+LARGEST_REWARD = 1e15
+"""The largest size of a reward: what learners square, sums of rewards, fits into float32."""
+
+
+def wrong_reward(rewards: Array) -> int | None:
+    """The first that is not finite or larger than ``LARGEST_REWARD``: its row; None: all fit."""
+    fit = np.abs(rewards) <= LARGEST_REWARD
+    return int(np.flatnonzero(~fit)[0]) if b"\0" in fit.tobytes() else None
+
+
 @dataclass(slots=True)
 class Step:
     """One environment transition as a skill's methods see it, batched over N environments.

@@ -105,7 +105,7 @@ class PPO(OnPolicy):
     """Advantages to normalise that have a smaller deviation, in units of reward, are divided by
     this: where nothing was won yet, they are the critic's errors. 0: no limit."""
     normalize_returns: bool = True
-    """The critic learns returns in units of their running deviation: no reward is too large."""
+    """The critic learns returns in units of their running deviation, so rewards may be large."""
     action_std_init: float = 0.6
     """Initial standard deviation of continuous actions, where a bounded range spans [−1, 1]."""
     action_std: Literal["parameter", "state"] = "parameter"

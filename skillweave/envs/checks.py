@@ -14,7 +14,13 @@ import numpy as np
 
 from skillweave.messages import short, told
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.types import Array, SkillweaveError, finite
+from skillweave.types import (
+    LARGEST_REWARD,
+    Array,
+    SkillweaveError,
+    finite,
+    wrong_reward,
+)
 
 LONGEST_EPISODE = 100_000
 """Steps after which an episode is cut that nothing ends, wherever a policy is only watched."""
@@ -22,7 +28,7 @@ LONGEST_FILM = 10_000
 """The same of a video."""
 
 
-_LARGEST = float(np.finfo(np.float32).max)
+_REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
 
 
 class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -88,8 +94,8 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             raise self._misfit(obs)
         if type(reward) is not float:
             reward = self._number_of(reward)
-        if not -_LARGEST <= reward <= _LARGEST:
-            raise self._wrong(f"its reward is {reward}; it must be finite, as float32 too")
+        if not -LARGEST_REWARD <= reward <= LARGEST_REWARD:
+            raise self._wrong(f"its reward is {reward}; {_REWARDS}")
         if type(terminated) is not bool:
             terminated = self._flag(terminated, "terminated")
         if type(truncated) is not bool:
@@ -177,9 +183,8 @@ class Watch:
         else:
             self._elapsed[ids] += 1
         self._check(raw.next_obs, ids)
-        if not finite(raw.reward):
-            row = int(np.flatnonzero(~np.isfinite(raw.reward))[0])
-            raise self._wrong(row, ids, f"its reward is {raw.reward[row]}; it must be finite")
+        if (row := wrong_reward(raw.reward)) is not None:
+            raise self._wrong(row, ids, f"its reward is {raw.reward[row]}; {_REWARDS}")
         return raw
 
     def _check(self, obs: Array, ids: Array | None) -> None:

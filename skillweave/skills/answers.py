@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave.messages import short
 from skillweave.skills.outputs import as_array, at_step, called
-from skillweave.types import Array, SkillweaveError, Step, finite, read_only
+from skillweave.types import LARGEST_REWARD, Array, SkillweaveError, Step, read_only, wrong_reward
 
 
 def answer(
@@ -71,12 +71,11 @@ def checked(
         )
     with np.errstate(over="ignore"):  # an overflow is an infinity, reported below
         array = array.astype(dtype, copy=False)
-    if not finite(array):
-        row = int(np.flatnonzero(~np.isfinite(array))[0])
+    if (row := wrong_reward(array)) is not None:
         when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
         raise SkillweaveError(
             f"{who}: {method}() returned {array[row]}{when} for environment {_number(row, ids)}: "
-            "rewards must be finite"
+            f"rewards must be finite, and at most {LARGEST_REWARD:g} in size"
         )
     return array
 

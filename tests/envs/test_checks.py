@@ -59,6 +59,10 @@ WRONG = {
     "a NaN as reward": (but(reward=np.nan), "its reward is nan; it must be finite"),
     "an infinite reward": (but(reward=-np.inf), "its reward is -inf"),
     "a reward too large": (but(reward=1e300), r"its reward is 1e\+300"),
+    "a reward too large to square": (
+        but(reward=-2e15),
+        r"-2000000000000000.0; it must be .*at most 1e\+15",
+    ),
     "terminated: NaN": (but(terminated=np.nan), "terminated is nan; it must be True or False"),
     "terminated: 7": (but(terminated=7), "terminated is 7"),
     "terminated: text": (but(terminated="no"), "terminated is 'no'"),
@@ -232,7 +236,16 @@ def test_large_numbers_are_numbers():
     watch = Watch("X", BOX, 2)
     huge = np.full((2, 2), 3e38, np.float32)  # their squares are infinite
     assert watch.begun(huge) is huge
-    watch.stepped(raw(huge, (3e38, -3e38)))
+    watch.stepped(raw(huge, (1e15, -1e15)))
+
+
+@pytest.mark.parametrize("reward", [2e15, -3e38])
+def test_a_reward_too_large_to_be_squared_names_its_environment(reward):
+    # Before, training ended with a NaN and the advice to lower the learning rate.
+    watch = Watch("X", BOX, 2)
+    watch.begun(zeros := np.zeros((2, 2), np.float32))
+    with pytest.raises(SkillweaveError, match=r"X: environment 1, step 1.*at most 1e\+15 in size"):
+        watch.stepped(raw(zeros, (0.0, reward)))
 
 
 def test_envpool_is_watched_too(monkeypatch):

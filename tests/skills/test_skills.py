@@ -122,6 +122,13 @@ def test_a_number_too_large_for_float32_is_not_finite_either():
         checked([0.0, 1e300], 2, np.float32, "skill x", "reward", 7)
 
 
+@pytest.mark.parametrize("bad", [2e15, -1e33])
+def test_a_reward_too_large_to_be_squared_is_refused(bad):
+    says = r"skill x: reward\(\).*environment 1.*at most 1e\+15"
+    with pytest.raises(SkillweaveError, match=says):
+        checked([1e15, bad], 2, np.float32, "skill x", "reward", 7)
+
+
 @pytest.mark.parametrize("bad", [0.0, np.zeros(3), np.zeros((2, 1))], ids=["()", "(3,)", "(2, 1)"])
 def test_a_wrong_shape_is_named(bad):
     with pytest.raises(SkillweaveError, match=r"reward\(\) returned shape \(.*at step 7.*\(2,\)"):
