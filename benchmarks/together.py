@@ -114,13 +114,13 @@ def together(task: Task, steps: int, **how: Any) -> Hierarchy:
 def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
     """Skills apart, each after calls of those before, then the selector."""
     *each, last = [steps * part // sum(task.parts) for part in task.parts]
-    asked = {
+    asked: dict[str, Any] = {
         "learn": "apart",
         "start_calls": 8,
         "selector": task.algorithm(**FLOORS),
         "selector_steps": last,
     }
-    hierarchy = together(task, steps, **asked | task.apart | how)
+    hierarchy = together(task, steps, **asked | dict(task.apart) | how)
     for skill, own in zip(hierarchy.skills, each, strict=True):
         skill.steps = own
     if task.last_skill is not None:
@@ -199,8 +199,8 @@ def one(case: str, task: str, steps: int, engine: str, f4: bool, seed: int) -> d
         score, usage = solved(run)
         stages = run.info()["stages"]
         told = {"seed": seed, "solved": score, "usage": usage, "seconds": seconds}
-        if f4 and not isinstance(learner, Flat):
-            told["f4"] = without_selector(run, declare(), Path(folder) / "lot", seed)
+        if f4 and isinstance(same := declare(), Hierarchy):
+            told["f4"] = without_selector(run, same, Path(folder) / "lot", seed)
     told["steps"] = sum(s["steps"] + s["evaluation_steps"] for s in stages)
     kept = stages[-1].get("kept")
     return told | ({} if kept is None else {"kept": kept})
@@ -229,7 +229,8 @@ def main() -> None:
     parser.add_argument("--engine", choices=("auto", "sync"), default="auto")
     parser.add_argument("--f4", action="store_true", help="score skills without the selector, too")
     asked = cases_asked(parser, CASES, steps=500_000)
-    rows, found = [], {}
+    rows: list[tuple[str, ...]] = []
+    found: dict[str, list[dict[str, Any]]] = {}
     with workers(asked.processes) as pool:
         futures = {
             case: [

@@ -172,7 +172,9 @@ class Report(Output):
 class Compare(Output):
     """Write one HTML file that compares runs; those that differ by their seed alone are a group."""
 
-    runs: Positional[tuple[Path, ...]] = tyro.MISSING
+    runs: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")] = (
+        tyro.MISSING
+    )
     """The runs' directories."""
     out: Annotated[Path, arg(aliases=["-o"])] = Path("compare.html")
     """The file to write."""
