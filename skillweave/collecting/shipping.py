@@ -57,7 +57,7 @@ def _own_code() -> Iterator[None]:
     """Pickle modules by their content where they are not installed."""
     known = cloudpickle.list_registry_pickle_by_value()
     # Each once: where a process was spawned, the user's script stands there by two names.
-    modules = dict.fromkeys(sys.modules.values())
+    modules = {id(m): m for m in list(sys.modules.values())}.values()  # not all have a hash
     found = [m for m in modules if is_own_code(m) and m.__name__ not in known]
     for module in found:
         cloudpickle.register_pickle_by_value(module)
