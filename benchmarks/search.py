@@ -5,7 +5,8 @@
 Four members begin with settings drawn from a wide prior over learning rate, γ, λ, entropy, clip,
 width and depth, and train for a million steps each. Random search draws from the same prior, trains
 every draw to its end and takes the best by the same fitness: once the same four draws, and once
-eight draws of half as many steps. The defaults get all steps for one agent. Scores are 100 greedy
+eight draws of half as many steps. The defaults get all steps for one agent. Evolution selects by
+truncation; "tournaments" is the same with the library's default selection. Scores are 100 greedy
 episodes of Gymnasium's environment with seeds that training never saw.
 """
 
@@ -18,7 +19,16 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import median, report, table, workers
-from skillweave import PPO, Evolution, Mutations, Network, Range, train_agent
+from skillweave import (
+    PPO,
+    Evolution,
+    Mutations,
+    Network,
+    Range,
+    Tournament,
+    Truncation,
+    train_agent,
+)
 
 BUDGET, GENERATIONS = 4_000_000, 20
 PRIOR = {
@@ -32,7 +42,11 @@ MUTATIONS = Mutations(
     none=0.2, hyperparameters=0.6, parameters=0.0, architecture=0.2, activation=0.0,
     ranges=PRIOR, units=(16, 256), layers=(1, 3),
 )  # fmt: skip
-EVOLVED = Evolution(4, GENERATIONS, episodes=20, start="random", mutations=MUTATIONS)
+# A generation is short, and while nobody can land its best member is so by chance. By truncation
+# that member replaces the worst one only; by tournaments all others may be replaced at once.
+EVOLVED = Evolution(
+    4, GENERATIONS, episodes=20, start="random", selection=Truncation(), mutations=MUTATIONS
+)
 # One generation: whoever is best at the end of training.
 RANDOM = {draws: replace(EVOLVED, population=draws, generations=1) for draws in (4, 8)}
 MEMBER = PPO(
@@ -48,6 +62,7 @@ WAYS: dict[str, tuple[PPO, int, Evolution | None]] = {
     "random search, 4 draws": (MEMBER, BUDGET // 4, RANDOM[4]),
     "random search, 8 draws": (MEMBER, BUDGET // 8, RANDOM[8]),
     "defaults": (PPO(), BUDGET, None),
+    "tournaments": (MEMBER, BUDGET // 4, replace(EVOLVED, selection=Tournament())),
 }
 
 
