@@ -26,6 +26,9 @@ from skillweave.types import Array
 
 LOG_STD = (-5.0, 2.0)
 """Range of a log deviation that depends on the state."""
+WIDEST = 1.0
+"""The deviation of a Box's actions, in policy units, that the entropy bonus does not pay to exceed.
+A bounded range spans [−1, 1] there."""
 
 
 class ActionHead:
@@ -132,6 +135,25 @@ class ActionHead:
             z = ((action - mean) * (-log_std).exp()).detach()
             entropy = entropy + tanh_log_det(mean + log_std.exp() * z).sum(-1)
         return log_prob, entropy
+
+    def surplus(self, head: Tensor, log_std: Tensor | None) -> Tensor | None:
+        """What is too much of the entropy, in nats, (...); None: nothing.
+
+        A normal's entropy grows with its deviation without end. A bonus for it would widen the
+        deviation for ever where rewards are rare, until the mean does not matter. But actions are
+        clipped to their range: from some deviation on, ``WIDEST``, they are less spread the wider
+        it is, as ever more are at one bound or the other. So each nat beyond counts against it.
+
+        Args:
+            head: (..., width), what a network's last layer says.
+            log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
+                None.
+        """
+        if self.discrete or self.squash:
+            return None
+        mean, log_std = self.moments(head, log_std)
+        beyond = (log_std - math.log(WIDEST)).clamp_min(0.0).expand_as(mean).sum(-1)
+        return 2.0 * beyond
 
     def kl(
         self,

@@ -247,6 +247,20 @@ def test_continuous_sampling_has_the_initial_deviation():
     torch.testing.assert_close(action[0].mean(0), head[0, 0], rtol=0, atol=0.01)
 
 
+@pytest.mark.parametrize("action_std", ["parameter", "state"])
+def test_where_nothing_is_paid_the_entropy_bonus_does_not_widen_the_deviation_for_ever(action_std):
+    algorithm, state = make(
+        Box(-1, 1, (2,)), ent_coef=0.1, learning_rate=0.02, action_std=action_std
+    )
+    for i in range(60):
+        data = replace(rollout(algorithm, state, i), reward=torch.zeros(1, T, B))
+        state, _ = algorithm.update(state, data, rngs(i))
+    head = algorithm.act(algorithm.acting_params(state), torch.full((1, 1, 3), 2.0), None, None)[1]
+    log_std = algorithm.layout.views(state.params).get("actor.log_std")
+    deviation = algorithm.head.moments(head, log_std)[1].exp()
+    assert (0.8 < deviation).all() and (deviation < 1.5).all()
+
+
 def test_a_masked_action_is_never_taken_and_has_no_probability():
     algorithm, state = make()
     algorithm.layout.views(state.params)["actor.1.bias"][:] = torch.tensor([9.0, 0.0, 0.0, 9.0])

@@ -104,6 +104,26 @@ def test_a_deviation_out_of_its_range_learns_to_come_back_and_not_to_go_further(
 
 
 @pytest.mark.parametrize("std", ["parameter", "state"])
+def test_entropy_is_worth_less_beyond_the_deviation_that_fills_the_range(std):
+    head = ActionHead(action_codec(Box(-1, 1, (2,))), std)
+    log = torch.tensor([[[-1.0, -0.5], [0.5, 1.5]]], requires_grad=True)
+    mean = torch.zeros(1, 2, 2)
+    raw, log_std = (mean, log) if std == "parameter" else (torch.cat([mean, log], -1), None)
+    surplus = head.surplus(raw, log_std)
+    assert surplus.tolist() == [[0.0, 4.0]]  # twice the 0.5 + 1.5 nats beyond a deviation of 1
+    worth = head.stats(raw, log_std, None, mean)[1] - surplus
+    worth.sum().backward()
+    assert log.grad.tolist() == [[[1.0, 1.0], [-1.0, -1.0]]]
+
+
+@pytest.mark.parametrize(("space", "squash"), [(Discrete(3), False), (Box(-1, 1, (2,)), True)])
+def test_all_entropy_of_what_is_bounded_is_worth_something(space, squash):
+    head = ActionHead(action_codec(space), "parameter", squash)
+    log_std = None if space == Discrete(3) else torch.full((1, 1, 2), 3.0)
+    assert head.surplus(torch.zeros(1, 1, head.width), log_std) is None
+
+
+@pytest.mark.parametrize("std", ["parameter", "state"])
 def test_a_squashed_log_probability_is_that_of_torchs_transformed_distribution(std, generator):
     head = ActionHead(action_codec(Box(-1, 1, (3,))), std, squash=True)
     raw = torch.randn(P, B, head.width, generator=generator)
