@@ -83,7 +83,9 @@ class PPOAlgorithm(Algorithm):
         params = torch.zeros(len(seeds), self.layout.size)
         views, generators = self.layout.views(params), self.member_generators(seeds)
         self.actor_net.init_(views, 0.01, generators)
-        self.critic_net.init_(views, 1.0, generators)
+        # All values begin at 0. A random critic's errors are the only advantages until something
+        # is paid for the first time, and they can lead the policy away from where that would be.
+        self.critic_net.init_(views, 0.0, generators)
         if self.head.std_in_head:
             bias = views[f"{self.actor_net.head}.bias"]
             bias[..., self.codec.size :].fill_(self.config.action_std_init).log_()

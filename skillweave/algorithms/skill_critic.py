@@ -54,9 +54,9 @@ class SkillCriticAlgorithm(Algorithm):
         self.acting = self.layout = Layout(self.net.shapes)
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> AgentState:
-        """A state of fresh members, to which all skills are worth about the same."""
+        """A state of fresh members, to which all skills are worth the same."""
         params = torch.zeros(len(seeds), self.layout.size)
-        self.net.init_(self.layout.views(params), 0.01, self.member_generators(seeds))
+        self.net.init_(self.layout.views(params), 0.0, self.member_generators(seeds))
         return AgentState(**self.fresh_fields(params))
 
     def parameter_groups(self) -> list[ParameterGroup]:

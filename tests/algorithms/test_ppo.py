@@ -247,6 +247,19 @@ def test_continuous_sampling_has_the_initial_deviation():
     torch.testing.assert_close(action[0].mean(0), head[0, 0], rtol=0, atol=0.01)
 
 
+@pytest.mark.parametrize("space", [Discrete(4), Box(-1, 1, (2,))])
+@pytest.mark.parametrize("normalize_advantage", [True, False])
+def test_a_policy_does_not_move_until_something_is_paid(space, normalize_advantage):
+    algorithm, state = make(space, ent_coef=0.0, normalize_advantage=normalize_advantage)
+    before = state.params.clone()
+    for i in range(3):
+        data = replace(rollout(algorithm, state, i), reward=torch.zeros(1, T, B))
+        state, _ = algorithm.update(state, data, rngs(i))
+    assert torch.equal(state.params, before)
+    state, _ = algorithm.update(state, rollout(algorithm, state, 3), rngs(3))
+    assert not torch.equal(state.params, before)
+
+
 @pytest.mark.parametrize("action_std", ["parameter", "state"])
 def test_where_nothing_is_paid_the_entropy_bonus_does_not_widen_the_deviation_for_ever(action_std):
     algorithm, state = make(
