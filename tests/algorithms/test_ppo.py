@@ -271,7 +271,8 @@ def test_where_nothing_is_paid_the_entropy_bonus_does_not_widen_the_deviation_fo
     head = algorithm.act(algorithm.acting_params(state), torch.full((1, 1, 3), 2.0), None, None)[1]
     log_std = algorithm.layout.views(state.params).get("actor.log_std")
     deviation = algorithm.head.moments(head, log_std)[1].exp()
-    assert (0.8 < deviation).all() and (deviation < 1.5).all()
+    assert (deviation > 0.8).all()
+    assert (deviation < 1.5).all()
 
 
 def test_a_masked_action_is_never_taken_and_has_no_probability():

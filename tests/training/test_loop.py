@@ -100,9 +100,9 @@ def test_a_forbidden_action_is_never_taken_and_the_best_of_the_others_is_learnt(
 
 
 def test_a_time_limit_is_bootstrapped():
-    algorithm, state = train(Allowance(16), 60)
+    algorithm, state = train(Allowance(16), 200)
     assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(
-        1 / (1 - 0.9), rel=0.05
+        1 / (1 - 0.9), rel=0.02
     )
 
 
