@@ -3,10 +3,11 @@
     python -m benchmarks.together [CASE …] [--task 8x8] [--seeds 0 1 2 3 4] [--steps 500000]
 
 Tasks: ``8x8`` and ``16x16``, MiniGrid's DoorKey (``examples/doorkey.py``); ``bridge``, a longer
-chain (``examples/bridge.py``). Every case has the same number of environment steps in all. Scores
-are 100 episodes with a selector that samples, with seeds that training never saw. DoorKey is scored
-on MiniGrid's own environment; training steps EnvPool's, or with ``--engine sync`` MiniGrid's own.
-Two runs go side by side (``--processes``), so the seconds are those of a busy machine.
+chain (``examples/bridge.py``); ``yard``, one with continuous actions (``examples/yard.py``). Every
+case has the same number of environment steps in all. Scores are 100 episodes with a selector that
+samples, with seeds that training never saw. DoorKey is scored on MiniGrid's own environment;
+training steps EnvPool's, or with ``--engine sync`` MiniGrid's own. Two runs go side by side
+(``--processes``), so the seconds are those of a busy machine.
 
 Flat agents: ``flat`` (F0), ``"skill rewards x 0.1"`` and other weights (F1), ``bonus`` (F2). With
 ``--f4`` the skills of each hierarchy are also scored without its selector: chosen by lot, and each
@@ -31,7 +32,7 @@ from benchmarks.common import cases_asked, median, report, table, workers
 from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat, with_bonus
 from benchmarks.pay.suite import Shaped
-from examples import bridge, doorkey
+from examples import bridge, doorkey, yard
 from skillweave import PPO, Array, Hierarchy, Lengths, Run, Together
 
 FLOOR = Together(floor=1.0, floor_final=0.1)
@@ -101,6 +102,14 @@ TASKS = {
         (4, 5, 5, 3, 3),
         {},
         cells=lambda obs: obs[:, :5],
+        has_engines=False,
+    ),
+    "yard": Task(
+        yard.declare,
+        yard.algorithm,
+        (1, 1, 1, 1),
+        {},
+        cells=lambda obs: np.floor(obs / 0.1),
         has_engines=False,
     ),
 }

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 9
+COUNT = 10
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
     "bridge.py": ("--steps", "3000", "--out", "{folder}/run"),
@@ -20,6 +20,7 @@ SMALL = {
     "own_algorithm.py": ("--steps", "2000", "--out", "{folder}/run"),
     "sb3_selector.py": ("--steps", "3000", "--episodes", "2"),
     "tutorial.py": ("--scale", "0.01", "--episodes", "2", "--out", "{folder}/run"),
+    "yard.py": ("--steps", "5000", "--out", "{folder}/run"),
 }
 """Small budgets, for those that take long."""
 NEEDS = {
@@ -38,6 +39,7 @@ SAYS = {
     "ready_selectors.py": "automaton  return 1.00",
     "sb3_selector.py": "woven by the selector: ",
     "tutorial.py": "the hierarchy: ",
+    "yard.py": "solved: ",
 }
 
 
