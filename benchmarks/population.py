@@ -92,6 +92,9 @@ def growth() -> float:
             for seed in range(5):
                 member = Member(0, PPO(network=Network((64, 64), activation)), None)
                 member.state = member.algorithm(SPACES).init([Seeds(seed)])
+                generator = torch.Generator().manual_seed(seed)
+                drawn = torch.randn(member.state.params.shape, generator=generator)
+                member.state.params.add_(0.1 * drawn)  # a critic begins at 0
                 after = rebuilt(member, change, SPACES, np.random.default_rng(seed))
                 worst = max(worst, float((_outputs(member) - _outputs(after)).abs().max()))
     return worst

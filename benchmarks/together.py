@@ -143,7 +143,7 @@ def then(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 
 def no_least_deviation(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """The critic's errors are made as large as a success, where nothing was won yet."""
+    """The critic's errors are made as large as a success, where hardly anything was won yet."""
     who = task.algorithm(min_advantage_std=0.0)
     return together(task, steps, algorithm=who, selector=who, **how)
 

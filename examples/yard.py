@@ -116,7 +116,12 @@ def algorithm(**how: Any) -> sw.PPO:
 
 def declare(steps: int = 300_000, workers: int | None = None, **how: Any) -> sw.Hierarchy:
     """The hierarchy; ``how`` changes any of its settings."""
-    settings: dict[str, Any] = {"learn": "together", "together_steps": steps} | how
+    settings: dict[str, Any] = {
+        "learn": "together",
+        "together_steps": steps,
+        "algorithm": algorithm(),
+        "selector": algorithm(),
+    } | how
     env = sw.EnvSpec(Yard, workers=workers)
     return sw.Hierarchy(env, [Press(), Pass(), Reach()], **settings)
 

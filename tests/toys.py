@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
@@ -537,3 +538,10 @@ def learn(
     made = training(algorithm, env, seeds, members, state=state, shared=shared)
     made.run(budget, **how)
     return algorithm, made.state
+
+
+def random_critic(algorithm: Any, state: Any) -> None:
+    """Give PPO's critic, which begins at 0, values of its own: the same to each member."""
+    weight = algorithm.layout.views(state.params)[f"{algorithm.critic_net.head}.weight"]
+    drawn = torch.randn(weight.shape[1:], generator=torch.Generator().manual_seed(0))
+    weight.copy_(drawn / len(drawn) ** 0.5)

@@ -86,7 +86,7 @@ class PPO(OnPolicy):
     clip_value: float | None = None
     """How far a value may move per update, in units of normalised returns; None: freely."""
     ent_coef: float = 0.01
-    """Weight of the entropy bonus, which pays for deviations of continuous actions up to 1."""
+    """Weight of the entropy bonus; deviations of bounded actions beyond 1 cost as much."""
     ent_coef_final: float | None = None
     """Weight of the entropy bonus at the end of the budget, reached linearly; None: constant."""
     floor: float = 0.0
@@ -103,7 +103,7 @@ class PPO(OnPolicy):
     """Zero mean, unit deviation of the advantages of each update."""
     min_advantage_std: float = 0.05
     """Advantages to normalise that have a smaller deviation, in units of reward, are divided by
-    this: where nothing was won yet, they are the critic's errors. 0: no limit."""
+    this: where hardly anything was won yet, they are the critic's errors. 0: no limit."""
     normalize_returns: bool = True
     """The critic learns returns in units of their running deviation, so rewards may be large."""
     action_std_init: float = 0.6

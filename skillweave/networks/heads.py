@@ -27,8 +27,8 @@ from skillweave.types import Array
 LOG_STD = (-5.0, 2.0)
 """Range of a log deviation that depends on the state."""
 WIDEST = 1.0
-"""The deviation of a Box's actions, in policy units, that the entropy bonus does not pay to exceed.
-A bounded range spans [−1, 1] there."""
+"""The deviation of bounded actions beyond which the entropy bonus counts against it; their range
+spans [−1, 1]."""
 
 
 class ActionHead:
@@ -63,6 +63,10 @@ class ActionHead:
         self._columns = Constant(torch.tensor(rows))
         exists = [[i < n for i in range(widest)] for n in codec.parts]
         self._exists = Constant(torch.tensor(exists))
+        # Which dimensions of a Box have two bounds, and so units in which they span [−1, 1].
+        bounded = [] if codec.discrete else codec.span[2].tolist()
+        self._narrows = any(bounded) and not self.squash
+        self._bounded = Constant(torch.tensor(bounded))
 
     @property
     def discrete(self) -> bool:
@@ -140,20 +144,20 @@ class ActionHead:
         """What is too much of the entropy, in nats, (...); None: nothing.
 
         A normal's entropy grows with its deviation without end. A bonus for it would widen the
-        deviation for ever where rewards are rare, until the mean does not matter. But actions are
-        clipped to their range: from some deviation on, ``WIDEST``, they are less spread the wider
-        it is, as ever more are at one bound or the other. So each nat beyond counts against it.
+        deviation for ever where rewards are rare, until the mean does not matter. Actions of a
+        bounded range are clipped to it: with a deviation of 1 (``WIDEST``) a third of them, with 2
+        two thirds. So a wider normal explores no more, and each nat beyond counts against it.
 
         Args:
             head: (..., width), what a network's last layer says.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
         """
-        if self.discrete or self.squash:
+        if not self._narrows:
             return None
         mean, log_std = self.moments(head, log_std)
-        beyond = (log_std - math.log(WIDEST)).clamp_min(0.0).expand_as(mean).sum(-1)
-        return 2.0 * beyond
+        beyond = (log_std - math.log(WIDEST)).clamp_min(0.0).expand_as(mean)
+        return 2.0 * (beyond * self._bounded.on(beyond.device)).sum(-1)
 
     def kl(
         self,

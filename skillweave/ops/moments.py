@@ -54,10 +54,13 @@ def normalise(
 
 
 def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
-    """``1 − Var(target − value) / Var(target)`` of each member; (P, ...) to (P,)."""
+    """``1 − Var(target − value) / Var(target)`` of each member; (P, ...) to (P,).
+
+    0 where the target is constant: there is nothing to explain.
+    """
     residual, _ = masked_var_mean(target - value, valid)
     whole, _ = masked_var_mean(target, valid)
-    return 1.0 - residual / whole.clamp_min(1e-12)
+    return torch.where(whole > 1e-12, 1.0 - residual / whole.clamp_min(1e-12), 0.0)
 
 
 def merge_moments(

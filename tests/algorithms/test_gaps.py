@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from toys import random_critic
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.ppo import PPOAlgorithm, State
@@ -32,7 +33,9 @@ CELLS = (
 
 def made(config: PPO, members: int) -> tuple[PPOAlgorithm, State]:
     algorithm = PPOAlgorithm(config, Box(-np.inf, np.inf, (OBS,)), Discrete(ACTIONS))
-    return algorithm, algorithm.init([Seeds(m) for m in range(members)])
+    state = algorithm.init([Seeds(m) for m in range(members)])
+    random_critic(algorithm, state)
+    return algorithm, state
 
 
 def full(algorithm: PPOAlgorithm, members: int, steps: int = T, columns: int = B) -> Rollout:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from torch import nn
-from toys import Echo, learn, training
+from toys import Echo, learn, random_critic, training
 
 from skillweave.algorithms import config as configs
 from skillweave.algorithms.config import (
@@ -32,8 +32,11 @@ CONFIG = PPO(
 
 
 def make(action=None, members=1, **settings) -> tuple[PPOAlgorithm, State]:
+    """An algorithm, and members whose critics say something; at first they say 0."""
     algorithm = PPOAlgorithm(replace(CONFIG, **settings), OBS, action or Discrete(4))
-    return algorithm, algorithm.init([Seeds(m) for m in range(members)])
+    state = algorithm.init([Seeds(m) for m in range(members)])
+    random_critic(algorithm, state)
+    return algorithm, state
 
 
 def rngs(*seeds: int | Seeds) -> list[torch.Generator]:
@@ -129,7 +132,8 @@ def test_a_stack_of_three_learns_what_three_single_members_learn(variant):
 
 
 def test_init_does_not_depend_on_the_neighbours():
-    algorithm, three = make(members=3)
+    algorithm, _ = make()
+    three = algorithm.init([Seeds(m) for m in range(3)])
     for m in range(3):
         assert torch.equal(algorithm.init([Seeds(m)]).params[0], three.params[m])
     assert not torch.equal(three.params[0], three.params[1])
@@ -249,8 +253,11 @@ def test_continuous_sampling_has_the_initial_deviation():
 
 @pytest.mark.parametrize("space", [Discrete(4), Box(-1, 1, (2,))])
 @pytest.mark.parametrize("normalize_advantage", [True, False])
-def test_a_policy_does_not_move_until_something_is_paid(space, normalize_advantage):
-    algorithm, state = make(space, ent_coef=0.0, normalize_advantage=normalize_advantage)
+def test_without_an_entropy_bonus_a_fresh_policy_does_not_move_until_something_is_paid(
+    space, normalize_advantage
+):
+    algorithm, _ = make(space, ent_coef=0.0, normalize_advantage=normalize_advantage)
+    state = algorithm.init([Seeds(0)])
     before = state.params.clone()
     for i in range(3):
         data = replace(rollout(algorithm, state, i), reward=torch.zeros(1, T, B))

@@ -73,8 +73,9 @@ def test_it_learns_what_each_skill_is_worth():
 
 def test_while_skills_are_tried_they_differ_less_in_worth_so_that_few_calls_are_cut():
     algorithm, state = critic(floor=1.0, floor_final=0.2)
-    state.params.normal_(generator=torch.Generator().manual_seed(0))  # as if it had learnt
     obs = torch.eye(3)[None]
+    assert not algorithm.act(algorithm.learning_params(state), obs, None, None)[1].any()
+    state.params.normal_(generator=torch.Generator().manual_seed(0))  # as if it had learnt
     whole = algorithm.act(algorithm.learning_params(state), obs, None, None)[1]
     assert whole.abs().min() > 0
     for progress, share in ((0.0, 0.0), (0.5, 0.4), (1.0, 1.0)):

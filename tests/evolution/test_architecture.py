@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from toys import random_critic
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Mutations, Network, SkillweaveError
 from skillweave.evolution.architecture import Change, check_architecture, draw_change, rebuilt
@@ -54,6 +55,13 @@ def member(name: str, activation: str, spaces_obs: Any = VECTOR) -> tuple[Member
         flat = getattr(made.state, field)
         flat.add_(0.3 * torch.randn(flat.shape, generator=generator))
     return made, spaces
+
+
+def begin_anew(made: Member, spaces: Any) -> None:
+    """Fresh weights of the shapes that its settings say, and a critic that says something."""
+    algorithm = made.algorithm(spaces)
+    made.state = algorithm.init([Seeds(3)])
+    random_critic(algorithm, made.state)
 
 
 def outputs(made: Member, spaces: Any) -> dict[str, torch.Tensor]:
@@ -109,7 +117,7 @@ def test_growth_leaves_every_function_as_it_was(name, growth, activation):
 def test_channels_grow_without_changing_the_function(cnn, space, layer):
     before, spaces = member("ppo", "relu", space)
     before.config = replace(before.config, network=replace(before.config.network, cnn=cnn))
-    before.state = before.algorithm(spaces).init([Seeds(3)])
+    begin_anew(before, spaces)
     after = rebuilt(before, Change("channels", layer, 3), spaces, np.random.default_rng(0))
     assert after.config.network.cnn.channels[layer] == cnn.channels[layer] + 3
     old, new = outputs(before, spaces), outputs(after, spaces)
@@ -125,10 +133,10 @@ def test_kernels_grow_without_changing_the_function_where_they_can(space):
     before, spaces = member("ppo", "relu", space)
     cnn = CNN("plain", (4, 6), (3, 2), (2, 1))  # 12 → 5 → 4 pixels: the first has one to spare
     before.config = replace(before.config, network=replace(before.config.network, cnn=cnn))
-    before.state = before.algorithm(spaces).init([Seeds(3)])
+    begin_anew(before, spaces)
     by, drawn = Mutations(channels=(99, 99), units=(99, 99)), set()
     before.config = replace(before.config, network=replace(before.config.network, hidden=(99,)))
-    before.state = before.algorithm(spaces).init([Seeds(3)])
+    begin_anew(before, spaces)
     rng = np.random.default_rng(0)
     for _ in range(40):
         change = draw_change(before, replace(by, layer_share=0.0), spaces, rng)

@@ -100,6 +100,7 @@ def test_a_forbidden_action_is_never_taken_and_the_best_of_the_others_is_learnt(
 
 
 def test_a_time_limit_is_bootstrapped():
+    # The observation is 0, so of a critic that begins at 0 only the last bias learns: that is slow.
     algorithm, state = train(Allowance(16), 200)
     assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(
         1 / (1 - 0.9), rel=0.02
