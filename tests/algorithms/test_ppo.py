@@ -175,6 +175,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     acted, _ = algorithm.head.stats(data.head, data.log_std, tr.obs_mask, tr.action)
     if late:  # what learns is no longer what acted
         state = algorithm.init([Seeds(7)])
+        random_critic(algorithm, state)
         algorithm.layout.views(state.params)["actor.1.weight"].mul_(100.0)
     actor, critic = (plain_network(algorithm, state, k) for k in ("actor", "critic"))
     log_std = nn.Parameter(torch.full((2,), cfg.action_std_init).log())
