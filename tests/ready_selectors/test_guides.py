@@ -152,8 +152,10 @@ def test_skills_learn_where_a_ready_selector_calls_them(whole):
 
 
 def test_skills_that_learn_under_a_ready_selector_solve_the_corridor(tmp_path):
+    # To stay is nearly as good as to go, as there is time. After 12,000 steps greedy skills stay at
+    # the door with a third of the seeds; after 24,000 with none of 0 to 11.
     skilled = declare(
-        selector=AUTOMATON, learn="together", together_steps=12_000, cut_every=100_000,
+        selector=AUTOMATON, learn="together", together_steps=24_000, cut_every=100_000,
         algorithm=PPO(num_envs=8, n_steps=32, batch_size=64, network=SMALL, learning_rate=3e-3),
     )  # fmt: skip
     assert skilled.train(tmp_path / "run", seed=0, quiet=True).evaluate(30).mean > 0.9
