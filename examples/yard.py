@@ -58,7 +58,7 @@ class Yard(gym.Env[np.ndarray, np.ndarray]):
 
 
 def near(place: np.ndarray, point: np.ndarray) -> bool:
-    """It is there."""
+    """Whether ``place`` is at ``point``."""
     return bool(np.hypot(*(place - point)) < NEAR)
 
 

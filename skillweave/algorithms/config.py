@@ -86,7 +86,7 @@ class PPO(OnPolicy):
     clip_value: float | None = None
     """How far a value may move per update, in units of normalised returns; None: freely."""
     ent_coef: float = 0.01
-    """Weight of the entropy bonus; deviations of bounded actions beyond 1 cost as much."""
+    """Weight of the entropy bonus, and of the cost of bounded actions' deviations beyond 1."""
     ent_coef_final: float | None = None
     """Weight of the entropy bonus at the end of the budget, reached linearly; None: constant."""
     floor: float = 0.0

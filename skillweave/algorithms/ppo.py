@@ -191,13 +191,13 @@ class PPOAlgorithm(Algorithm):
         clip = self.config.clip_value
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
         value = value_loss(raw.squeeze(-1), batch.target, batch.old_value, bound, valid)
-        spread = bonus = masked_mean(entropy, acted)
+        mean_entropy = bonus = masked_mean(entropy, acted)
         if (surplus := self.head.surplus(head, log_std)) is not None:
-            bonus = spread - masked_mean(surplus, acted)
+            bonus = mean_entropy - masked_mean(surplus, acted)
         total = policy + state.vf_coef * value - now.ent_coef * bonus
         with torch.no_grad():
             kl = approximate_kl(log_prob, old, weight, acted)
-        report = {"policy_loss": policy, "value_loss": value, "entropy": spread, "kl": kl}
+        report = {"policy_loss": policy, "value_loss": value, "entropy": mean_entropy, "kl": kl}
         if now.anchor is not None:
             near = now.anchor.params
             other = None if near is None else near.views.get("actor.log_std")

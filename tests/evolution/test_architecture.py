@@ -133,7 +133,6 @@ def test_kernels_grow_without_changing_the_function_where_they_can(space):
     before, spaces = member("ppo", "relu", space)
     cnn = CNN("plain", (4, 6), (3, 2), (2, 1))  # 12 → 5 → 4 pixels: the first has one to spare
     before.config = replace(before.config, network=replace(before.config.network, cnn=cnn))
-    begin_anew(before, spaces)
     by, drawn = Mutations(channels=(99, 99), units=(99, 99)), set()
     before.config = replace(before.config, network=replace(before.config.network, hidden=(99,)))
     begin_anew(before, spaces)
