@@ -67,7 +67,6 @@ def _doorkey(size: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     """
     every = {
         "episode_calls": 8,
-        "call_cost": 0.001,  # far from the goal a decision is worth 0.02
         "algorithm": doorkey.algorithm(ent_coef=0.03),  # with less `goal` settles too early
     }
     return Task(

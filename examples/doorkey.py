@@ -117,7 +117,10 @@ def declare(
         "together_steps": steps,
         # At first any skill that may start is called: else one that may start anywhere takes all.
         "together": sw.Together(floor=1.0, floor_final=0.1),
-        "call_cost": 0.01,  # a call that ends at once is not worth as much as one that does not
+        # A call that ends at once is not worth as much as one that does not. The cost is small
+        # beside what a decision is worth far from the goal, 0.02: before anything is won, the
+        # skill with the longest calls costs least.
+        "call_cost": 0.001,
         "greedy_skills": False,
         "algorithm": algorithm(),
         "selector": algorithm(),
