@@ -2,12 +2,13 @@
 
     python -m benchmarks.together [CASE …] [--task 8x8] [--seeds 0 1 2 3 4] [--steps 500000]
 
-Tasks: ``8x8`` and ``16x16``, MiniGrid's DoorKey (``examples/doorkey.py``); ``bridge``, a longer
-chain (``examples/bridge.py``); ``yard``, one with continuous actions (``examples/yard.py``). Every
-case has the same number of environment steps in all. Scores are 100 episodes with a selector that
-samples, with seeds that training never saw. DoorKey is scored on MiniGrid's own environment;
-training steps EnvPool's, or with ``--engine sync`` MiniGrid's own. Two runs go side by side
-(``--processes``), so the seconds are those of a busy machine.
+Tasks: ``8x8`` and ``16x16``, MiniGrid's DoorKey, and ``unlock-pickup``, its room with a box behind
+the door (``examples/doorkey.py``); ``bridge``, a longer chain (``examples/bridge.py``); ``yard``,
+one with continuous actions (``examples/yard.py``). Every case has the same number of environment
+steps in all. Scores are 100 episodes with a selector that samples, with seeds that training never
+saw. MiniGrid's rooms are scored in its own environments; training steps EnvPool's, or with
+``--engine sync`` MiniGrid's own. Two runs go side by side (``--processes``), so the seconds are
+those of a busy machine.
 
 Flat agents: ``flat`` (F0), ``"skill rewards x 0.1"`` and other weights (F1), ``bonus`` (F2). With
 ``--f4`` the skills of each hierarchy are also scored without its selector: chosen by lot, and each
@@ -58,19 +59,21 @@ class Task:
     """``--engine`` is about it."""
 
 
-def _doorkey(size: str, parts: tuple[int, ...], goal: PPO | None = None, **apart: Any) -> Task:
-    """Three skills on DoorKey.
+def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart: Any) -> Task:
+    """Three skills in a room with a key and a door.
 
     Args:
+        room: MiniGrid's name of it.
+        parts: of the steps apart.
         goal: who trains the third skill apart; None: who trains the others.
-        apart: settings where skills learn apart, beside those of every size.
+        apart: settings where skills learn apart, beside those of every room.
     """
     every = {
         "episode_calls": 8,
         "algorithm": doorkey.algorithm(ent_coef=0.03),  # with less `goal` settles too early
     }
     return Task(
-        functools.partial(doorkey.declare, size),
+        functools.partial(doorkey.declare, room),
         doorkey.algorithm,
         parts,
         every | apart,
@@ -80,13 +83,14 @@ def _doorkey(size: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
 
 
 TASKS = {
-    "8x8": _doorkey("8x8", (1, 2, 3, 2)),
+    "8x8": _doorkey("DoorKey-8x8", (1, 2, 3, 2)),
+    "unlock-pickup": _doorkey("UnlockPickup", (1, 2, 3, 2)),
     # `goal` succeeds once in 1,000 steps at first: it needs most of the steps, and rollouts with
     # several successes. It learns from them without a limit on its advantages: the entropy's bonus
     # would be larger than what the first few teach. The selector begins with a low floor: a high
     # one hides from it what it does by itself.
     "16x16": _doorkey(
-        "16x16",
+        "DoorKey-16x16",
         (1, 2, 6, 1),
         goal=replace(
             doorkey.algorithm(ent_coef=0.015, min_advantage_std=0.0), n_steps=512, update_epochs=10

@@ -2,9 +2,11 @@
 
     pip install minigrid
     python examples/doorkey.py
+    python examples/doorkey.py --room UnlockPickup
 
 The third skill would never see a state that it is for, if it learnt apart: behind the door. Here
-all learn from the same steps, and the others lead it there.
+all learn from the same steps, and the others lead it there. In UnlockPickup, too, there are a key,
+a door, and behind it what is paid: a box to pick up.
 """
 
 from __future__ import annotations
@@ -21,16 +23,16 @@ import skillweave as sw
 KEY, DOOR, OPEN = 5, 4, 0
 
 
-def make(render_mode: str | None = None, size: str = "8x8") -> gym.Env[Any, Any]:
-    """DoorKey; observations are the 7×7 cells in view: kind, colour and state of each."""
+def make(render_mode: str | None = None, room: str = "DoorKey-8x8") -> gym.Env[Any, Any]:
+    """A room; observations are the 7×7 cells in view: kind, colour and state of each."""
     import minigrid  # noqa: F401, it registers the environments
     from minigrid.wrappers import ImgObsWrapper
 
-    return ImgObsWrapper(gym.make(f"MiniGrid-DoorKey-{size}-v0", render_mode=render_mode))
+    return ImgObsWrapper(gym.make(f"MiniGrid-{room}-v0", render_mode=render_mode))
 
 
 class Image(sw.PoolWrapper):
-    """Observations of EnvPool's DoorKey as those of ``make``: the image alone."""
+    """Observations of EnvPool's rooms as those of ``make``: the image alone."""
 
     def __init__(self, pool: Any) -> None:
         super().__init__(pool, pool.observation_space["image"])
@@ -40,9 +42,9 @@ class Image(sw.PoolWrapper):
         return image
 
 
-def many(num_envs: int, threads: int, seed: int, size: str = "8x8") -> Image:
-    """The same DoorKey in EnvPool, ten times as fast."""
-    return Image(sw.envpool(f"MiniGrid-DoorKey-{size}-v0", num_envs, threads, seed))
+def many(num_envs: int, threads: int, seed: int, room: str = "DoorKey-8x8") -> Image:
+    """The same room in EnvPool, ten times as fast."""
+    return Image(sw.envpool(f"MiniGrid-{room}-v0", num_envs, threads, seed))
 
 
 def carrying(obs: sw.Array) -> sw.Array:
@@ -83,7 +85,7 @@ class OpenDoor(sw.Skill):
 
 
 class Goal(sw.Skill):
-    """Reaches the goal."""
+    """Does what the task pays for: reaches the goal, or picks up the box."""
 
     max_steps = 64
 
@@ -100,7 +102,7 @@ def algorithm(**how: Any) -> sw.PPO:
 
 
 def declare(
-    size: str = "8x8",
+    room: str = "DoorKey-8x8",
     steps: int = 500_000,
     workers: int | None = None,
     engine: Literal["auto", "sync"] = "auto",
@@ -109,6 +111,7 @@ def declare(
     """The hierarchy; ``how`` changes any of its settings.
 
     Args:
+        room: MiniGrid's name of it, without version.
         engine: auto: in EnvPool, where it is installed; sync: in Python.
     """
     settings = {
@@ -125,8 +128,13 @@ def declare(
         "algorithm": algorithm(),
         "selector": algorithm(),
     } | how
-    one = make if size == "8x8" else partial(make, size=size)
-    env = sw.EnvSpec(one, pool=partial(many, size=size), engine=engine, workers=workers)
+    env = sw.EnvSpec(
+        make,
+        kwargs={"room": room},
+        pool=partial(many, room=room),
+        engine=engine,
+        workers=workers,
+    )
     return sw.Hierarchy(env, [GetKey(), OpenDoor(), Goal()], **settings)
 
 
@@ -136,11 +144,12 @@ hierarchy = declare()
 def main() -> None:
     """Train it, and say how many episodes it solves."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--room", default="DoorKey-8x8")
     parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default="runs/doorkey")
     asked = parser.parse_args()
-    run = declare(steps=asked.steps).train(asked.out, seed=asked.seed)
+    run = declare(asked.room, asked.steps).train(asked.out, seed=asked.seed)
     found = run.evaluate(100)
     print(found.for_people())
     print(f"solved: {np.mean(np.array(found.returns) > 0):.0%} of the episodes")
