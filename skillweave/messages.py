@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import traceback
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,12 @@ def shortened(text: str, longest: int = 500) -> str:
     """Text for a message, its middle left out where it is long."""
     half = longest // 2
     return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
+
+
+def close_matches(name: str, known: Iterable[str]) -> str:
+    """A sentence, after a space, that names up to four known names like ``name``; or nothing."""
+    near = difflib.get_close_matches(name, known, n=4, cutoff=0.6)
+    return f" Close matches: {', '.join(near)}." if near else ""
 
 
 def observed(obs: Array) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import os
 import time
@@ -18,7 +17,7 @@ from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.pool import MakePool, envpool
-from skillweave.messages import short, shortened, told, whole_number
+from skillweave.messages import close_matches, short, shortened, told, whole_number
 from skillweave.types import MissingExtra, SkillweaveError
 
 MOST = 65_536
@@ -148,11 +147,8 @@ class EnvSpec:
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error
             raise SkillweaveError(f"the environment {env_id} needs more: {error}") from error
         except (gym.error.Error, ImportError) as error:
-            near = difflib.get_close_matches(env_id, list(gym.registry), n=4, cutoff=0.6)
-            hint = f" Close matches: {', '.join(near)}." if near else ""
-            raise SkillweaveError(
-                f"no environment {short(env_id)}: {shortened(str(error)).rstrip('.')}.{hint}"
-            ) from error
+            why, near = shortened(str(error)).rstrip("."), close_matches(env_id, gym.registry)
+            raise SkillweaveError(f"no environment {short(env_id)}: {why}.{near}") from error
 
     @property
     def name(self) -> str:

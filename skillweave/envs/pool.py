@@ -9,7 +9,8 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 
-from skillweave.types import Array, MissingExtra
+from skillweave.messages import close_matches, short
+from skillweave.types import Array, MissingExtra, SkillweaveError
 
 
 class Pool(Protocol):
@@ -119,9 +120,14 @@ def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) 
 
     Raises:
         MissingExtra: EnvPool is not installed.
+        SkillweaveError: it has no such environment (with close matches).
     """
+    package = installed()
+    if env_id not in (known := package.list_all_envs()):
+        near = close_matches(env_id, known)
+        raise SkillweaveError(f"EnvPool has no environment {short(env_id)}.{near}")
     with no_precision_warnings():
-        pool = installed().make_gymnasium(
+        pool = package.make_gymnasium(
             env_id, num_envs=num_envs, num_threads=min(threads, num_envs), seed=seed, **kwargs
         )
         _ = pool.observation_space  # made on first use, with the warning

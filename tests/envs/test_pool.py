@@ -138,3 +138,10 @@ def test_what_envpool_shows_may_be_changed():
     seen = make_engine(sw.EnvSpec(one, pool=pool), N).reset(0)
     whole = make_engine(sw.EnvSpec("CartPole-v1"), N).reset(0)
     np.testing.assert_array_equal(seen, whole[:, :1])
+
+
+def test_an_environment_that_envpool_does_not_have_is_told():
+    pytest.importorskip("envpool")
+    says = r"EnvPool has no environment 'CartPool-v1'.* Close matches: .*CartPole-v1"
+    with pytest.raises(SkillweaveError, match=says):
+        sw.envpool("CartPool-v1", 2, 1, 0)
