@@ -2,11 +2,11 @@
 
     pip install minigrid
     python examples/doorkey.py
-    python examples/doorkey.py --room UnlockPickup
 
 The third skill would never see a state that it is for, if it learnt apart: behind the door. Here
-all learn from the same steps, and the others lead it there. In UnlockPickup, too, there are a key,
-a door, and behind it what is paid: a box to pick up.
+all learn from the same steps, and the others lead it there. ``--room`` names another room with a
+key and a door, as DoorKey-16x16, or UnlockPickup, where a box is to be picked up behind the door.
+They take more steps.
 """
 
 from __future__ import annotations
