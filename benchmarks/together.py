@@ -63,7 +63,7 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     """Three skills in a room with a key and a door.
 
     Args:
-        room: MiniGrid's name of it.
+        room: MiniGrid's name of it, without version.
         parts: of the steps apart.
         goal: who trains the third skill apart; None: who trains the others.
         apart: settings where skills learn apart, beside those of every room.

@@ -5,8 +5,8 @@
 
 The third skill would never see a state that it is for, if it learnt apart: behind the door. Here
 all learn from the same steps, and the others lead it there. ``--room`` names another room with a
-key and a door, as DoorKey-16x16, or UnlockPickup, where a box is to be picked up behind the door.
-They take more steps.
+key and a door, such as DoorKey-16x16, or UnlockPickup, where a box is to be picked up behind the
+door. They take more steps.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ import numpy as np
 import skillweave as sw
 
 KEY, DOOR, OPEN = 5, 4, 0
+ROOM = "DoorKey-8x8"
 
 
-def make(render_mode: str | None = None, room: str = "DoorKey-8x8") -> gym.Env[Any, Any]:
+def make(render_mode: str | None = None, room: str = ROOM) -> gym.Env[Any, Any]:
     """A room; observations are the 7×7 cells in view: kind, colour and state of each."""
     import minigrid  # noqa: F401, it registers the environments
     from minigrid.wrappers import ImgObsWrapper
@@ -42,7 +43,7 @@ class Image(sw.PoolWrapper):
         return image
 
 
-def many(num_envs: int, threads: int, seed: int, room: str = "DoorKey-8x8") -> Image:
+def many(num_envs: int, threads: int, seed: int, room: str = ROOM) -> Image:
     """The same room in EnvPool, ten times as fast."""
     return Image(sw.envpool(f"MiniGrid-{room}-v0", num_envs, threads, seed))
 
@@ -102,7 +103,7 @@ def algorithm(**how: Any) -> sw.PPO:
 
 
 def declare(
-    room: str = "DoorKey-8x8",
+    room: str = ROOM,
     steps: int = 500_000,
     workers: int | None = None,
     engine: Literal["auto", "sync"] = "auto",
@@ -120,21 +121,16 @@ def declare(
         "together_steps": steps,
         # At first any skill that may start is called: else one that may start anywhere takes all.
         "together": sw.Together(floor=1.0, floor_final=0.1),
-        # A call that ends at once is not worth as much as one that does not. The cost is small
-        # beside what a decision is worth far from the goal, 0.02: before anything is won, the
-        # skill with the longest calls costs least.
+        # A call that ends at once is not worth as much as one that does not. Far from the goal a
+        # decision is worth 0.02. Before anything is won, a cost as large as that teaches the
+        # selector to call the skill with the longest calls.
         "call_cost": 0.001,
         "greedy_skills": False,
         "algorithm": algorithm(),
         "selector": algorithm(),
     } | how
-    env = sw.EnvSpec(
-        make,
-        kwargs={"room": room},
-        pool=partial(many, room=room),
-        engine=engine,
-        workers=workers,
-    )
+    other = {} if room == ROOM else {"room": room}
+    env = sw.EnvSpec(make, other, pool=partial(many, **other), engine=engine, workers=workers)
     return sw.Hierarchy(env, [GetKey(), OpenDoor(), Goal()], **settings)
 
 
@@ -144,7 +140,7 @@ hierarchy = declare()
 def main() -> None:
     """Train it, and say how many episodes it solves."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--room", default="DoorKey-8x8")
+    parser.add_argument("--room", default=ROOM)
     parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default="runs/doorkey")

@@ -43,7 +43,7 @@ class EnvSpec:
 
     Args:
         env: a Gymnasium id, or a function that makes one environment.
-        kwargs: passed to ``gymnasium.make``.
+        kwargs: passed to ``gymnasium.make``, or to that function; not to ``pool``.
         wrappers: applied to each environment, first one first.
         engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
             environment as Gymnasium defines it, else sync.
@@ -59,7 +59,7 @@ class EnvSpec:
             says which.
     """
 
-    env: str | Callable[[], gym.Env[Any, Any]]
+    env: str | Callable[..., gym.Env[Any, Any]]
     kwargs: dict[str, Any] = field(default_factory=dict)
     wrappers: tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...] = ()
     engine: EngineName = "auto"
@@ -124,10 +124,12 @@ class EnvSpec:
         if isinstance(self.env, str):
             return self._from_registry(self.env, render_mode)
         if render_mode is None:
-            return self.env()
+            return self.env(**self.kwargs)
         try:
-            return self.env(render_mode=render_mode)  # type: ignore[call-arg]
+            return self.env(render_mode=render_mode, **self.kwargs)
         except TypeError as error:
+            if "render_mode" not in str(error):
+                raise
             raise SkillweaveError(
                 f"{self.name} cannot be rendered: the function that makes it must take "
                 f"render_mode ({error})"

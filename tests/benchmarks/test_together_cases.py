@@ -19,6 +19,21 @@ def test_every_case_has_the_steps_that_are_asked(case: str) -> None:
     assert 9_990 <= steps <= 10_000
 
 
+@pytest.mark.parametrize(
+    ("task", "room"),
+    [
+        ("8x8", "DoorKey-8x8"),
+        ("16x16", "DoorKey-16x16"),
+        ("unlock-pickup", "UnlockPickup"),
+    ],
+)
+def test_a_room_is_scored_in_itself(task: str, room: str) -> None:
+    pytest.importorskip("minigrid")
+    for case in ("together", "apart", "flat", "bonus"):
+        env = CASES[case](TASKS[task], 10_000).spec.make()
+        assert env.unwrapped.spec.id == f"MiniGrid-{room}-v0"
+
+
 def step_of(before: np.ndarray, after: np.ndarray, reward: float) -> Step:
     no, one = np.zeros(1, bool), np.ones(1, np.int64)
     return Step(before[None], one, after[None], np.array([reward]), no, no, no, one, {})

@@ -111,3 +111,17 @@ def test_training_opens_no_window_whatever_an_environment_does_by_itself():
         assert EnvSpec("Shown-v0").make().unwrapped.mode is None
     finally:
         del gym.registry["Shown-v0"]
+
+
+def test_a_function_that_makes_environments_gets_kwargs():
+    def short(render_mode=None, longest=500):
+        return gym.make("CartPole-v1", render_mode=render_mode, max_episode_steps=longest)
+
+    spec = EnvSpec(short, kwargs={"longest": 7})
+    for made in (spec.make(), spec.make(render_mode="rgb_array")):
+        assert made.spec.max_episode_steps == 7
+        made.close()
+    with pytest.raises(SkillweaveError, match=r"short could not be made: TypeError.*'longer'"):
+        EnvSpec(short, kwargs={"longer": 7}).make()
+    with pytest.raises(SkillweaveError, match=r"short could not be made: TypeError.*'longer'"):
+        EnvSpec(short, kwargs={"longer": 7}).make(render_mode="rgb_array")
