@@ -128,8 +128,8 @@ class EnvSpec:
         try:
             return self.env(render_mode=render_mode, **self.kwargs)
         except TypeError as error:
-            if "render_mode" not in str(error):
-                raise
+            if self.kwargs and "render_mode" not in str(error):
+                raise  # it is about kwargs
             raise SkillweaveError(
                 f"{self.name} cannot be rendered: the function that makes it must take "
                 f"render_mode ({error})"

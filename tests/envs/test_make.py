@@ -125,3 +125,11 @@ def test_a_function_that_makes_environments_gets_kwargs():
         EnvSpec(short, kwargs={"longer": 7}).make()
     with pytest.raises(SkillweaveError, match=r"short could not be made: TypeError.*'longer'"):
         EnvSpec(short, kwargs={"longer": 7}).make(render_mode="rgb_array")
+
+
+def test_a_class_that_takes_nothing_is_told_that_films_need_render_mode():
+    class Bare(gym.Env):
+        observation_space = action_space = gym.spaces.Discrete(2)
+
+    with pytest.raises(SkillweaveError, match=r"Bare cannot be rendered: .* must take render_mode"):
+        EnvSpec(Bare).make(render_mode="rgb_array")
