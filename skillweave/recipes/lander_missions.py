@@ -108,7 +108,9 @@ class Flight(Skill):
 class Hover(Flight):
     """Fly to the point above the pad, and stay there."""
 
-    call_steps = 50
+    call_steps = 200
+    """It flies there, and stays for two seconds. With calls of 50 steps a leg took several, one
+    after the other, which a selector hardly ever drew by lot."""
     prize = 0.0
     point, half = POINTS[KINDS.index("hover")], HALF[KINDS.index("hover")]
 
@@ -172,7 +174,8 @@ PILOT = PPO(
 )
 SELECTOR = PPO(
     min_advantage_std=0.0,  # so it was measured
-    n_steps=128,
+    num_envs=16,
+    n_steps=512,  # several calls, one after the other: what the last one won reaches the first
     batch_size=32,  # a rollout has few decisions
     update_epochs=10,
     gamma=0.999,
@@ -200,6 +203,7 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
     settings: dict[str, Any] = {
         "call_steps": None,
         "start_calls": 2,
+        "greedy_skills": False,  # greedy ones may stay beside their point, and never arrive
         "algorithm": PILOT,
         "selector": SELECTOR,
         "skill_steps": 600_000,

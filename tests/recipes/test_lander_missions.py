@@ -215,6 +215,13 @@ def test_going_on_is_never_worth_as_much_as_arriving(skill, most):
     assert missions.CRASH < 0 < best < skill.prize
 
 
+def test_one_call_may_last_for_the_way_to_a_leg_and_the_leg_itself():
+    # Several in a row are hardly ever drawn by lot, so a selector would not find out.
+    for skill in missions.SKILLS:
+        there = world.HOVER_STEPS if skill is missions.Hover else 0
+        assert (skill.call_steps or skill.max_steps) >= there + 100
+
+
 def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_pad():
     land = missions.Land()
     high = step_of(lander(SKY), lander((0.2, 1.0), speed=(-0.4, -0.2)))  # 0.4 of 0.5 down
