@@ -187,6 +187,17 @@ def test_skills_are_paid_for_the_speed_that_is_wanted_where_they_are():
     assert not missions.GoLeft().success(crashed)
 
 
+def test_hovering_is_paid_for_its_place_and_not_for_its_speed_alone():
+    # Without it a skill stayed just beside the box, and no leg was done.
+    x, y = world.POINTS[world.KINDS.index("hover")]
+    inside, beside = (lander((x + 0.19, y)), lander((x + 0.21, y)))
+    hover, within = missions.Hover(), step_of(lander(SKY), inside)
+    # At rest, 2.5 · 0.19 and 2.5 · 0.21 slower than is wanted there.
+    assert hover.reward(within) == pytest.approx(2.0 - 2.5 * 0.19, abs=1e-5)
+    assert hover.reward(step_of(lander(SKY), beside)) == pytest.approx(1 - 2.5 * 0.21, abs=1e-5)
+    assert hover.reward(step_of(lander(SKY), inside, terminated=True)) == missions.CRASH
+
+
 @pytest.mark.parametrize("skill", [missions.GoLeft(), missions.GoRight(), missions.Hover()])
 def test_a_skill_has_arrived_only_where_the_missions_leg_is_done(skill):
     # Else the selector would call it again, and it would end at once, for ever.
