@@ -185,8 +185,7 @@ PILOT = PPO(
 )
 SELECTOR = PPO(
     min_advantage_std=0.0,  # so it was measured
-    num_envs=16,
-    n_steps=512,  # several calls, one after the other: what the last one won reaches the first
+    n_steps=128,
     batch_size=32,  # a rollout has few decisions
     update_epochs=10,
     gamma=0.999,
@@ -230,7 +229,7 @@ def with_skills(
     mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
 ) -> Hierarchy:
     """The hierarchy on a mission with skills that are there already, by name."""
-    found = declare(mission, gusts, **how)
+    found = declare(mission, gusts, **{"selector_steps": 300_000} | how)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found
