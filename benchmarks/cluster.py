@@ -307,8 +307,9 @@ def sweep(given: argparse.Namespace) -> dict[str, Any]:
 
 def costs(given: argparse.Namespace) -> dict[str, Any]:
     """Of a step, in microseconds of one processor: collecting, coming back, learning; its bytes."""
+    import ray
+
     from skillweave.algorithms.policy import make_algorithm
-    from skillweave.collecting import actors as on_ray
     from skillweave.seeding import Seeds
     from skillweave.training.learner import RolloutLearner, Stack
     from skillweave.training.scene import skill_scene
@@ -328,7 +329,7 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
         alone.start(Seeds(0))
         seconds: dict[str, list[float]] = {"collect": [], "there and back": [], "learn": []}
         with Ray(count).connected(count, print) as where:
-            away = where.collectors(make, each * count, count, 1, name)
+            away: Any = where.collectors(make, each * count, count, 1, name)
             away.start(Seeds(0))
             for update in range(given.updates):
                 request, began = learner.request(update, 0, 0.0), time.process_time()
@@ -338,11 +339,11 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
                     away._workers[i]._actors.get(i).answer.remote("collect", request)
                     for i in range(count)
                 ]
-                on_ray.ray.wait(refs, num_returns=count)
+                ray.wait(refs, num_returns=count)
                 began = time.process_time()
-                answers = [on_ray.ray.get(ref)[1] for ref in refs]
+                answers = [ray.get(ref)[1] for ref in refs]
                 collected = away._joined(answers)
-                on_ray.ray.get(on_ray.ray.put(request))
+                ray.get(ray.put(request))
                 seconds["there and back"].append(
                     (time.process_time() - began) / (each * rows * count)
                 )

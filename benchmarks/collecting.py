@@ -124,7 +124,8 @@ class Glide(Skill):
         # steps ends now with this chance. A function of the state, so that it can be repeated.
         chance = 1.0 / np.maximum(1, 65 - step.elapsed)
         digits = np.abs(step.next_obs[:, :6].astype(np.float64)).sum(1) * 1e4
-        return digits % 1.0 < chance
+        ends: Array = digits % 1.0 < chance
+        return ends
 
 
 def calls(random_lengths: bool, steps: int) -> float:
@@ -161,7 +162,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=40_960)
     given = parser.parse_args()
-    steps, summary = given.steps, {}
+    steps = given.steps
+    summary: dict[str, Any] = {}
     if "workers" in given.which:
         measures = {
             "two workers": lambda: ours(2, steps),

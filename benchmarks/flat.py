@@ -9,6 +9,7 @@ of Gymnasium's environment with seeds that training never saw.
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table, warm_up
@@ -63,7 +64,7 @@ def main() -> None:
     parser.add_argument("--every", type=float, default=1.0)
     given = parser.parse_args()
     warm_up()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for seed in given.seeds:
         rows.append(learn(seed, given.steps, given.every))
         shown = [k for k in rows[0] if k != "curve"]

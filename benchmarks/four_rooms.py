@@ -15,6 +15,7 @@ import argparse
 import itertools
 import tempfile
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,11 @@ from skillweave.training.scene import CALL
 from skillweave.types import Array
 
 GAMMA, GOALS = 0.9, {"G1": G1, "G2": G2}
-SETS = {"H": hallway_skills, "A": moves, "A+H": lambda: [*moves(), *hallway_skills()]}
+SETS: dict[str, Callable[[], list[Skill]]] = {
+    "H": hallway_skills,
+    "A": moves,
+    "A+H": lambda: [*moves(), *hallway_skills()],
+}
 # One weight for each state and skill, and only random choices. The learning rate is small enough
 # for its end to average over many samples: with 0.01 the largest error was 1.6 times that of the
 # counts (H, 6M steps, seed 0), with 5e-4 it is nearly theirs. More steps mend what is left.

@@ -56,7 +56,8 @@ def minatar(game: str, render_mode: str | None = None) -> gym.Env[Any, Any]:
     """MinAtar (Young & Tian 2019): 10×10 pixels of several channels, sticky actions."""
     from minatar.gym import BaseEnv
 
-    return BaseEnv(game, render_mode)
+    env: gym.Env[Any, Any] = BaseEnv(game, render_mode)
+    return env
 
 
 DISCRETE, CONTINUOUS = EnvSpec("LunarLander-v3"), EnvSpec("LunarLanderContinuous-v3")

@@ -12,6 +12,7 @@ import contextlib
 import tempfile
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +21,7 @@ import torch
 from benchmarks.common import report
 from skillweave import PPO, Hierarchy, Skill
 from skillweave.api import running
+from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 
@@ -52,7 +54,7 @@ class Stop(Exception):
     """Training is to be stopped here."""
 
 
-class Stopping(running.Progress):
+class Stopping(Progress):
     """Stops training in the middle."""
 
     at = 0
@@ -74,11 +76,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         whole, broken = Path(name) / "whole", Path(name) / "broken"
         hierarchy(given.length, given.steps).train(whole, flat=True, quiet=True)
-        Stopping.at, plain = int(0.7 * given.steps), running.Progress
-        running.Progress = Stopping  # type: ignore[misc]
-        with contextlib.suppress(Stop):
+        Stopping.at = int(0.7 * given.steps)
+        with patch.object(running, "Progress", Stopping), contextlib.suppress(Stop):
             hierarchy(given.length, given.steps).train(broken, flat=True, quiet=True)
-        running.Progress = plain  # type: ignore[misc]
         hierarchy(given.length, given.steps).resume(broken, quiet=True)
         weights = [
             read_tensors(run / "policies" / "agent.safetensors")[0] for run in (whole, broken)

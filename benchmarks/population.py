@@ -132,7 +132,7 @@ def padded() -> float:
         for member, seed in zip(alone, seeds, strict=True):
             data, part = rollout(MEMBERS, 64), slice(member.number, member.number + 1)
             values = {f.name: getattr(data, f.name) for f in fields(data)}
-            own = {k: v[part] for k, v in values.items() if isinstance(v, torch.Tensor)}
+            own: Any = {k: v[part] for k, v in values.items() if isinstance(v, torch.Tensor)}
             single: Any = member.algorithm(SPACES)
             single.update(member.state, replace(data, **own), [seed.torch()])
     split(algorithm, state, stacked, SPACES)

@@ -61,7 +61,7 @@ def watched(run: Callable[[], None]) -> set[CodeType]:
         run()
     finally:
         sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]
+        threading.setprofile(None)
     return found
 
 

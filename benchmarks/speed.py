@@ -12,9 +12,10 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
+from typing import cast
 
 from benchmarks.common import median, recorded, report, table, warm_up
-from skillweave import Hierarchy, recipes
+from skillweave import Hierarchy, HierarchyPolicy, recipes
 
 
 def stable_baselines3(steps: int, seed: int) -> float:
@@ -46,8 +47,8 @@ def flat(seed: int, steps: int) -> tuple[float, float]:
 def selector(seed: int) -> tuple[float, float]:
     """Steps/s of the selector over the shipped skills, and of EnvPool alone fed with its calls."""
     run = Hierarchy.pretrained("lunar-lander")
-    hierarchy = run.hierarchy
-    for skill, policy in zip(hierarchy.skills, run.policy.skills.policies, strict=True):
+    hierarchy, woven = run.hierarchy, cast(HierarchyPolicy, run.policy)
+    for skill, policy in zip(hierarchy.skills, woven.skills.policies, strict=True):
         skill.policy = policy
     return trained(hierarchy, seed, False)
 

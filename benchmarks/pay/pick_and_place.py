@@ -51,7 +51,7 @@ def by_hand(selector: Any, call_steps: int = 1) -> Any:
 def cells(obs: Array) -> Array:
     """Where the block is seen from the gripper, its height, whether it is grasped, (n, 5)."""
     places = np.column_stack([obs[:, arm.OFFSET], obs[:, arm.BLOCK][:, 2]])
-    return np.column_stack([np.floor(places / 0.04), arm.is_grasped(obs)])
+    return np.column_stack([np.floor(places / 0.04), world.is_held(obs)])
 
 
 def suite() -> Suite:
