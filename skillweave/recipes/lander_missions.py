@@ -155,8 +155,12 @@ class Land(Flight):
     def wanted(self, obs: Array) -> Array:
         """Speeds, (n, 2): towards the middle; above the pad down, the slower the lower."""
         sink = -0.1 - 0.4 * np.clip(obs[:, Y], 0.0, 1.0)
-        over = np.clip(1.2 - 4.0 * np.abs(obs[:, X]), 0.0, 1.0)
-        return np.column_stack([np.clip(-2.0 * obs[:, X], -0.8, 0.8), sink * over])
+        away = np.abs(obs[:, X])
+        over = np.clip(1.2 - 4.0 * away, 0.0, 1.0)
+        # Straight down onto the pad: who touches it while moving sideways tips over.
+        low = np.clip(obs[:, Y] / 0.2, 0.0, 1.0)
+        side = np.clip(-2.0 * obs[:, X], -0.8, 0.8) * np.where(away <= 0.15, low, 1.0)
+        return np.column_stack([side, sink * over])
 
     def reward(self, step: Step) -> Array:
         """1 less the deviation, or on the pad 2 less 1 for an engine; the prize for rest on it."""

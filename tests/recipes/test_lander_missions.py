@@ -252,6 +252,13 @@ def test_landing_is_paid_for_rest_and_for_engines_that_are_off_on_the_pad():
     assert land.reward(step_of(lander(SKY), ground, terminated=True)) == missions.CRASH
 
 
+def test_a_lander_is_to_touch_the_pad_without_moving_sideways():
+    # Towards the middle by 2x: at 0.15 it is 0.3. Below 0.2 that falls with the height, to 0.
+    places = [(0.1, 0.3), (0.1, 0.1), (0.1, 0.0), (-0.1, 0.1), (0.16, 0.0)]
+    wanted = missions.Land().wanted(np.stack([lander(place) for place in places]))
+    np.testing.assert_allclose(wanted[:, 0], [-0.2, -0.1, 0.0, 0.1, -0.32], atol=1e-6)
+
+
 def test_the_selector_by_hand_calls_the_skill_of_the_leg():
     progress = world.Progress(4, [(kind,) for kind in world.KINDS], gusts=False)
     progress.left[:, 0] = np.arange(4)
