@@ -66,8 +66,8 @@ def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
     never, ones = np.zeros((1, NUM_ENVS), bool), np.ones((1, NUM_ENVS), np.int64)
 
     def add(obs: Any, true: Any, action: Any, reward: Any, ended: Any) -> None:
-        one, what, paid = obs[None], action[None], reward[None]
-        store.add(Experience(one, what, paid, ones, ended[None], never, true[None]))
+        seen, acted = obs[None], action[None]
+        store.add(Experience(seen, acted, reward[None], ones, ended[None], never, true[None]))
 
     speed = filled(transitions, add)
     grown = resident() - before

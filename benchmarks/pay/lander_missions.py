@@ -62,7 +62,7 @@ def suite() -> Suite:
         cells=cells,
         bonus=0.01,
         fixed={"by-leg": by_leg},
-        # More than learns the first task, skills included; a further task takes a seventh.
+        # More than learns the first task, skills included. A further one takes a thirteenth of it.
         flat_steps=4_000_000,
         evaluations=8,
     )

@@ -153,11 +153,15 @@ class Land(Flight):
     point = np.zeros(2)
 
     def wanted(self, obs: Array) -> Array:
-        """Speeds, (n, 2): towards the middle; above the pad down, the slower the lower."""
+        """Speeds, (n, 2): towards the middle; above the pad down, the slower the lower.
+
+        Low above the pad no sideways speed is wanted any more.
+        """
         sink = -0.1 - 0.4 * np.clip(obs[:, Y], 0.0, 1.0)
         away = np.abs(obs[:, X])
         over = np.clip(1.2 - 4.0 * away, 0.0, 1.0)
-        # Straight down onto the pad: who touches it while moving sideways tips over.
+        # Who touches the pad while moving sideways tips over. The pad goes to 0.2; who is beyond
+        # 0.15 must still come nearer.
         low = np.clip(obs[:, Y] / 0.2, 0.0, 1.0)
         side = np.clip(-2.0 * obs[:, X], -0.8, 0.8) * np.where(away <= 0.15, low, 1.0)
         return np.column_stack([side, sink * over])
