@@ -237,7 +237,7 @@ def test_going_on_is_never_worth_as_much_as_arriving(skill, most):
 def test_one_call_of_hover_may_last_for_the_way_there_and_the_leg_itself(start):
     # Several calls in a row are hardly ever drawn by lot, so a selector would not find out.
     hover, place, way = missions.Hover(), np.array(start), 0
-    while not hover.in_box(lander(place)[None])[0]:
+    while not hover.in_box(lander(place)[None])[0] and way < 1_000:  # else it is never there
         # Of the lander's view a speed of 1 is 0.01 of its width and 0.0225 of its height a step.
         place = place + hover.wanted(lander(place)[None])[0] * (0.01, 0.0225)
         way += 1
