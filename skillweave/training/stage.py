@@ -92,7 +92,8 @@ class Together:
     """
 
     floor: float = 1.0
-    """The least share of calls that are drawn uniformly from those allowed, at the start."""
+    """The least share of calls that are drawn by lot from those allowed, at the start. The fewer
+    steps a skill has acted in so far, the likelier it is drawn."""
     floor_final: float = 0.1
     """The same at the end of the budget, reached linearly."""
     task_weight: float = 0.0

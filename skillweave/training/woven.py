@@ -122,7 +122,7 @@ class WovenAgents(OneAgent):
                 part.anchor = anchor  # type: ignore[attr-defined]
             keep_to_guide(part, self._nats(name))
             parts[name] = part
-        found = WovenLearner(parts, self.node, self.together)
+        found = WovenLearner(parts, self.node, self.together, self._choices())
         if extra:
             told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
             if not ((told >= 0) & (told < 2**53)).all():
@@ -131,6 +131,12 @@ class WovenAgents(OneAgent):
                 )
             found.counts = dict(zip(parts, told.tolist(), strict=True))
         return found
+
+    def _choices(self) -> dict[str, list[str]]:
+        """By the paths of selectors that learn, the path of the skill that each choice calls."""
+        selectors = [name for name in self.algorithms if name.rpartition("/")[2] == SELECTOR]
+        scene, node = self.scene, self.node
+        return {s: [node + path for path in scene.choices(self._below(s))] for s in selectors}
 
     def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: AgentPolicy) -> Any:
         """The state that ``name`` ended its latest stage with; of a population its weights."""

@@ -16,6 +16,9 @@ from skillweave.training.learner import Learner, Stack
 from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.types import Array, prefixed, unprefixed
 
+RARE = 0.01
+"""A skill that has not acted yet is drawn 101 times as often as one that has acted alone."""
+
 
 class WovenLearner:
     """A selector and skills, each with a learner of its own; nobody learns from others' rows.
@@ -24,10 +27,18 @@ class WovenLearner:
         parts: by path, the selector first unless it is ready, then all others who learn.
         node: the path of the hierarchy: empty, or ``inner/`` for example.
         how: how much the task counts, and how far skills may move from their anchors.
+        choices: by the paths of selectors, the path of the skill that each choice calls.
     """
 
-    def __init__(self, parts: Mapping[str, Learner], node: str, how: Together) -> None:
+    def __init__(
+        self,
+        parts: Mapping[str, Learner],
+        node: str,
+        how: Together,
+        choices: Mapping[str, Sequence[str]],
+    ) -> None:
         self.parts, self._how, self._weight = dict(parts), how, 0.0
+        self._choices = choices
         self._selector, self._critic = node + SELECTOR, node + CRITIC
         self.counts = {name: [0, 0] for name in parts}
         """By path, in how many rows each has acted, and how often it has learnt from them."""
@@ -44,10 +55,38 @@ class WovenLearner:
         """
         self._weight = self._how.task_weight * progress
         asked = tuple(p.request(update, steps, progress) for p in self.parts.values())
+        for name, request in zip(self.parts, asked, strict=True):
+            if (weights := self._floor_weights(name)) is not None:
+                request.params[0].extra["floor_weights"] = weights
         if self._selector in self.parts:
             return replace(asked[0], parts=asked[1:])
         rows, seeds = max(r.rows for r in asked), asked[0].seeds / self._selector
         return Request(rows, (), asked[0].gamma, seeds, parts=asked)
+
+    def _floor_weights(self, selector: str) -> Tensor | None:
+        """How likely a selector's floor draws each of its choices, (A,); None: all alike.
+
+        The fewer rows a skill has acted in, the likelier it is. Else a skill that may seldom start
+        hardly ever acts, does not learn, and whoever comes after it never has its turn. Skills that
+        do not learn are as likely as the others are on average.
+        """
+        choices = self._choices.get(selector, ())
+        rows = {path: self._rows_of(path) for path in choices}
+        learn = {path: count for path, count in rows.items() if count is not None}
+        if not (total := sum(learn.values())):
+            return None
+        weights = {path: 1.0 / (count / total + RARE) for path, count in learn.items()}
+        usual = sum(weights.values()) / len(weights)
+        return torch.tensor([weights.get(path, usual) for path in choices])
+
+    def _rows_of(self, path: str) -> int | None:
+        """In how many rows a skill has acted, be it a hierarchy; None: it does not learn."""
+        found = [
+            count
+            for name, (count, _) in self.counts.items()
+            if not decides(name) and f"{name}/".startswith(f"{path}/")
+        ]
+        return sum(found) if found else None
 
     def take(self, experience: Experience) -> None:
         """Give each its own rows, and skills the task's advantage in them, if it counts."""

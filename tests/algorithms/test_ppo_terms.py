@@ -30,6 +30,16 @@ def test_a_floor_is_shared_among_what_is_allowed():
     assert found[0, 3] < 1e-6
 
 
+def test_a_floor_may_draw_some_more_often_than_others():
+    logits = torch.tensor([[2.0, 0.0, 1.0, 5.0]])
+    mask = torch.tensor([[True, True, True, False]])
+    weights = torch.tensor([1.0, 4.0, 5.0, 90.0])
+    found = with_floor(logits, mask, torch.tensor([[0.3]]), weights).softmax(-1)
+    own, lot = logits[0, :3].softmax(-1), torch.tensor([0.03, 0.12, 0.15])
+    torch.testing.assert_close(found[0, :3], 0.7 * own + lot)
+    assert found[0, 3] < 1e-6
+
+
 def test_the_floor_falls_over_the_budget():
     config, like = PPO(floor=0.5, floor_final=0.1), torch.zeros(2)
     assert floor_now(config, 0.25, like).flatten().tolist() == pytest.approx([0.4, 0.4])
