@@ -36,7 +36,7 @@ from benchmarks.pay.suite import Shaped
 from examples import bridge, doorkey, yard
 from skillweave import PPO, Array, Hierarchy, Lengths, Run, Together
 
-FLOOR = Together(floor=1.0, floor_final=0.1)
+FLOOR = Together(floor=1.0, floor_final=0.1, floor_balanced=True)
 
 FLOORS = {"floor": FLOOR.floor, "floor_final": FLOOR.floor_final}
 
@@ -181,8 +181,9 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "less entropy": less_entropy,
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "large call cost": functools.partial(apart, call_cost=0.01),
-    "low floor": functools.partial(together, together=Together(floor=0.3, floor_final=0.02)),
+    "low floor": functools.partial(together, together=replace(FLOOR, floor=0.3, floor_final=0.02)),
     "no least deviation": no_least_deviation,
+    "equal floor": functools.partial(together, together=replace(FLOOR, floor_balanced=False)),
     "no floor": functools.partial(together, together=Together(floor=0.0, floor_final=0.0)),
     "no call cost": functools.partial(together, call_cost=0.0),
     "task advantage": functools.partial(together, together=replace(FLOOR, task_weight=1.0)),

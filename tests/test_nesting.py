@@ -130,7 +130,9 @@ MODES = Automaton({"low": ["balance", "right"], "high": "right"}, {
     ("high", "low"): lambda step: step.next_obs[:, 2] < 0,
 })  # fmt: skip
 KINDS = {
-    "together": lambda: declare(learn="together", together=Together(task_weight=0.5)),
+    "together": lambda: declare(
+        learn="together", together=Together(task_weight=0.5, floor_balanced=True)
+    ),
     "apart": lambda: declare(),
     "then": lambda: declare(learn="apart, then together"),
     "off-policy": lambda: declare(inside(algorithm=OFF, selector=OFF), learn="together"),

@@ -72,7 +72,9 @@ class Remembers(Left):
 
 KINDS = {
     "all": lambda: declare(
-        call_steps=Lengths(1, ..., 8), interrupt=True, together=Together(task_weight=0.5)
+        call_steps=Lengths(1, ..., 8),
+        interrupt=True,
+        together=Together(task_weight=0.5, floor_balanced=True),
     ),
     "mixed": lambda: declare(Left(), Other(), Push()),
     "memory": lambda: declare(Remembers(), Balance(), together=Together(task_weight=0.5)),

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.algorithms.config_checks import number, positive
+from skillweave.algorithms.config_checks import flags, number, positive
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting import levels
 from skillweave.envs.make import EnvSpec, workers_for
@@ -92,10 +92,12 @@ class Together:
     """
 
     floor: float = 1.0
-    """The least share of calls that are drawn by lot from those allowed, at the start. The fewer
-    steps a skill has acted in so far, the likelier it is drawn."""
+    """The least share of calls that are drawn by lot from those allowed, at the start."""
     floor_final: float = 0.1
     """The same at the end of the budget, reached linearly."""
+    floor_balanced: bool = False
+    """The lot draws a skill the more often, the fewer steps it has acted in so far; else all alike.
+    It helps where a skill may seldom start, so that others would act nearly all the time."""
     task_weight: float = 0.0
     """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
     for skills that learn by PPO."""
@@ -111,6 +113,7 @@ class Together:
     def __post_init__(self) -> None:
         for name in ("floor", "floor_final", "quota"):
             number(self, name, high=1.0)
+        flags(self)
         number(self, "task_weight")
         number(self, "margin")
         if self.anchor_nats is not None:

@@ -133,7 +133,9 @@ class WovenAgents(OneAgent):
         return found
 
     def _choices(self) -> dict[str, list[str]]:
-        """By the paths of selectors that learn, the path of the skill that each choice calls."""
+        """By the paths of selectors whose floor is balanced, the skill that each choice calls."""
+        if not self.together.floor_balanced:
+            return {}
         selectors = [name for name in self.algorithms if name.rpartition("/")[2] == SELECTOR]
         scene, node = self.scene, self.node
         return {s: [node + path for path in scene.choices(self._below(s))] for s in selectors}

@@ -27,7 +27,8 @@ class WovenLearner:
         parts: by path, the selector first unless it is ready, then all others who learn.
         node: the path of the hierarchy: empty, or ``inner/`` for example.
         how: how much the task counts, and how far skills may move from their anchors.
-        choices: by the paths of selectors, the path of the skill that each choice calls.
+        choices: by the paths of selectors whose floor is balanced, the path of the skill that each
+            choice calls.
     """
 
     def __init__(
