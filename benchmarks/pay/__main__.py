@@ -5,7 +5,7 @@
 
 Suites: shuttle, pick-and-place, lander-missions, mazes, keys-and-doors. A result that is in the
 folder is not made again, and a training that was killed goes on where it stood, so the same command
-finishes what it began.
+finishes what it began. Where other code than today's made a result, the table says so.
 
 Agents, each with at least the hierarchy's steps, what learnt its skills included: F0 flat; F1 flat,
 on the task's reward and the weighted sum of the skills' rewards (weights chosen on seed 100); F2
@@ -22,7 +22,7 @@ from pathlib import Path
 from benchmarks.pay.agents import CHAINS
 from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.jobs import SUITES, run_all, suite_of
-from benchmarks.pay.results import Results
+from benchmarks.pay.results import Results, of_other_code
 from skillweave.types import SkillweaveError
 
 
@@ -80,6 +80,8 @@ def main(arguments: list[str] | None = None) -> None:
         results = reported(Results(out).all(name), seeds)
         if results:
             print(f"\n{name}\n{make_table(suite, results)}")
+            if told := of_other_code(results):
+                print(told)
             print(*draw(suite, results, out), sep="\n", flush=True)
 
 

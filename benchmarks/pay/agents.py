@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.pay.flat import Flat, with_bonus
-from benchmarks.pay.results import Result, Results, curve_of
+from benchmarks.pay.results import Result, Results, code_now, curve_of
 from benchmarks.pay.suite import Policies, Shaped, Suite, Task
 from skillweave import Array, Hierarchy, Lengths, Skill
 from skillweave.algorithms.policy import AgentPolicy
@@ -195,7 +195,7 @@ class Bench:
         score, seconds = float(np.mean(scores)), time.perf_counter() - started
         result = Result(
             self.suite.name, task.name, agent, self.seed, score, spent, budget, seconds,
-            [*curve, (spent, score)], scores, usage,
+            [*curve, (spent, score)], scores, usage, code_now(),
         )  # fmt: skip
         self.results.save(result)
         if not keep:

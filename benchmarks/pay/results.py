@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import benchmarks
+import skillweave
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
@@ -32,6 +37,8 @@ class Result:
     """Of each episode that the score is the mean of."""
     usage: dict[str, float] = field(default_factory=dict)
     """The share of steps of each skill."""
+    code: str = ""
+    """``code_now`` of when it was made."""
 
 
 class Results:
@@ -94,6 +101,30 @@ def read(path: Path) -> Result:
         return Result(**found)
     except (ValueError, TypeError, KeyError) as error:
         raise SkillweaveError(f"{path} is damaged ({error}): remove it, and run again") from error
+
+
+@functools.cache
+def code_now() -> str:
+    """A checksum of all code that a result follows from, recipes, library and benchmarks."""
+    found = hashlib.sha256()
+    for package in (skillweave, benchmarks):
+        root = Path(str(package.__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            found.update(f"{path.relative_to(root.parent)}\0".encode() + path.read_bytes())
+    return found.hexdigest()
+
+
+def of_other_code(results: Sequence[Result]) -> str:
+    """A sentence that names the results that were made by other code than today's; or nothing."""
+    others = [r for r in results if r.code != code_now()]
+    if not others:
+        return ""
+    named = ", ".join(f"{r.task} {r.agent} {r.seed}" for r in others[:5])
+    named += ", …" if len(others) > 5 else ""
+    return (
+        f"{len(others)} of these {len(results)} results were made by other code than today's "
+        f"({named}): to measure today's, give another folder with --out"
+    )
 
 
 def curve_of(path: Path, unit: float, stages: tuple[str, ...]) -> list[tuple[int, float]]:

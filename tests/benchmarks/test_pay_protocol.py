@@ -17,7 +17,7 @@ from benchmarks.pay import agents
 from benchmarks.pay.agents import CHAINS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_SEED, Bench
 from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.flat import Bonus, Flat
-from benchmarks.pay.results import Results, curve_of
+from benchmarks.pay.results import Results, curve_of, of_other_code, read
 from benchmarks.pay.suite import Shaped, Suite, Task
 from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, SkillweaveError, Step
 
@@ -170,6 +170,24 @@ def test_what_is_there_is_not_run_again(done, monkeypatch):
 def test_a_result_of_other_budgets_is_not_taken_for_this_one(done):
     with pytest.raises(SkillweaveError, match="give another folder with --out"):
         Bench(suite().scaled(2.0), done, seed=0).run("flat")
+
+
+def test_results_of_other_code_are_named(done):
+    results = done.all("line")
+    assert of_other_code(results) == ""
+    older = [replace(r, code="1f") if r.agent == HIERARCHY else r for r in results]
+    told = of_other_code(older)
+    assert told.startswith(f"2 of these {len(results)} results were made by other code")
+    assert "left hierarchy 0" in told
+    assert "right hierarchy 0" in told
+
+
+def test_a_result_that_does_not_say_its_code_is_of_other_code(done, tmp_path):
+    found = done.file("line", "left", HIERARCHY, 0)
+    told = json.loads(found.read_text())
+    del told["code"]
+    (tmp_path / "0.json").write_text(json.dumps(told))
+    assert "1 of these 1 results" in of_other_code([read(tmp_path / "0.json")])
 
 
 def test_who_was_killed_goes_on_and_comes_to_the_same(done, tmp_path, monkeypatch):
