@@ -34,11 +34,9 @@ from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat, with_bonus
 from benchmarks.pay.suite import Shaped
 from examples import bridge, doorkey, yard
-from skillweave import PPO, Array, Hierarchy, Lengths, Run, Together
+from skillweave import PPO, Array, Hierarchy, Lengths, Run
 
-FLOOR = Together(floor=1.0, floor_final=0.1, floor_balanced=True)
-
-FLOORS = {"floor": FLOOR.floor, "floor_final": FLOOR.floor_final}
+FLOORS = {"floor": 1.0, "floor_final": 0.1}
 
 
 @dataclass(frozen=True)
@@ -123,6 +121,12 @@ def together(task: Task, steps: int, **how: Any) -> Hierarchy:
     return task.declare(steps, workers=1, **how)  # runs go side by side
 
 
+def otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: Any) -> Hierarchy:
+    """The same with other settings of learning together (fields of ``Together``)."""
+    own = together(task, steps).together
+    return together(task, steps, together=replace(own, **changed), **how)
+
+
 def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
     """Skills apart, each after calls of those before, then the selector."""
     *each, last = [steps * part // sum(task.parts) for part in task.parts]
@@ -181,12 +185,13 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "less entropy": less_entropy,
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "large call cost": functools.partial(apart, call_cost=0.01),
-    "low floor": functools.partial(together, together=replace(FLOOR, floor=0.3, floor_final=0.02)),
+    "low floor": functools.partial(otherwise, changed={"floor": 0.3, "floor_final": 0.02}),
     "no least deviation": no_least_deviation,
-    "equal floor": functools.partial(together, together=replace(FLOOR, floor_balanced=False)),
-    "no floor": functools.partial(together, together=Together(floor=0.0, floor_final=0.0)),
+    "even floor": functools.partial(otherwise, changed={"floor_balanced": False}),
+    "balanced floor": functools.partial(otherwise, changed={"floor_balanced": True}),
+    "no floor": functools.partial(otherwise, changed={"floor": 0.0, "floor_final": 0.0}),
     "no call cost": functools.partial(together, call_cost=0.0),
-    "task advantage": functools.partial(together, together=replace(FLOOR, task_weight=1.0)),
+    "task advantage": functools.partial(otherwise, changed={"task_weight": 1.0}),
     "lengths": functools.partial(together, call_steps=Lengths(4, ..., 64)),
     "interrupt": functools.partial(together, interrupt=True),
     "flat": flat,

@@ -72,12 +72,12 @@ class Remembers(Left):
 
 KINDS = {
     "all": lambda: declare(
-        call_steps=Lengths(1, ..., 8),
-        interrupt=True,
-        together=Together(task_weight=0.5, floor_balanced=True),
+        call_steps=Lengths(1, ..., 8), interrupt=True, together=Together(task_weight=0.5)
     ),
     "mixed": lambda: declare(Left(), Other(), Push()),
-    "memory": lambda: declare(Remembers(), Balance(), together=Together(task_weight=0.5)),
+    "memory": lambda: declare(
+        Remembers(), Balance(), together=Together(task_weight=0.5, floor_balanced=True)
+    ),
     "a selector with a memory": lambda: declare(
         Left(), Balance(), selector=Remembers.algorithm, interrupt=True
     ),

@@ -5,7 +5,7 @@
 
 Suites: shuttle, pick-and-place, lander-missions, mazes, keys-and-doors. A result that is in the
 folder is not made again, and a training that was killed goes on where it stood, so the same command
-finishes what it began. Where other code than today's made a result, the table says so.
+finishes what it began. Results of other code than today's are named under the table.
 
 Agents, each with at least the hierarchy's steps, what learnt its skills included: F0 flat; F1 flat,
 on the task's reward and the weighted sum of the skills' rewards (weights chosen on seed 100); F2

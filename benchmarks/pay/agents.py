@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.pay.flat import Flat, with_bonus
-from benchmarks.pay.results import Result, Results, code_now, curve_of
+from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Shaped, Suite, Task
 from skillweave import Array, Hierarchy, Lengths, Skill
 from skillweave.algorithms.policy import AgentPolicy
@@ -36,6 +36,7 @@ class Bench:
 
     def __init__(self, suite: Suite, results: Results, seed: int) -> None:
         self.suite, self.results, self.seed = suite, results, seed
+        self._on_older = False  # what comes next is built on a result of other code
 
     def run(self, chain: str, tasks: Sequence[str] | None = None) -> None:
         """Train and score a chain of agents on tasks, by name (None: all)."""
@@ -67,12 +68,12 @@ class Bench:
         if self._found(task, agent, budget):
             return
         path, started = self._path(task, agent), time.perf_counter()
+        self.results.begin(path)
         hierarchy.eval_every = max(1, budget // self.suite.evaluations)
         hierarchy.eval_episodes = self.suite.evaluated
         if path.exists():
             run = hierarchy.resume(path, quiet=True)
         else:
-            path.parent.mkdir(parents=True, exist_ok=True)
             run = hierarchy.train(path, seed=self.seed, quiet=True)
         self._score(run, task, agent, budget, started, keep, ("selector", "together"))
 
@@ -82,6 +83,7 @@ class Bench:
         hierarchy = self.suite.hierarchy(source, None)
         run = hierarchy.load(self._path(source, HIERARCHY))
         policy: Any = run.policy
+        self._builds_on(source, HIERARCHY)
         return dict(zip(policy.labels, policy.skills.policies, strict=True))
 
     def _without_learning(self, task: Task) -> None:
@@ -107,7 +109,7 @@ class Bench:
         """The run of a hierarchy in which nobody learns."""
         path = self._path(task, agent)
         shutil.rmtree(path, ignore_errors=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        self.results.begin(path)
         return hierarchy.train(path, seed=self.seed, quiet=True)
 
     # Flat agents
@@ -146,6 +148,8 @@ class Bench:
         for i, weights in enumerate(self.suite.weights):
             agent = other._with_rewards(other._agent(task), weights)
             scores.append(other._learn(agent, task, f"tuning-{i}").score)
+            other._builds_on(task, f"tuning-{i}")
+        self._on_older |= other._on_older
         return dict(self.suite.weights[int(np.argmax(scores))])
 
     def _with_rewards(self, agent: Flat, weights: Any) -> Flat:
@@ -164,13 +168,15 @@ class Bench:
         if found := self._found(task, name, budget):
             return found
         path, started = self._path(task, name), time.perf_counter()
-        path.parent.mkdir(parents=True, exist_ok=True)
+        self.results.begin(path)
         return self._score(
             agent.run(path, self.seed), task, name, budget, started, keep, ("agent",)
         )
 
     def _source_agent(self) -> AgentPolicy:
-        policy: Any = self._agent(self.suite.tasks[0]).load(self._path(self.suite.tasks[0], FLAT))
+        source = self.suite.tasks[0]
+        policy: Any = self._agent(source).load(self._path(source, FLAT))
+        self._builds_on(source, FLAT)
         return policy.policy  # type: ignore[no-any-return]
 
     # What all share
@@ -193,9 +199,11 @@ class Bench:
         curve = curve_of(run.path, self.suite.unit, stages) if stages else []
         spent = sum(int(s["steps"]) for s in run.info()["stages"])
         score, seconds = float(np.mean(scores)), time.perf_counter() - started
+        begun = self.results.begun_by(run.path)
+        code = CODE if begun == CODE and not self._on_older else ""
         result = Result(
             self.suite.name, task.name, agent, self.seed, score, spent, budget, seconds,
-            [*curve, (spent, score)], scores, usage, code_now(),
+            [*curve, (spent, score)], scores, usage, code,
         )  # fmt: skip
         self.results.save(result)
         if not keep:
@@ -204,6 +212,11 @@ class Bench:
 
     def _found(self, task: Task, agent: str, budget: int) -> Result | None:
         return self.results.find(self.suite.name, task.name, agent, self.seed, budget)
+
+    def _builds_on(self, task: Task, agent: str) -> None:
+        """What follows needs this result, so it is of other code if this one is."""
+        path = self.results.file(self.suite.name, task.name, agent, self.seed)
+        self._on_older |= read(path).code != CODE
 
     def _path(self, task: Task, agent: str) -> Any:
         return self.results.run_path(self.suite.name, task.name, agent, self.seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import os
@@ -38,7 +37,7 @@ class Result:
     usage: dict[str, float] = field(default_factory=dict)
     """The share of steps of each skill."""
     code: str = ""
-    """``code_now`` of when it was made."""
+    """``CODE``, if all that it follows from was made by one code; else empty."""
 
 
 class Results:
@@ -84,6 +83,19 @@ class Results:
         part.write_text(json.dumps(asdict(result), indent=1))
         os.replace(part, path)
 
+    def begin(self, run: Path) -> None:
+        """Note by which code a training is begun, before it is, or goes on."""
+        if not run.exists():
+            run.parent.mkdir(parents=True, exist_ok=True)
+            run.with_suffix(".code").write_text(CODE)
+
+    def begun_by(self, run: Path) -> str:
+        """By which code a training was begun that is over now; empty: nobody noted it."""
+        note = run.with_suffix(".code")
+        found = note.read_text() if note.exists() else ""
+        note.unlink(missing_ok=True)
+        return found
+
     def all(self, suite: str) -> list[Result]:
         """All results of a suite."""
         return [read(path) for path in sorted((self.folder / suite).glob("*/*/*.json"))]
@@ -103,20 +115,23 @@ def read(path: Path) -> Result:
         raise SkillweaveError(f"{path} is damaged ({error}): remove it, and run again") from error
 
 
-@functools.cache
-def code_now() -> str:
-    """A checksum of all code that a result follows from, recipes, library and benchmarks."""
+def checksum(*packages: Path) -> str:
+    """Of all Python files in folders."""
     found = hashlib.sha256()
-    for package in (skillweave, benchmarks):
-        root = Path(str(package.__file__)).parent
+    for root in packages:
         for path in sorted(root.rglob("*.py")):
             found.update(f"{path.relative_to(root.parent)}\0".encode() + path.read_bytes())
     return found.hexdigest()
 
 
+CODE = checksum(*(Path(str(p.__file__)).parent for p in (skillweave, benchmarks)))
+"""Of the library with its recipes, and of the benchmarks, as this process has them. Any change of
+a file counts, comments too; versions of other packages do not."""
+
+
 def of_other_code(results: Sequence[Result]) -> str:
     """A sentence that names the results that were made by other code than today's; or nothing."""
-    others = [r for r in results if r.code != code_now()]
+    others = [r for r in results if r.code != CODE]
     if not others:
         return ""
     named = ", ".join(f"{r.task} {r.agent} {r.seed}" for r in others[:5])

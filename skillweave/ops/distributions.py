@@ -39,7 +39,7 @@ def with_floor(
 
     Args:
         floor: ε, of a shape that broadcasts with (..., A).
-        weights: (A,), positive: how likely the lot draws each action; None: all alike.
+        weights: (A,), positive: in which proportion the lot draws actions; None: all alike.
     """
     allowed = torch.ones_like(logits) if mask is None else mask.to(logits.dtype)
     if weights is not None:

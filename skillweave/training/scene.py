@@ -129,7 +129,7 @@ class WovenScene(Scene):
             return gym.spaces.Discrete(level.choices)
         return gym.spaces.Discrete(len(level.skills)) if name == CRITIC else self.skill_space
 
-    def choices(self, path: str) -> tuple[str, ...]:
+    def skills_of_choices(self, path: str) -> tuple[str, ...]:
         """The path of the skill that each choice of a selector calls, by the selector's path."""
         level = self.level(path.split("/")[:-1])
         node, each = path.removesuffix(SELECTOR), max(1, len(level.lengths))

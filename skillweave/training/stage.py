@@ -92,12 +92,13 @@ class Together:
     """
 
     floor: float = 1.0
-    """The least share of calls that are drawn by lot from those allowed, at the start."""
+    """The least share of calls that are drawn by lot from those allowed, at the start; for
+    selectors that learn by PPO."""
     floor_final: float = 0.1
     """The same at the end of the budget, reached linearly."""
     floor_balanced: bool = False
-    """The lot draws a skill the more often, the fewer steps it has acted in so far; else all alike.
-    It helps where a skill may seldom start, so that others would act nearly all the time."""
+    """The lot draws a skill the more often, the fewer of this stage's steps it has acted in; else
+    all alike. It helps where a skill may seldom start, and would act too little to learn."""
     task_weight: float = 0.0
     """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
     for skills that learn by PPO."""

@@ -137,8 +137,8 @@ class WovenAgents(OneAgent):
         if not self.together.floor_balanced:
             return {}
         selectors = [name for name in self.algorithms if name.rpartition("/")[2] == SELECTOR]
-        scene, node = self.scene, self.node
-        return {s: [node + path for path in scene.choices(self._below(s))] for s in selectors}
+        below = {s: self.scene.skills_of_choices(self._below(s)) for s in selectors}
+        return {s: [self.node + path for path in paths] for s, paths in below.items()}
 
     def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: AgentPolicy) -> Any:
         """The state that ``name`` ended its latest stage with; of a population its weights."""
@@ -207,8 +207,8 @@ class WovenAgents(OneAgent):
             if rows and not updates:
                 log.tell(
                     f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "
-                    "to learn from once: lower together.quota, raise together.floor, or give more "
-                    "steps"
+                    "to learn from once: lower together.quota, raise together.floor, set "
+                    "together.floor_balanced, or give more steps"
                 )
             elif not rows:
                 log.tell(

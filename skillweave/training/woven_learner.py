@@ -16,8 +16,9 @@ from skillweave.training.learner import Learner, Stack
 from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.types import Array, prefixed, unprefixed
 
-RARE = 0.01
-"""A skill that has not acted yet is drawn 101 times as often as one that has acted alone."""
+LEAST_SHARE = 0.01
+"""Added to each skill's share of rows, so that none is drawn more than 101 times as often as
+another."""
 
 
 class WovenLearner:
@@ -57,7 +58,8 @@ class WovenLearner:
         self._weight = self._how.task_weight * progress
         asked = tuple(p.request(update, steps, progress) for p in self.parts.values())
         for name, request in zip(self.parts, asked, strict=True):
-            if (weights := self._floor_weights(name)) is not None:
+            weights = self._floor_weights(name)
+            if weights is not None and "floor" in request.params[0].extra:
                 request.params[0].extra["floor_weights"] = weights
         if self._selector in self.parts:
             return replace(asked[0], parts=asked[1:])
@@ -65,23 +67,23 @@ class WovenLearner:
         return Request(rows, (), asked[0].gamma, seeds, parts=asked)
 
     def _floor_weights(self, selector: str) -> Tensor | None:
-        """How likely a selector's floor draws each of its choices, (A,); None: all alike.
+        """In which proportion a selector's floor draws its choices, (A,); None: all alike.
 
-        The fewer rows a skill has acted in, the likelier it is. Else a skill that may seldom start
-        hardly ever acts, does not learn, and whoever comes after it never has its turn. Skills that
-        do not learn are as likely as the others are on average.
+        The smaller the share of rows that a skill has acted in, the more often it is drawn. Else a
+        skill that may seldom start may act too little to learn. Skills that do not learn are drawn
+        as often as one that has acted in an equal share.
         """
         choices = self._choices.get(selector, ())
         rows = {path: self._rows_of(path) for path in choices}
         learn = {path: count for path, count in rows.items() if count is not None}
         if not (total := sum(learn.values())):
             return None
-        weights = {path: 1.0 / (count / total + RARE) for path, count in learn.items()}
-        usual = sum(weights.values()) / len(weights)
-        return torch.tensor([weights.get(path, usual) for path in choices])
+        shares = {path: count / total for path, count in learn.items()}
+        found = [shares.get(path, 1.0 / len(shares)) + LEAST_SHARE for path in choices]
+        return 1.0 / torch.tensor(found)
 
     def _rows_of(self, path: str) -> int | None:
-        """In how many rows a skill has acted, be it a hierarchy; None: it does not learn."""
+        """In how many rows a skill has acted, or those that learn in a hierarchy; None: none do."""
         found = [
             count
             for name, (count, _) in self.counts.items()

@@ -57,6 +57,16 @@ def test_who_acts_has_the_floor_and_who_is_greedy_has_not():
     assert "floor" not in greedy.extra
 
 
+def test_who_acts_draws_by_the_weights_that_the_floor_has():
+    algorithm = make_algorithm(PPO(floor=1.0, network=SMALL), SEEN, gym.spaces.Discrete(4))
+    params = algorithm.acting_params(algorithm.init([Seeds(0)]), 0.0)
+    params.extra["floor_weights"] = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    mask = torch.tensor([[[True, True, False, True]]])
+    _, head, _ = algorithm.act(params, torch.zeros(1, 1, 3), mask, None)
+    want = torch.tensor([1.0, 2.0, 0.0, 4.0]) / 7.0
+    torch.testing.assert_close(head[0, 0].softmax(-1), want)
+
+
 def test_a_floor_needs_discrete_actions():
     with pytest.raises(SkillweaveError, match="floor needs discrete actions"):
         make_algorithm(PPO(floor=0.1), SEEN, SEEN)

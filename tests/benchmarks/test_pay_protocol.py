@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -17,7 +18,7 @@ from benchmarks.pay import agents
 from benchmarks.pay.agents import CHAINS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_SEED, Bench
 from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.flat import Bonus, Flat
-from benchmarks.pay.results import Results, curve_of, of_other_code, read
+from benchmarks.pay.results import CODE, Results, checksum, curve_of, of_other_code, read
 from benchmarks.pay.suite import Shaped, Suite, Task
 from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, SkillweaveError, Step
 
@@ -172,14 +173,50 @@ def test_a_result_of_other_budgets_is_not_taken_for_this_one(done):
         Bench(suite().scaled(2.0), done, seed=0).run("flat")
 
 
-def test_results_of_other_code_are_named(done):
-    results = done.all("line")
+def test_results_of_other_code_are_named(done, tmp_path, capsys, monkeypatch):
+    results = reported(done.all("line"), [0])
+    assert {r.code for r in results} == {CODE}
     assert of_other_code(results) == ""
     older = [replace(r, code="1f") if r.agent == HIERARCHY else r for r in results]
     told = of_other_code(older)
     assert told.startswith(f"2 of these {len(results)} results were made by other code")
     assert "left hierarchy 0" in told
     assert "right hierarchy 0" in told
+    monkeypatch.setitem(command.SUITES, "line", suite)
+    for result in older:
+        Results(tmp_path).save(result)
+    command.main(["line", "--only-figures", "--seeds", "0", "--out", str(tmp_path)])
+    assert told in capsys.readouterr().out
+
+
+def test_the_checksum_of_code_is_of_every_file_and_its_place(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "one.py").write_text("x = 1")
+    first = checksum(tmp_path)
+    assert checksum(tmp_path) == first
+    (tmp_path / "a" / "one.py").write_text("x = 2")
+    second = checksum(tmp_path)
+    (tmp_path / "a" / "one.py").rename(tmp_path / "a" / "two.py")
+    assert len({first, second, checksum(tmp_path)}) == 3
+
+
+def test_what_is_built_on_skills_of_other_code_is_of_other_code(done, tmp_path):
+    shutil.copytree(done.folder, tmp_path / "pay")
+    results = Results(tmp_path / "pay")
+    source, last = (results.file("line", task, HIERARCHY, 0) for task in ("right", "left"))
+    results.save(replace(read(source), code="1f"))
+    last.unlink()
+    Bench(suite(), results, seed=0).run("hierarchy", ["left"])
+    assert read(last).code == ""
+
+
+def test_a_training_that_other_code_began_is_of_other_code(tmp_path):
+    run = Results(tmp_path).run_path("line", "left", HIERARCHY, 0)
+    Results(tmp_path).begin(run)
+    assert Results(tmp_path).begun_by(run) == CODE
+    run.mkdir()
+    Results(tmp_path).begin(run)  # it goes on, and nobody noted who began it
+    assert Results(tmp_path).begun_by(run) == ""
 
 
 def test_a_result_that_does_not_say_its_code_is_of_other_code(done, tmp_path):

@@ -2,7 +2,9 @@
 
 import importlib.util
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,26 @@ def test_every_case_has_the_steps_that_are_asked(case: str) -> None:
     learner = CASES[case](TASKS["bridge"], 10_000)
     steps = learner.total_steps if isinstance(learner, Hierarchy) else learner.steps
     assert 9_990 <= steps <= 10_000
+
+
+@pytest.mark.parametrize("task", ["8x8", "bridge", "yard"])
+@pytest.mark.parametrize(
+    ("case", "changed"),
+    [
+        ("low floor", {"floor": 0.3, "floor_final": 0.02}),
+        ("no floor", {"floor": 0.0, "floor_final": 0.0}),
+        ("even floor", {"floor_balanced": False}),
+        ("balanced floor", {"floor_balanced": True}),
+        ("task advantage", {"task_weight": 1.0}),
+    ],
+)
+def test_a_case_changes_what_it_names_and_nothing_else(
+    task: str, case: str, changed: dict[str, Any]
+) -> None:
+    usual, other = (CASES[name](TASKS[task], 1_000) for name in ("together", case))
+    assert isinstance(usual, Hierarchy)
+    assert isinstance(other, Hierarchy)
+    assert other.together == replace(usual.together, **changed)
 
 
 @pytest.mark.parametrize(

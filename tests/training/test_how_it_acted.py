@@ -96,7 +96,9 @@ def test_of_a_skill_with_lengths_each_choice_and_of_a_hierarchy_all_its_skills_c
     assert found == pytest.approx([1 / 0.51] * 3)
 
 
-def test_skills_that_do_not_learn_are_as_likely_as_the_others_on_average() -> None:
+def test_skills_that_do_not_learn_are_drawn_as_ones_with_an_equal_share() -> None:
     acted = {"inner/a": 30, "inner/b": 10}
     found = floor_weights(acted, ["inner/a", "inner/ready", "inner/b"])
-    assert found == pytest.approx([1 / 0.76, (1 / 0.76 + 1 / 0.26) / 2, 1 / 0.26])
+    assert found == pytest.approx([1 / 0.76, 1 / 0.51, 1 / 0.26])
+    found = floor_weights({"inner/a": 30, "inner/b": 0}, ["inner/a", "inner/ready", "inner/b"])
+    assert found == pytest.approx([1 / 1.01, 1 / 0.51, 100.0])
