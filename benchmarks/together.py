@@ -187,8 +187,6 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(otherwise, changed={"floor": 0.3, "floor_final": 0.02}),
     "no least deviation": no_least_deviation,
-    "even floor": functools.partial(otherwise, changed={"floor_balanced": False}),
-    "balanced floor": functools.partial(otherwise, changed={"floor_balanced": True}),
     "no floor": functools.partial(otherwise, changed={"floor": 0.0, "floor_final": 0.0}),
     "no call cost": functools.partial(together, call_cost=0.0),
     "task advantage": functools.partial(otherwise, changed={"task_weight": 1.0}),

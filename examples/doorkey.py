@@ -120,8 +120,7 @@ def declare(
         "learn": "together",
         "together_steps": steps,
         # At first any skill that may start is called: else one that may start anywhere takes all.
-        # A skill that has acted little is drawn more often where it may start.
-        "together": sw.Together(floor=1.0, floor_final=0.1, floor_balanced=True),
+        "together": sw.Together(floor=1.0, floor_final=0.1),
         # A call that ends at once is not worth as much as one that does not. Far from the goal a
         # decision is worth 0.02. Before anything is won, a cost as large as that teaches the
         # selector to call the skill with the longest calls.

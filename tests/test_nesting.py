@@ -22,7 +22,6 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
-from skillweave.algorithms import ppo
 from skillweave.cli import main
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy import training
@@ -137,9 +136,7 @@ KINDS = {
     "off-policy": lambda: declare(inside(algorithm=OFF, selector=OFF), learn="together"),
     "an off-policy selector above": lambda: declare(learn="together", selector=OFF),
     "memory": lambda: declare(inside(algorithm=MEMORY, selector=MEMORY), learn="together"),
-    "interrupted": lambda: declare(
-        inside(**BUSY), learn="together", together=Together(floor_balanced=True), **BUSY
-    ),
+    "interrupted": lambda: declare(inside(**BUSY), learn="together", **BUSY),
     "its own ends": lambda: declare(careful(), learn="together"),
     "its own ends apart": lambda: declare(careful(interrupt=True)),
     "a ready selector": lambda: declare(inside(selector=ready), learn="together"),
@@ -169,29 +166,6 @@ KINDS = {
         selector=lambda obs: np.where(obs[:, 1] > 0, "left", "inner"), learn="together"
     ),
 }
-
-
-def test_each_selector_with_a_balanced_floor_draws_all_its_choices_by_weights(
-    tmp_path, monkeypatch
-):
-    drawn, plain = [], ppo.with_floor
-
-    def heard(logits, mask, floor, weights):
-        drawn.append((logits.shape[-1], weights))
-        return plain(logits, mask, floor, weights)
-
-    monkeypatch.setattr(ppo, "with_floor", heard)
-    KINDS["interrupted"]().train(tmp_path / "run", seed=3, quiet=True)
-    lengths = 4  # 1, 2, 4, 8
-    assert {size for size, _ in drawn} == {3 * lengths, 2 * lengths}
-    for skills in (3, 2):
-        of_level = [w for size, w in drawn if size == skills * lengths and w is not None]
-        assert of_level, "once skills have acted there are weights"
-        for weights in of_level:
-            each = weights.view(skills, lengths)
-            assert (each == each[:, :1]).all(), "the lengths of a skill are drawn alike"
-        if skills == 3:  # the last one is ready
-            assert all(w[-1] == pytest.approx(1 / 0.51) for w in of_level)
 
 
 def leans(obs):

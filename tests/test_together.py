@@ -75,9 +75,7 @@ KINDS = {
         call_steps=Lengths(1, ..., 8), interrupt=True, together=Together(task_weight=0.5)
     ),
     "mixed": lambda: declare(Left(), Other(), Push()),
-    "memory": lambda: declare(
-        Remembers(), Balance(), together=Together(task_weight=0.5, floor_balanced=True)
-    ),
+    "memory": lambda: declare(Remembers(), Balance(), together=Together(task_weight=0.5)),
     "a selector with a memory": lambda: declare(
         Left(), Balance(), selector=Remembers.algorithm, interrupt=True
     ),

@@ -90,7 +90,7 @@ class PPO(OnPolicy):
     ent_coef_final: float | None = None
     """Weight of the entropy bonus at the end of the budget, reached linearly; None: constant."""
     floor: float = 0.0
-    """Share of actions drawn by lot from those allowed, discrete ones, at the start."""
+    """Share of actions drawn uniformly from those allowed, discrete ones, at the start."""
     floor_final: float | None = None
     """The same at the end of the budget, reached linearly; None: constant."""
     vf_coef: float = 0.5
@@ -157,7 +157,7 @@ class SkillCritic(OnPolicy):
     min_advantage_std: float = 0.05
     """The task's advantages of a smaller deviation, in units of reward, are divided by this."""
     floor: float = 0.0
-    """Share of calls that the selector draws by lot at the start, to try skills. Few of them are
+    """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
     cut: while skills learn, what skills are worth is multiplied by 1 − floor."""
     floor_final: float | None = None
     """The same at the end of the budget, reached linearly; None: constant."""

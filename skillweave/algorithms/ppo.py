@@ -116,11 +116,8 @@ class PPOAlgorithm(Algorithm):
             _, other = self.critic_net.step(views, inputs, other)
             memory = torch.cat([own, other], dim=-1)
         if self.head.discrete:
-            floor, weights = params.extra.get("floor"), params.extra.get("floor_weights")
-            if floor is None:
-                head = mask_logits(head, mask)
-            else:
-                head = with_floor(head, mask, floor, weights)
+            floor = params.extra.get("floor")
+            head = mask_logits(head, mask) if floor is None else with_floor(head, mask, floor)
         return self.head.act(head, views.get("actor.log_std"), noise), head, memory
 
     def acting_params(

@@ -41,7 +41,7 @@ class Terms:
 
 
 def floor_now(config: PPO | SkillCritic, progress: float, like: Tensor) -> Tensor | None:
-    """The share of actions that is drawn by lot, (P, 1, 1); None: there is no such share.
+    """The share of actions that is drawn uniformly, (P, 1, 1); None: there is no such share.
 
     Args:
         like: (P,).

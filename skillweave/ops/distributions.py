@@ -32,21 +32,16 @@ def mask_logits(
     return logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
 
 
-def with_floor(
-    logits: Tensor, mask: Tensor | None, floor: Tensor, weights: Tensor | None = None
-) -> Tensor:
-    """Logits (..., A) of ``(1 − ε)·softmax + ε·lot`` over what ``mask`` (..., A) allows.
+def with_floor(logits: Tensor, mask: Tensor | None, floor: Tensor) -> Tensor:
+    """Logits (..., A) of ``(1 − ε)·softmax + ε·uniform`` over what ``mask`` (..., A) allows.
 
     Args:
         floor: ε, of a shape that broadcasts with (..., A).
-        weights: (A,), positive: in which proportion the lot draws actions; None: all alike.
     """
     allowed = torch.ones_like(logits) if mask is None else mask.to(logits.dtype)
-    if weights is not None:
-        allowed = allowed * weights
-    lot = allowed / allowed.sum(-1, keepdim=True)
+    uniform = allowed / allowed.sum(-1, keepdim=True)
     share = mask_logits(logits, mask).softmax(-1)
-    return mask_logits(torch.lerp(share, lot, floor).clamp_min(1e-30).log(), mask)
+    return mask_logits(torch.lerp(share, uniform, floor).clamp_min(1e-30).log(), mask)
 
 
 def categorical_kl(logits: Tensor, other: Tensor) -> Tensor:

@@ -129,12 +129,6 @@ class WovenScene(Scene):
             return gym.spaces.Discrete(level.choices)
         return gym.spaces.Discrete(len(level.skills)) if name == CRITIC else self.skill_space
 
-    def skills_of_choices(self, path: str) -> tuple[str, ...]:
-        """The path of the skill that each choice of a selector calls, by the selector's path."""
-        level = self.level(path.split("/")[:-1])
-        node, each = path.removesuffix(SELECTOR), max(1, len(level.lengths))
-        return tuple(node + skill.name for skill in level.skills for _ in range(each))
-
     def steps_of_row(self, path: str) -> int:
         """Environment steps of a row of a learner's experience, about, by its path."""
         *nodes, name = path.split("/")

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
-from skillweave.algorithms.config_checks import flags, number, positive
+from skillweave.algorithms.config_checks import number, positive
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting import levels
 from skillweave.envs.make import EnvSpec, workers_for
@@ -92,13 +92,9 @@ class Together:
     """
 
     floor: float = 1.0
-    """The least share of calls that are drawn by lot from those allowed, at the start; for
-    selectors that learn by PPO."""
+    """The least share of calls that are drawn uniformly from those allowed, at the start."""
     floor_final: float = 0.1
     """The same at the end of the budget, reached linearly."""
-    floor_balanced: bool = False
-    """The lot draws a skill the more often, the fewer of this stage's steps it has acted in; else
-    all alike. It helps where a skill may seldom start, and would act too little to learn."""
     task_weight: float = 0.0
     """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
     for skills that learn by PPO."""
@@ -114,7 +110,6 @@ class Together:
     def __post_init__(self) -> None:
         for name in ("floor", "floor_final", "quota"):
             number(self, name, high=1.0)
-        flags(self)
         number(self, "task_weight")
         number(self, "margin")
         if self.anchor_nats is not None:

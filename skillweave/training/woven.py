@@ -122,7 +122,7 @@ class WovenAgents(OneAgent):
                 part.anchor = anchor  # type: ignore[attr-defined]
             keep_to_guide(part, self._nats(name))
             parts[name] = part
-        found = WovenLearner(parts, self.node, self.together, self._choices())
+        found = WovenLearner(parts, self.node, self.together)
         if extra:
             told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
             if not ((told >= 0) & (told < 2**53)).all():
@@ -131,14 +131,6 @@ class WovenAgents(OneAgent):
                 )
             found.counts = dict(zip(parts, told.tolist(), strict=True))
         return found
-
-    def _choices(self) -> dict[str, list[str]]:
-        """By the paths of selectors whose floor is balanced, the skill that each choice calls."""
-        if not self.together.floor_balanced:
-            return {}
-        selectors = [name for name in self.algorithms if name.rpartition("/")[2] == SELECTOR]
-        below = {s: self.scene.skills_of_choices(self._below(s)) for s in selectors}
-        return {s: [self.node + path for path in paths] for s, paths in below.items()}
 
     def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: AgentPolicy) -> Any:
         """The state that ``name`` ended its latest stage with; of a population its weights."""
@@ -207,8 +199,8 @@ class WovenAgents(OneAgent):
             if rows and not updates:
                 log.tell(
                     f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "
-                    "to learn from once: lower together.quota, raise together.floor, set "
-                    "together.floor_balanced, or give more steps"
+                    "to learn from once: lower together.quota, raise together.floor, or give more "
+                    "steps"
                 )
             elif not rows:
                 log.tell(

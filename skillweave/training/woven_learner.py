@@ -16,10 +16,6 @@ from skillweave.training.learner import Learner, Stack
 from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.types import Array, prefixed, unprefixed
 
-LEAST_SHARE = 0.01
-"""Added to each skill's share of rows, so that none is drawn more than 101 times as often as
-another."""
-
 
 class WovenLearner:
     """A selector and skills, each with a learner of its own; nobody learns from others' rows.
@@ -28,19 +24,10 @@ class WovenLearner:
         parts: by path, the selector first unless it is ready, then all others who learn.
         node: the path of the hierarchy: empty, or ``inner/`` for example.
         how: how much the task counts, and how far skills may move from their anchors.
-        choices: by the paths of selectors whose floor is balanced, the path of the skill that each
-            choice calls.
     """
 
-    def __init__(
-        self,
-        parts: Mapping[str, Learner],
-        node: str,
-        how: Together,
-        choices: Mapping[str, Sequence[str]],
-    ) -> None:
+    def __init__(self, parts: Mapping[str, Learner], node: str, how: Together) -> None:
         self.parts, self._how, self._weight = dict(parts), how, 0.0
-        self._choices = choices
         self._selector, self._critic = node + SELECTOR, node + CRITIC
         self.counts = {name: [0, 0] for name in parts}
         """By path, in how many rows each has acted, and how often it has learnt from them."""
@@ -57,39 +44,10 @@ class WovenLearner:
         """
         self._weight = self._how.task_weight * progress
         asked = tuple(p.request(update, steps, progress) for p in self.parts.values())
-        for name, request in zip(self.parts, asked, strict=True):
-            weights = self._floor_weights(name)
-            if weights is not None and "floor" in request.params[0].extra:
-                request.params[0].extra["floor_weights"] = weights
         if self._selector in self.parts:
             return replace(asked[0], parts=asked[1:])
         rows, seeds = max(r.rows for r in asked), asked[0].seeds / self._selector
         return Request(rows, (), asked[0].gamma, seeds, parts=asked)
-
-    def _floor_weights(self, selector: str) -> Tensor | None:
-        """In which proportion a selector's floor draws its choices, (A,); None: all alike.
-
-        The smaller the share of rows that a skill has acted in, the more often it is drawn. Else a
-        skill that may seldom start may act too little to learn. Skills that do not learn are drawn
-        as often as one that has acted in an equal share.
-        """
-        choices = self._choices.get(selector, ())
-        rows = {path: self._rows_of(path) for path in choices}
-        learn = {path: count for path, count in rows.items() if count is not None}
-        if not (total := sum(learn.values())):
-            return None
-        shares = {path: count / total for path, count in learn.items()}
-        found = [shares.get(path, 1.0 / len(shares)) + LEAST_SHARE for path in choices]
-        return 1.0 / torch.tensor(found)
-
-    def _rows_of(self, path: str) -> int | None:
-        """In how many rows a skill has acted, or those that learn in a hierarchy; None: none do."""
-        found = [
-            count
-            for name, (count, _) in self.counts.items()
-            if not decides(name) and f"{name}/".startswith(f"{path}/")
-        ]
-        return sum(found) if found else None
 
     def take(self, experience: Experience) -> None:
         """Give each its own rows, and skills the task's advantage in them, if it counts."""

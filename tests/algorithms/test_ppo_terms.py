@@ -30,16 +30,6 @@ def test_a_floor_is_shared_among_what_is_allowed():
     assert found[0, 3] < 1e-6
 
 
-def test_a_floor_may_draw_some_more_often_than_others():
-    logits = torch.tensor([[2.0, 0.0, 1.0, 5.0]])
-    mask = torch.tensor([[True, True, True, False]])
-    weights = torch.tensor([1.0, 4.0, 5.0, 90.0])
-    found = with_floor(logits, mask, torch.tensor([[0.3]]), weights).softmax(-1)
-    own, lot = logits[0, :3].softmax(-1), torch.tensor([0.03, 0.12, 0.15])
-    torch.testing.assert_close(found[0, :3], 0.7 * own + lot)
-    assert found[0, 3] < 1e-6
-
-
 def test_the_floor_falls_over_the_budget():
     config, like = PPO(floor=0.5, floor_final=0.1), torch.zeros(2)
     assert floor_now(config, 0.25, like).flatten().tolist() == pytest.approx([0.4, 0.4])
@@ -55,16 +45,6 @@ def test_who_acts_has_the_floor_and_who_is_greedy_has_not():
     assert head.softmax(-1).min() >= 0.2 - 1e-6
     greedy = algorithm.acting_params_of(algorithm.weights(state))
     assert "floor" not in greedy.extra
-
-
-def test_who_acts_draws_by_the_weights_that_the_floor_has():
-    algorithm = make_algorithm(PPO(floor=1.0, network=SMALL), SEEN, gym.spaces.Discrete(4))
-    params = algorithm.acting_params(algorithm.init([Seeds(0)]), 0.0)
-    params.extra["floor_weights"] = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    mask = torch.tensor([[[True, True, False, True]]])
-    _, head, _ = algorithm.act(params, torch.zeros(1, 1, 3), mask, None)
-    want = torch.tensor([1.0, 2.0, 0.0, 4.0]) / 7.0
-    torch.testing.assert_close(head[0, 0].softmax(-1), want)
 
 
 def test_a_floor_needs_discrete_actions():

@@ -29,8 +29,6 @@ def test_every_case_has_the_steps_that_are_asked(case: str) -> None:
     [
         ("low floor", {"floor": 0.3, "floor_final": 0.02}),
         ("no floor", {"floor": 0.0, "floor_final": 0.0}),
-        ("even floor", {"floor_balanced": False}),
-        ("balanced floor", {"floor_balanced": True}),
         ("task advantage", {"task_weight": 1.0}),
     ],
 )

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import PPO, Together
+from skillweave import Together
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.experience import Experience
 from skillweave.seeding import Seeds
-from skillweave.training.learner import Learner, RolloutLearner, Stack
+from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.woven_learner import WovenLearner, how_it_acted
 from skillweave.types import Array
 
@@ -59,46 +59,6 @@ def test_a_task_that_says_little_moves_skills_little(least: float, deviation: fl
     given = torch.tensor([[[0.5, -0.5]] * 3])
     algorithm.advantage = lambda *_: given  # type: ignore[method-assign]
     learner = RolloutLearner(Stack(algorithm, state), Seeds(0))
-    woven = WovenLearner({"skill_critic": learner}, "", Together(), {})
+    woven = WovenLearner({"skill_critic": learner}, "", Together())
     found = woven._task_advantage(rows())
     assert found.std() == pytest.approx(deviation, rel=0.01)
-
-
-def floor_weights(acted: dict[str, int], choices: list[str]) -> list[float] | None:
-    """How likely the floor draws each choice, after skills have acted in so many rows."""
-    config = PPO(num_envs=2, n_steps=3, batch_size=6, floor=1.0)
-    seen, two = gym.spaces.Box(-9, 9, (1,), np.float32), gym.spaces.Discrete(2)
-    algorithm = make_algorithm(config, seen, two)
-    names = ["inner/selector", *acted]
-    stack = Stack(algorithm, algorithm.init([Seeds(0)]))
-    parts: dict[str, Learner] = {name: RolloutLearner(stack, Seeds(0)) for name in names}
-    woven = WovenLearner(parts, "inner/", Together(), {"inner/selector": choices})
-    woven.counts |= {name: [rows, 0] for name, rows in acted.items()}
-    (params,) = woven.request(1, 0, 0.0).params
-    found = params.extra.get("floor_weights")
-    return None if found is None else [float(x) for x in found]
-
-
-def test_the_floor_draws_skills_that_have_acted_little_more_often() -> None:
-    found = floor_weights({"inner/a": 30, "inner/b": 10}, ["inner/a", "inner/b"])
-    assert found == pytest.approx([1 / 0.76, 1 / 0.26])
-    found = floor_weights({"inner/a": 40, "inner/b": 0}, ["inner/a", "inner/b"])
-    assert found == pytest.approx([1 / 1.01, 100.0])
-
-
-def test_before_any_skill_has_acted_the_floor_draws_all_alike() -> None:
-    assert floor_weights({"inner/a": 0, "inner/b": 0}, ["inner/a", "inner/b"]) is None
-
-
-def test_of_a_skill_with_lengths_each_choice_and_of_a_hierarchy_all_its_skills_count() -> None:
-    acted = {"inner/a": 20, "inner/deep/selector": 9, "inner/deep/b": 15, "inner/deep/c": 5}
-    found = floor_weights(acted, ["inner/a", "inner/a", "inner/deep"])
-    assert found == pytest.approx([1 / 0.51] * 3)
-
-
-def test_skills_that_do_not_learn_are_drawn_as_ones_with_an_equal_share() -> None:
-    acted = {"inner/a": 30, "inner/b": 10}
-    found = floor_weights(acted, ["inner/a", "inner/ready", "inner/b"])
-    assert found == pytest.approx([1 / 0.76, 1 / 0.51, 1 / 0.26])
-    found = floor_weights({"inner/a": 30, "inner/b": 0}, ["inner/a", "inner/ready", "inner/b"])
-    assert found == pytest.approx([1 / 1.01, 1 / 0.51, 100.0])
