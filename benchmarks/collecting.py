@@ -52,13 +52,13 @@ def grid(render_mode: str | None = None) -> gym.Env[Any, Any]:
     return Flat(gym.make(GRID, render_mode=render_mode))
 
 
-def ours(workers: int, steps: int, cluster: Ray | None = None) -> float:
+def ours(workers: int, steps: int, cluster: Ray | None = None, env: Any = grid) -> float:
     config = PPO(
         num_envs=ENVS, n_steps=ROWS, batch_size=BATCH, update_epochs=EPOCHS, network=NETWORK,
         normalize_obs=False,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        spec = EnvSpec(grid, engine="sync", workers=workers)
+        spec = EnvSpec(env, engine="sync", workers=workers)
         run = train_agent(spec, config, steps, Path(folder) / "run", quiet=True, cluster=cluster)
         return float(run.info()["stages"][0]["steps_per_second"])
 
