@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skillweave.algorithms.base import ActingParams, AgentState, Algorithm
-    from skillweave.algorithms.config import DQN, PPO, SAC, TD3, OnPolicy
+    from skillweave.algorithms.config import DQN, PPO, SAC, TD3, OnPolicy, SelfImitationPPO
     from skillweave.algorithms.parameters import ParameterGroup
     from skillweave.algorithms.registry import register_algorithm
     from skillweave.api import Agent, Hierarchy, Run, train_agent
@@ -84,6 +84,7 @@ _HOME = {
     "Sample": "experience",
     "Seeds": "seeding",
     "Selection": "evolution.selection",
+    "SelfImitationPPO": "algorithms.config",
     "Skill": "skills",
     "SkillweaveError": "types",
     "Step": "types",
@@ -154,6 +155,7 @@ __all__ = [
     "Sample",
     "Seeds",
     "Selection",
+    "SelfImitationPPO",
     "Skill",
     "SkillweaveError",
     "Step",

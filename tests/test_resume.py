@@ -408,6 +408,11 @@ LEARNERS = {
         "network=Network((6,))": f"network=Network((6,), {GRU})",
         " critic=Network(hidden=(5, 5)),": "",
     },
+    "self-imitation": {
+        "algorithm=small": (
+            "algorithm=SelfImitationPPO(**vars(small), imitation_rows=50)"
+        ),
+    },
     "dqn and sac": {
         "algorithm=small": f"algorithm=DQN({SMALL_REPLAY})",
         "selector=small": f"selector=SAC({SMALL_REPLAY})",
@@ -421,7 +426,9 @@ LEARNERS = {
 
 def recipe_of(folder: Path, learner: str, workers: int) -> str:
     text = RECIPE.replace("ENGINE", "sync").replace("workers=1", f"workers={workers}")
-    text = text.replace("import Network, PPO,", "import DQN, RNN, SAC, Network, PPO,")
+    text = text.replace(
+        "import Network, PPO,", "import DQN, RNN, SAC, SelfImitationPPO, Network, PPO,"
+    )
     for old, new in LEARNERS[learner].items():
         assert old in text
         text = text.replace(old, new)

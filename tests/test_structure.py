@@ -65,9 +65,11 @@ LEAVES: dict[str, set[str]] = {
         "networks.config",
         "algorithms.config_checks",
         "algorithms.config_off_policy",
+        "algorithms.config_on_policy",
     },
     "algorithms.config_checks": {"types", "messages", "networks.config"},
     "algorithms.config_off_policy": {"types", "networks.config", "algorithms.config_checks"},
+    "algorithms.config_on_policy": {"types", "networks.config", "algorithms.config_checks"},
     "evolution.config": {
         "types",
         "messages",

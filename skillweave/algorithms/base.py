@@ -203,6 +203,9 @@ class Algorithm:
             return None, None
         return _scaling(state.obs_mean, state.obs_var)
 
+    def check_state(self, state: Any) -> None:
+        """Raise a SkillweaveError where a finite number of a ``state`` is out of its range."""
+
     def layouts(self) -> dict[str, Layout]:
         """The fields of the state that hold parameters, or moments of them, and their columns."""
         groups = self.parameter_groups()
@@ -214,9 +217,7 @@ class Algorithm:
         return self.layout.shapes | (scaling if self.normalize_obs else {})
 
     def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
-        """One ``member``'s policy of a ``state`` by name: parameters (*shape) and the scaling of
-        observations (O,), copied to the CPU.
-        """
+        """One ``member``'s policy: parameters (*shape) and scaling (O,), copied to the CPU."""
         named = {k: v[member] for k, v in self.layout.views(state.params).items()}
         if self.normalize_obs:
             named |= {k: getattr(state, k)[member] for k in ("obs_mean", "obs_var")}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import torch
@@ -53,7 +53,7 @@ class PPOAlgorithm(Algorithm):
     """PPO on one pair of spaces. Holds no learnt state: that is in ``State``."""
 
     store = "rollout"
-    state_type = State
+    state_type: ClassVar[type[State]] = State
     member_hyperparameters = (
         "learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "vf_coef",
         "max_grad_norm",

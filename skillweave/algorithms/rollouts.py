@@ -21,7 +21,7 @@ def rows_where(flags: Tensor) -> Tensor:
 
     K is the largest number of any member; the others' are followed by rows that are False.
     """
-    return _first_true(flags, *on_host(flags.sum(1).max()))
+    return first_true(flags, *on_host(flags.sum(1).max()))
 
 
 def values_after(value: Tensor, last: Tensor, at_ends: Callable[[Tensor], Tensor]) -> Tensor:
@@ -53,7 +53,7 @@ class Cells:
         if rollout.valid is not None:
             valid = rollout.valid.flatten(1)
             (self.most,) = on_host(valid.sum(1).max())
-            self._rows = None if all_cells else _first_true(valid, self.most)
+            self._rows = None if all_cells else first_true(valid, self.most)
 
     def flat(self, x: Tensor) -> Tensor:
         """(P, T, B, …) to (P, N, …)."""
@@ -75,7 +75,8 @@ class Cells:
         return self.unflat(x)
 
 
-def _first_true(flags: Tensor, count: int) -> Tensor:
+def first_true(flags: Tensor, count: int) -> Tensor:
+    """The first ``count`` rows that are True, (P, count), of flags (P, N); then others."""
     order = flags.to(torch.int8).argsort(dim=1, descending=True, stable=True)
     return order[:, :count]
 

@@ -61,7 +61,7 @@ def check_held(
             _check_field(name, x, lead, obs, codec)
         for name in ("obs", "next_obs"):
             seen.check(rows[name])
-        _check_actions(rows["action"], codec)
+        codec.check(rows["action"])
         steps = rows["steps"]
         if not bool(((steps >= 1) & (steps < LARGEST_STEPS)).all()):
             raise ValueError("a row of it took no step, or more than there are")
@@ -85,14 +85,6 @@ def _check_field(
         raise ValueError(f"{name!r} of its rows is {x.dtype} {tuple(x.shape)}")
     if name in DTYPES and x.is_floating_point() and not bool(x.isfinite().all()):
         raise ValueError(f"{name!r} of its rows is not finite")
-
-
-def _check_actions(action: Tensor, codec: ActionCodec) -> None:
-    """That discrete actions are among those that there are."""
-    if codec.discrete:
-        most = torch.tensor(codec.parts if codec.multi else codec.parts[0])
-        if not bool(((action >= 0) & (action < most)).all()):
-            raise ValueError("an action of its rows does not exist")
 
 
 def check_columns(

@@ -9,6 +9,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
+from torch import Tensor
 
 from skillweave.spaces.packing import check_size
 from skillweave.types import Array, SkillweaveError
@@ -69,6 +71,13 @@ class ActionCodec:
         width = np.where(span[bounded] == 0.0, 1.0, span[bounded])  # low == high: any unit
         units[:, bounded] = (units[:, bounded] - low[bounded]) / width * 2.0 - 1.0
         return units.astype(np.float32)
+
+    def check(self, action: Tensor) -> None:
+        """Raise a ValueError where actions in policy units (…) are none of this space."""
+        if self.discrete:
+            most = torch.tensor(self.parts if self.multi else self.parts[0])
+            if not bool(((action >= 0) & (action < most.to(action.device))).all()):
+                raise ValueError("an action of its rows does not exist")
 
     def _shaped(self, action: Array) -> Array:
         shaped = action.reshape(len(action), *(self.space.shape or ()))

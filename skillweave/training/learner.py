@@ -27,6 +27,9 @@ class Stack:
     algorithm: Any
     state: Any  # of P members
 
+    def __post_init__(self) -> None:
+        self.algorithm.check_state(self.state)  # it may be one that was read from a file
+
     @property
     def members(self) -> int:
         """P."""

@@ -27,7 +27,16 @@ from toys import (
 )
 
 from skillweave.algorithms import config as table
-from skillweave.algorithms.config import DQN, PPO, SAC, TD3, AlgorithmConfig, OnPolicy
+from skillweave.algorithms.config import (
+    DQN,
+    PPO,
+    SAC,
+    TD3,
+    AlgorithmConfig,
+    OffPolicy,
+    OnPolicy,
+    SelfImitationPPO,
+)
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.algorithms.ppo_samples import next_values
@@ -53,6 +62,7 @@ OWN = own_algorithm().A2C(
     num_envs=8, n_steps=8, gamma=0.5, learning_rate=2e-2, normalize_obs=False, ent_coef=0.0,
     network=Network((16,)),
 )  # fmt: skip
+IMITATING = SelfImitationPPO(**vars(ON), imitation_rows=64, imitation_steps=2)
 SQUASHED = replace(ON, squash_actions=True)
 STATE_STD = replace(ON, action_std="state", learning_rate=5e-3)
 LSTM = replace(ON, network=Network((16,), rnn=RNN("lstm", 8)))
@@ -114,6 +124,9 @@ TABLE: dict[str, Case] = {
         ("ppo with state's deviation", STATE_STD, "tuple", "Box", 4096),
         ("ppo with lstm", LSTM, "vector", "Discrete", 3072),
         ("ppo with gru", replace(GRU, ent_coef=0.02), "dict", "MultiBinary", 6144),
+        ("self-imitation", IMITATING, "vector", "Discrete", 1536),
+        ("self-imitation", IMITATING, "dict", "Box", 4096),
+        ("self-imitation", IMITATING, "image, channels last", "MultiDiscrete", 1536),
         ("own", OWN, "vector", "Discrete", 7680),
         ("own", replace(OWN, learning_rate=5e-3), "tuple", "Box", 25_600),
         ("own", OWN, "image, channels last", "Discrete", 7680),
@@ -276,6 +289,7 @@ EXACT: dict[str, Any] = {
 COLD = {"ent_coef": 1e-4, "learn_ent_coef": False}
 VALUED: dict[str, AlgorithmConfig] = {
     "ppo": replace(ON, gamma=GAMMA),
+    "self-imitation": replace(IMITATING, gamma=GAMMA),
     "own": replace(OWN, gamma=GAMMA),
     "ppo with lstm": replace(LSTM, gamma=GAMMA),
     "dqn": DQN(**EXACT),
@@ -299,7 +313,7 @@ def acted_in(env: Any, name: str) -> Any:
 def trained(env: Any, name: str, each: int = 1, scale: float = 1.0) -> tuple[Any, Any]:
     """Trained for a number of calls of so many steps."""
     config = VALUED[name]
-    calls = {PPO: 4096, type(OWN): 16_384}.get(type(config), 900)
+    calls = {PPO: 4096, SelfImitationPPO: 4096, type(OWN): 16_384}.get(type(config), 900)
     return learn(config, env, int(calls * each * scale))
 
 
@@ -394,7 +408,7 @@ def test_a_forbidden_action_is_never_taken(name):
         assert (some != obs).all()
 
 
-@pytest.mark.parametrize("name", [name for name in CHOOSERS if name != "own" and "ppo" not in name])
+@pytest.mark.parametrize("name", [name for name in CHOOSERS if isinstance(VALUED[name], OffPolicy)])
 def test_a_forbidden_action_is_never_drawn_at_random_before_learning(name):
     env = Masked(8)
     algorithm, _ = learn(replace(VALUED[name], learning_starts=4000), env, 2000)

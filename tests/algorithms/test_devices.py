@@ -15,7 +15,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 from torch.utils._pytree import tree_map
 
-from skillweave import DQN, PPO, SAC, TD3, Network, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
 from skillweave.algorithms import rollouts
 from skillweave.algorithms.base import state_to
 from skillweave.algorithms.registry import make_algorithm
@@ -38,6 +38,7 @@ ON: dict[str, tuple[PPO, Any, Any]] = {
     "continuous": (PPO(**SMALL, clip_value=0.2), SEEN, FORCE),
     "by kl": (PPO(**SMALL, learning_rate_schedule="kl", target_kl=0.01), SEEN, LINE),
     "early stop": (PPO(**SMALL, target_kl=0.01), SEEN, LINE),
+    "self-imitation": (SelfImitationPPO(**SMALL, imitation_rows=8), SEEN, CHOICE),
     "gru": (PPO(network=Network((8,), rnn=RNN("gru", 4))), SEEN, LINE),
     "images": (PPO(network=Network((8,), cnn=CNN("plain", (4,), (3,), (3,)))), MIXED, LINE),
 }

@@ -11,7 +11,18 @@ import pytest
 import torch
 from toys import random_critic
 
-from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Mutations, Network, SkillweaveError
+from skillweave import (
+    CNN,
+    DQN,
+    PPO,
+    RNN,
+    SAC,
+    TD3,
+    Mutations,
+    Network,
+    SelfImitationPPO,
+    SkillweaveError,
+)
 from skillweave.evolution.architecture import Change, check_architecture, draw_change, rebuilt
 from skillweave.evolution.stacks import Member, copy, join, split
 from skillweave.ops.optim import adam_
@@ -31,6 +42,7 @@ KINDS = {
     "ppo": (PPO(), CHOICE),
     "ppo, force": (PPO(), FORCE),
     "ppo, memory": (PPO(network=Network(rnn=RNN("lstm", 6))), CHOICE),
+    "self-imitation": (SelfImitationPPO(imitation_rows=20), CHOICE),
     "dqn": (DQN(), CHOICE),
     "rainbow": (DQN.rainbow(), CHOICE),
     "td3": (TD3(), FORCE),
@@ -85,7 +97,7 @@ def outputs(made: Member, spaces: Any) -> dict[str, torch.Tensor]:
                     if getattr(net, "memory_size", 0):
                         zero = torch.zeros(1, 50, net.memory_size)
                         found[key] = net.step(views, inputs, zero)[0]
-                    elif field.startswith("critic") and made.config.__class__ is not PPO:
+                    elif field.startswith("critic") and not isinstance(made.config, PPO):
                         found[key] = net(views, inputs, action)
                     else:
                         found[key] = net(views, inputs)

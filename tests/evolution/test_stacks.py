@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import DQN, PPO, RNN, SAC, TD3, Network
+from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO
 from skillweave.evolution.stacks import Member, crop, join, pad, split, stack_key
 from skillweave.experience import Rollout, Sample
 from skillweave.networks.stacked import Layout
@@ -23,6 +23,10 @@ REPLAY: dict[str, Any] = {"num_envs": 2, "batch_size": 16, "buffer_size": 100}
 CASES = {
     "ppo": (PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=2), CHOICE),
     "ppo, force": (PPO(num_envs=2, n_steps=8, batch_size=16, normalize_obs=True), FORCE),
+    "self-imitation": (
+        SelfImitationPPO(num_envs=2, n_steps=8, batch_size=16, imitation_rows=20),
+        CHOICE,
+    ),
     "dqn": (DQN(**REPLAY), CHOICE),
     "rainbow": (DQN.rainbow(**REPLAY), CHOICE),
     "td3": (TD3(**REPLAY), FORCE),

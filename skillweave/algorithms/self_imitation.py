@@ -1,0 +1,194 @@
+"""PPO with self-imitation (Oh, Guo, Singh & Lee 2018) for P members at once.
+
+An update is PPO's own; then come steps on good rows of before, which are part of the state. What
+counts is by how much a row's return exceeds the value, (R − V)₊ of eqs. 2 and 3 there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from skillweave.algorithms.config import SelfImitationPPO
+from skillweave.algorithms.ppo import PPOAlgorithm
+from skillweave.algorithms.ppo import State as PPOState
+from skillweave.algorithms.ppo_samples import Terms
+from skillweave.algorithms.rollouts import Cells, first_true
+from skillweave.experience import Report, Rollout
+from skillweave.networks.stacked import Views, take_rows
+from skillweave.ops.device import all_false
+from skillweave.ops.optim import adam_, clip_grad_norm_
+from skillweave.ops.returns import gae
+from skillweave.seeding import Seeds
+from skillweave.spaces import obs_dtype, obs_shape, to_tensor
+from skillweave.types import SkillweaveError
+
+
+@dataclass
+class State(PPOState):
+    """PPO's, and K rows that are kept."""
+
+    kept: Tensor  # (P, K) bool, the others are empty; the latest come first
+    kept_obs: Tensor  # (P, K, *obs_shape)
+    kept_action: Tensor  # (P, K) int64, or (P, K, A)
+    kept_mask: Tensor  # (P, K, A) bool, allowed actions
+    kept_return: Tensor  # (P, K), in units of reward
+
+    @property
+    def rows(self) -> Rows:
+        """What is kept."""
+        return Rows(self.kept_obs, self.kept_action, self.kept_mask, self.kept_return)
+
+
+@dataclass(slots=True)
+class Rows:
+    """What rows of P members did; fields as in ``State``."""
+
+    obs: Tensor
+    action: Tensor
+    mask: Tensor
+    returns: Tensor
+
+    def take(self, rows: Tensor) -> Rows:
+        """Those of ``rows`` (P, B)."""
+        parts = (self.obs, self.action, self.mask, self.returns)
+        return Rows(*(take_rows(x, rows) for x in parts))
+
+
+class SelfImitationAlgorithm(PPOAlgorithm):
+    """PPO that learns again from good rows of before; see the module."""
+
+    state_type: ClassVar[type[State]] = State
+    config: SelfImitationPPO
+
+    def fresh_state(self, seeds: Sequence[Seeds]) -> State:
+        """A state of fresh members, which have no row yet."""
+        lead, width = (len(seeds), self.config.imitation_rows), self.codec.size
+        action = self.codec.from_env(np.asarray(self.action_space.sample())[None])
+        space: gym.Space[Any] = self.observation_space
+        obs = to_tensor(np.zeros((1, *obs_shape(space)), obs_dtype(space)))[0]
+        return State(
+            **vars(super().fresh_state(seeds)),
+            kept=torch.zeros(lead, dtype=torch.bool),
+            kept_obs=obs.new_zeros(*lead, *obs.shape),
+            kept_action=to_tensor(action).new_zeros(*lead, *action.shape[1:]),
+            kept_mask=torch.ones(*lead, width, dtype=torch.bool),
+            kept_return=torch.zeros(lead),
+        )
+
+    def check_state(self, state: Any) -> None:
+        """Raise a SkillweaveError where a row that is kept is none of these spaces."""
+        try:
+            self.obs.check(state.kept_obs)
+            self.codec.check(state.kept_action)
+        except ValueError as error:
+            raise SkillweaveError(
+                f"what SelfImitationPPO has kept to learn from again is damaged: {error}. The file "
+                "that it was read from was altered"
+            ) from error
+
+    def update(
+        self, state: Any, batch: Rollout, rng: Sequence[torch.Generator]
+    ) -> tuple[Any, Report]:
+        """PPO's update, then steps on what is kept, good rows of this rollout included."""
+        self.keep(state, batch)
+        state, report = super().update(state, batch, rng)
+        now = Terms.of(self.config, state, batch)
+        report.metrics |= self.imitate(state, now.rate, rng)
+        return state, report
+
+    @torch.no_grad()
+    def keep(self, state: State, rollout: Rollout) -> None:
+        """Keep the rows of a rollout whose return exceeds the value, in place of the oldest."""
+        cells = Cells(rollout, all_cells=False)
+        obs, mask = cells.flat(rollout.obs), cells.flat_or_none(rollout.obs_mask)
+        value = self.value(state, obs)
+        if mask is None:
+            mask = state.kept_mask.new_ones(*value.shape, self.codec.size)
+        returns, known = (cells.flat(x) for x in returns_of(rollout))
+        good = known & (returns > value)
+        if rollout.overridden is not None:
+            good &= ~cells.flat(rollout.overridden)
+        new = Rows(obs, cells.flat(rollout.action), mask, returns)
+        kept = torch.cat([good, state.kept], dim=1)
+        latest = first_true(kept, state.kept.shape[1])
+        rows = joined(new, state.rows).take(latest)
+        state.kept, state.kept_return = take_rows(kept, latest), rows.returns
+        state.kept_obs, state.kept_action, state.kept_mask = rows.obs, rows.action, rows.mask
+
+    def imitate(
+        self, state: State, rate: Tensor, rng: Sequence[torch.Generator]
+    ) -> dict[str, Tensor]:
+        """Gradient steps on kept rows, in place, and metrics (P,).
+
+        Rows are drawn in proportion to their gain, (R − V)₊.
+
+        Args:
+            rate: (P,), Adam's step size.
+        """
+        cfg, leaves = self.config, self.layout.leaves(state.params)
+        rows = state.rows
+        with torch.no_grad():
+            gain = (rows.returns - self.value(state, rows.obs)).clamp_min(0.0) * state.kept
+        total = gain.cumsum(1)
+        some = total[:, -1] > 0.0
+        for _ in range(0 if all_false(some) else cfg.imitation_steps):
+            drawn = torch.stack([torch.rand(cfg.batch_size, generator=g) for g in rng])
+            place = torch.searchsorted(total, drawn.to(total.device) * total[:, -1:], right=True)
+            # Rounding may lead beyond the last row; of a member without rows it does.
+            batch = rows.take(place.clamp_max(total.shape[1] - 1))
+            grad = self.layout.gradient(self.imitation_loss(leaves, state, batch), leaves)
+            clip_grad_norm_(grad, state.max_grad_norm)
+            adam_(
+                state.params, grad, state.mu, state.nu, state.count, rate,
+                eps=cfg.adam_eps, active=some,
+            )  # fmt: skip
+        count = state.kept.sum(1).to(gain.dtype)
+        return {"imitation_rows": count, "imitation_gain": total[:, -1] / count.clamp_min(1.0)}
+
+    def imitation_loss(self, views: Views, state: State, batch: Rows) -> Tensor:
+        """``E[−log π(a|s)·min(g, 1)]`` and ``½E[g²]``, weighted; g = (R − V)₊; (P,).
+
+        Oh et al. 2018, eqs. 2 and 3; g is in deviations of returns, and at most 1 in the policy's
+        loss, as in the authors' code.
+        """
+        inputs = self.inputs(self.learning_params(state), batch.obs)
+        head, raw = self.actor_net(views, inputs), self.critic_net(views, inputs)
+        log_std = views.get("actor.log_std")
+        log_prob, _ = self.head.stats(head, log_std, batch.mask, batch.action)
+        target = (batch.returns - state.return_mean) / state.return_scale
+        gain = (target - raw.squeeze(-1)).clamp_min(0.0)
+        policy = -(log_prob * gain.detach().clamp_max(1.0)).mean(1)
+        cfg = self.config
+        return cfg.imitation_coef * policy + cfg.imitation_vf_coef * 0.5 * gain.square().mean(1)
+
+
+def joined(first: Rows, second: Rows) -> Rows:
+    """The rows of both, one after the other."""
+    return Rows(
+        obs=torch.cat([first.obs, second.obs], dim=1),
+        action=torch.cat([first.action, second.action], dim=1),
+        mask=torch.cat([first.mask, second.mask], dim=1),
+        returns=torch.cat([first.returns, second.returns], dim=1),
+    )
+
+
+def returns_of(rollout: Rollout) -> tuple[Tensor, Tensor]:
+    """What followed each row was paid, (P, T, B), and where that is known, (P, T, B) bool.
+
+    It is where the trajectory terminates within the rollout. Elsewhere it would take the critic's
+    word for the rest, and imitate its errors.
+    """
+    last, none = rollout.last, torch.zeros_like(rollout.reward)
+    one = none.new_ones(len(none))
+    ends = (last & (rollout.discount == 0.0)).to(none.dtype)
+    known = gae(ends, (~last).to(none.dtype), none, none, last, one) > 0.0
+    if rollout.valid is not None:
+        known &= rollout.valid
+    return gae(rollout.reward, rollout.discount, none, none, last, one), known
