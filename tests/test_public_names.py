@@ -18,9 +18,9 @@ NAMES = """
 ActingParams ActionHead Agent AgentState Algorithm Array Automaton CNN DQN Encoder EnvSpec
 Evaluation Evolution Export Heir Hierarchy HierarchyPolicy LastCall Layout Lengths Mutations Net
 Network OnPolicy OptionsEnv PPO ParameterGroup Player Policy PoolWrapper RNN Range Ray Reflex Report
-Rollout Run SAC Sample Seeds Selection Skill SkillweaveError Step TD3 Together Tournament
-Truncation adam_ clip_grad_norm_ envpool evaluate from_function from_hub from_onnx from_sb3
-from_torch gae make_options_env mask_logits masked_mean normalise register_algorithm
+Rollout Run SAC Sample Seeds Selection SelfImitationPPO Skill SkillweaveError Step TD3 Together
+Tournament Truncation adam_ clip_grad_norm_ envpool evaluate from_function from_hub from_onnx
+from_sb3 from_torch gae make_options_env mask_logits masked_mean normalise register_algorithm
 register_encoder train_agent tree
 """
 

@@ -217,7 +217,7 @@ class Algorithm:
         return self.layout.shapes | (scaling if self.normalize_obs else {})
 
     def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
-        """One ``member``'s policy: parameters (*shape) and scaling (O,), copied to the CPU."""
+        """One ``member``'s policy in a ``state``: parameters (*shape), scaling (O,); on the CPU."""
         named = {k: v[member] for k, v in self.layout.views(state.params).items()}
         if self.normalize_obs:
             named |= {k: getattr(state, k)[member] for k in ("obs_mean", "obs_var")}
