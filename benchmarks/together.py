@@ -34,7 +34,7 @@ from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat, with_bonus
 from benchmarks.pay.suite import Shaped
 from examples import bridge, doorkey, yard
-from skillweave import PPO, Array, Hierarchy, Lengths, Run
+from skillweave import PPO, Array, Hierarchy, Lengths, Run, SelfImitationPPO
 
 FLOORS = {"floor": 1.0, "floor_final": 0.1}
 
@@ -57,12 +57,19 @@ class Task:
     """``--engine`` is about it."""
 
 
-def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart: Any) -> Task:
+def _doorkey(
+    room: str,
+    parts: tuple[int, ...],
+    kind: type[PPO] = SelfImitationPPO,
+    goal: PPO | None = None,
+    **apart: Any,
+) -> Task:
     """Three skills in a room with a key and a door.
 
     Args:
         room: MiniGrid's name of it, without version.
         parts: of the steps apart.
+        kind: who trains skills.
         goal: who trains the third skill apart; None: who trains the others.
         apart: settings where skills learn apart, beside those of every room.
     """
@@ -72,7 +79,7 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     }
     return Task(
         functools.partial(doorkey.declare, room),
-        doorkey.algorithm,
+        functools.partial(doorkey.algorithm, kind),
         parts,
         every | apart,
         cells=lambda obs: obs.reshape(len(obs), -1),
@@ -81,7 +88,7 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
 
 
 TASKS = {
-    "8x8": _doorkey("DoorKey-8x8", (1, 2, 3, 2)),
+    "8x8": _doorkey("DoorKey-8x8", (1, 2, 3, 2), PPO),
     "unlock-pickup": _doorkey("UnlockPickup", (1, 2, 3, 2)),
     # `goal` succeeds once in 1,000 steps at first: it needs most of the steps, and rollouts with
     # several successes. It learns from them without a limit on its advantages: the entropy's bonus

@@ -94,9 +94,9 @@ class Goal(sw.Skill):
         return step.reward * 10 - 0.01
 
 
-def algorithm(**how: Any) -> sw.PPO:
+def algorithm(kind: type[sw.PPO] = sw.PPO, **how: Any) -> sw.PPO:
     """Who learns. A cell's numbers are kinds of things, not brightnesses: ``encoder="cells"``."""
-    return sw.PPO(
+    return kind(
         num_envs=16, n_steps=128, update_epochs=4, gamma=0.99, gae_lambda=0.95,
         learning_rate_schedule="constant", network=sw.Network(hidden=(64,), encoder="cells"), **how,
     )  # fmt: skip
@@ -115,6 +115,8 @@ def declare(
         room: MiniGrid's name of it, without version.
         engine: auto: in EnvPool, where it is installed; sync: in Python.
     """
+    # In larger rooms successes are rare at first: PPO forgets one before the next comes.
+    learner = algorithm() if room == ROOM else algorithm(sw.SelfImitationPPO)
     settings = {
         "call_steps": 32,
         "learn": "together",
@@ -126,7 +128,7 @@ def declare(
         # selector to call the skill with the longest calls.
         "call_cost": 0.001,
         "greedy_skills": False,
-        "algorithm": algorithm(),
+        "algorithm": learner,
         "selector": algorithm(),
     } | how
     other = {} if room == ROOM else {"room": room}
