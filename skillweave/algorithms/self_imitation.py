@@ -137,8 +137,12 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         with torch.no_grad():
             gain = (rows.returns - self.value(state, rows.obs)).clamp_min(0.0) * state.kept
         total = gain.cumsum(1)
-        some = total[:, -1] > 0.0
-        for _ in range(0 if all_false(some) else cfg.imitation_steps):
+        count = state.kept.sum(1)
+        # At most one pass over what is kept: many over a few rows would learn these by heart.
+        due = (-(-count // cfg.batch_size)).clamp_max(cfg.imitation_steps) * (total[:, -1] > 0.0)
+        for step in range(cfg.imitation_steps):
+            if all_false(active := step < due):
+                break
             drawn = torch.stack([torch.rand(cfg.batch_size, generator=g) for g in rng])
             place = torch.searchsorted(total, drawn.to(total.device) * total[:, -1:], right=True)
             # Rounding may lead beyond the last row; of a member without rows it does.
@@ -147,10 +151,10 @@ class SelfImitationAlgorithm(PPOAlgorithm):
             clip_grad_norm_(grad, state.max_grad_norm)
             adam_(
                 state.params, grad, state.mu, state.nu, state.count, rate,
-                eps=cfg.adam_eps, active=some,
+                eps=cfg.adam_eps, active=active,
             )  # fmt: skip
-        count = state.kept.sum(1).to(gain.dtype)
-        return {"imitation_rows": count, "imitation_gain": total[:, -1] / count.clamp_min(1.0)}
+        mean = total[:, -1] / count.clamp_min(1)
+        return {"imitation_rows": count.to(gain.dtype), "imitation_gain": mean}
 
     def imitation_loss(self, views: Views, state: State, batch: Rows) -> Tensor:
         """``E[−log π(a|s)·min(g, 1)]`` and ``½E[g²]``, weighted; g = (R − V)₊; (P,).

@@ -581,16 +581,17 @@ def test_without_a_memory_it_is_a_guess():
 # What cannot be
 
 
+KINDS = (PPO, SelfImitationPPO, DQN, TD3, SAC)
 ABLE = [
-    (gym.spaces.Discrete(2), (PPO, DQN, SAC)),
-    (gym.spaces.Box(-1.0, 1.0, (2,)), (PPO, TD3, SAC)),
-    (gym.spaces.MultiDiscrete([2, 2]), (PPO,)),
-    (gym.spaces.MultiBinary(3), (PPO,)),
+    (gym.spaces.Discrete(2), (PPO, SelfImitationPPO, DQN, SAC)),
+    (gym.spaces.Box(-1.0, 1.0, (2,)), (PPO, SelfImitationPPO, TD3, SAC)),
+    (gym.spaces.MultiDiscrete([2, 2]), (PPO, SelfImitationPPO)),
+    (gym.spaces.MultiBinary(3), (PPO, SelfImitationPPO)),
     (gym.spaces.Text(3), ()),
 ]
 
 
-@pytest.mark.parametrize("kind", [PPO, DQN, TD3, SAC])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("space", "able"), ABLE, ids=str)
 def test_an_algorithm_that_cannot_act_names_those_that_can(kind, space, able, monkeypatch):
     own = {k: table._REGISTERED[k] for k in table.BUILT_IN}  # without the example
@@ -599,7 +600,7 @@ def test_an_algorithm_that_cannot_act_names_those_that_can(kind, space, able, mo
     if kind in able:
         make_algorithm(kind(), obs, space)
         return
-    names = [k.__name__ for k in (PPO, DQN, TD3, SAC) if k in able]
+    names = [k.__name__ for k in KINDS if k in able]
     says = f"{', '.join(names)} can" if names else "no algorithm here can"
     with pytest.raises(SkillweaveError) as error:
         make_algorithm(kind(), obs, space)

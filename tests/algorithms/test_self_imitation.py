@@ -133,21 +133,20 @@ def chance(algorithm, state, obs, action):
 def test_what_was_paid_once_is_not_forgotten(seed):
     """One success, then forty updates in which nothing is won and all actions are tried."""
     left = {}
-    for steps in (1, 4):
+    for coef in (0.0, 1.0):
         algorithm, state = make(
-            imitation_rows=64, imitation_steps=steps, imitation_coef=float(steps > 1),
-            ent_coef=0.05, learning_rate=3e-3,
-        )  # fmt: skip
+            imitation_rows=64, imitation_coef=coef, ent_coef=0.05, learning_rate=4e-3
+        )
         success = rollout([[0.0, 0.0, 0.0, 5.0]], action=2, ends=[(3, 0)])
         state, _ = algorithm.update(state, success, rngs(of=seed))
         for i in range(40):
             empty = rollout([[0.0] * 4, [0.0] * 4])
             empty.action = torch.randint(3, (1, 4, 2), generator=(Seeds(seed) / i).torch())
             state, report = algorithm.update(state, empty, rngs(of=100 * seed + i))
-        left[steps] = chance(algorithm, state, success.obs[0, :, 0], 2)[-1].item()
+        left[coef] = chance(algorithm, state, success.obs[0, :, 0], 2)[-1].item()
         assert report.metrics["imitation_gain"].isfinite().all()
-    assert left[4] > 0.9
-    assert left[1] < 0.6
+    assert left[1.0] > 0.9
+    assert left[0.0] < 0.6
 
 
 def test_a_member_that_has_nothing_to_imitate_is_left_alone():
@@ -160,7 +159,16 @@ def test_a_member_that_has_nothing_to_imitate_is_left_alone():
     assert metrics["imitation_rows"].tolist() == [4.0, 0.0]
     assert not torch.equal(state.params[0], before[0])
     assert torch.equal(state.params[1], before[1])
-    assert state.count.tolist() == [CONFIG.imitation_steps, 0]
+    assert state.count.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(("batch", "most", "steps"), [(8, 9, 1), (4, 9, 1), (3, 9, 2), (1, 3, 3)])
+def test_a_few_rows_are_not_learnt_by_heart(batch, most, steps):
+    """Four rows are kept: at most one pass over them follows an update."""
+    algorithm, state = make(batch_size=batch, imitation_steps=most)
+    algorithm.keep(state, rollout([[0.0, 0.0, 0.0, 3.0]], ends=[(3, 0)]))
+    algorithm.imitate(state, state.learning_rate, rngs())
+    assert state.count.tolist() == [steps]
 
 
 def test_what_was_kept_is_looked_at_before_it_is_learnt_from():
