@@ -23,7 +23,7 @@ import functools
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat, with_bonus
 from benchmarks.pay.suite import Shaped
 from examples import bridge, doorkey, yard
-from skillweave import PPO, Array, Hierarchy, Lengths, Run, SelfImitationPPO
+from skillweave import PPO, Array, Hierarchy, Lengths, Run
 
 FLOORS = {"floor": 1.0, "floor_final": 0.1}
 
@@ -57,19 +57,12 @@ class Task:
     """``--engine`` is about it."""
 
 
-def _doorkey(
-    room: str,
-    parts: tuple[int, ...],
-    kind: type[PPO] = SelfImitationPPO,
-    goal: PPO | None = None,
-    **apart: Any,
-) -> Task:
+def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart: Any) -> Task:
     """Three skills in a room with a key and a door.
 
     Args:
         room: MiniGrid's name of it, without version.
         parts: of the steps apart.
-        kind: who trains skills.
         goal: who trains the third skill apart; None: who trains the others.
         apart: settings where skills learn apart, beside those of every room.
     """
@@ -79,7 +72,7 @@ def _doorkey(
     }
     return Task(
         functools.partial(doorkey.declare, room),
-        functools.partial(doorkey.algorithm, kind),
+        doorkey.algorithm,
         parts,
         every | apart,
         cells=lambda obs: obs.reshape(len(obs), -1),
@@ -88,7 +81,7 @@ def _doorkey(
 
 
 TASKS = {
-    "8x8": _doorkey("DoorKey-8x8", (1, 2, 3, 2), PPO),
+    "8x8": _doorkey("DoorKey-8x8", (1, 2, 3, 2)),
     "unlock-pickup": _doorkey("UnlockPickup", (1, 2, 3, 2)),
     # `goal` succeeds once in 1,000 steps at first: it needs most of the steps, and rollouts with
     # several successes. It learns from them without a limit on its advantages: the entropy's bonus
@@ -158,8 +151,16 @@ def then(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 def no_least_deviation(task: Task, steps: int, **how: Any) -> Hierarchy:
     """The critic's errors are made as large as a success, where hardly anything was won yet."""
-    who = task.algorithm(min_advantage_std=0.0)
-    return together(task, steps, algorithm=who, selector=who, **how)
+    own = together(task, steps)
+    asked = {k: replace(getattr(own, k), min_advantage_std=0.0) for k in ("algorithm", "selector")}
+    return together(task, steps, **asked, **how)
+
+
+def no_imitation(task: Task, steps: int, **how: Any) -> Hierarchy:
+    """Skills learn from each rollout once, by PPO."""
+    own: Any = together(task, steps).algorithm
+    plain = PPO(**{f.name: getattr(own, f.name) for f in fields(PPO)})
+    return together(task, steps, algorithm=plain, **how)
 
 
 def less_entropy(task: Task, steps: int, **how: Any) -> Hierarchy:
@@ -194,6 +195,7 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(otherwise, changed={"floor": 0.3, "floor_final": 0.02}),
     "no least deviation": no_least_deviation,
+    "no imitation": no_imitation,
     "no floor": functools.partial(otherwise, changed={"floor": 0.0, "floor_final": 0.0}),
     "no call cost": functools.partial(together, call_cost=0.0),
     "task advantage": functools.partial(otherwise, changed={"task_weight": 1.0}),

@@ -145,7 +145,8 @@ class SelfImitationPPO(PPO):
     imitation_rows: int = 4096
     """Rows that are kept, the latest."""
     imitation_steps: int = 8
-    """Gradient steps on kept rows after each update, each on ``batch_size`` of them."""
+    """The most gradient steps on kept rows after each update, each on ``batch_size`` of them; they
+    are fewer where one pass over what is kept takes fewer."""
     imitation_coef: float = 1.0
     """Weight of their policy loss."""
     imitation_vf_coef: float = 0.01

@@ -211,7 +211,7 @@ def test_a_space_that_it_cannot_act_in_names_those_that_can():
     with pytest.raises(SkillweaveError, match=rf"A2C cannot act in MultiBinary.*; {both} can"):
         make_algorithm(own(), BOX, gym.spaces.MultiBinary(2))
     td3 = named_config("TD3", "here")
-    with pytest.raises(SkillweaveError, match=rf"TD3 cannot act in Discrete.*; {both}, DQN, SAC, A2C"):
+    with pytest.raises(SkillweaveError, match=rf"TD3 cannot .*Discrete.*; {both}, DQN, SAC, A2C"):
         make_algorithm(td3, BOX, LINE)
 
 

@@ -13,7 +13,7 @@ from benchmarks.pay.flat import Flat
 from benchmarks.together import CASES, TASKS, one, without_selector
 from examples.bridge import AXE, BRIDGE, RIVER, WIDTH, WOOD, WORK, GetAxe, River, declare
 from examples.doorkey import ROOM
-from skillweave import Hierarchy, Step
+from skillweave import PPO, Hierarchy, SelfImitationPPO, Step
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -39,6 +39,23 @@ def test_a_case_changes_what_it_names_and_nothing_else(
     assert isinstance(usual, Hierarchy)
     assert isinstance(other, Hierarchy)
     assert other.together == replace(usual.together, **changed)
+
+
+def test_who_learns_is_the_same_but_for_what_a_case_names() -> None:
+    usual, plain, errors = (
+        CASES[case](TASKS["unlock-pickup"], 1_000)
+        for case in ("together", "no imitation", "no least deviation")
+    )
+    assert isinstance(usual, Hierarchy)
+    assert isinstance(plain, Hierarchy)
+    assert isinstance(errors, Hierarchy)
+    assert type(usual.algorithm) is SelfImitationPPO
+    assert type(plain.algorithm) is PPO
+    common = vars(usual.algorithm)
+    assert vars(plain.algorithm) == {k: common[k] for k in vars(PPO())}
+    assert plain.selector == usual.selector
+    assert errors.algorithm == replace(usual.algorithm, min_advantage_std=0.0)
+    assert errors.selector == replace(usual.selector, min_advantage_std=0.0)
 
 
 @pytest.mark.parametrize(

@@ -269,6 +269,7 @@ def test_settings_apply_in_order_and_the_skills_class_is_left_alone():
     assert (d.selector.gamma, d.skill("lean").steps, Lean.steps) == (0.6, 9, 5_000)
 
 
+KNOWN = "PPO, SelfImitationPPO, DQN, TD3, SAC"
 WRONG_SETTINGS = {
     "call_steps": "name=value",
     "call_step=4": "call_step'.*did you mean call_steps",
@@ -277,8 +278,8 @@ WRONG_SETTINGS = {
     "skills.center.learning_rat=1": "learning_rat'.*did you mean.*skills.center.learning_rate",
     "selector.network.hiden=3": "hiden.*did you mean.*selector.network.hidden",
     "skills.centre.gamma=1": "'centre'.*center, lean",
-    "skills.center=4": "skills.center=4: no algorithm '4'; there are: PPO, SelfImitationPPO, DQN, TD3, SAC",
-    "selector=4": "selector=4: no algorithm '4'; there are: PPO, SelfImitationPPO, DQN, TD3, SAC, .*Rainbow, DDPG",
+    "skills.center=4": f"skills.center=4: no algorithm '4'; there are: {KNOWN}",
+    "selector=4": f"selector=4: no algorithm '4'; there are: {KNOWN}, .*Rainbow, DDPG",
     "skills.nobody=DQN": "no skill 'nobody'",
     "selector.update_epoch=4": "no setting 'selector.update_epoch'.*update_epochs",
     "=4": "no setting ''",
