@@ -409,9 +409,7 @@ LEARNERS = {
         " critic=Network(hidden=(5, 5)),": "",
     },
     "self-imitation": {
-        "algorithm=small": (
-            "algorithm=SelfImitationPPO(**vars(small), imitation_rows=50)"
-        ),
+        "algorithm=small": ("algorithm=SelfImitationPPO(**vars(small), imitation_rows=50)"),
     },
     "dqn and sac": {
         "algorithm=small": f"algorithm=DQN({SMALL_REPLAY})",
