@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from benchmarks.pay.flat import Flat, with_bonus
 from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Shaped, Suite, Task
 from skillweave import Array, Hierarchy, Lengths, Skill
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.run import Run
 
 HIERARCHY, RANDOM, SINGLE = "hierarchy", "F4-random-skills", "F4-best-skill"
@@ -121,7 +121,7 @@ class Bench:
         for task in tasks:
             if task is not source:
                 agent = self._agent(task)
-                agent.starts_as = self._source_agent()
+                agent.starts_from = self._source_agent()
                 self._learn(agent, task, TUNED)
             elif not self._found(task, TUNED, budgets[task.name]):
                 found = self.results.find(
@@ -173,11 +173,11 @@ class Bench:
             agent.run(path, self.seed), task, name, budget, started, keep, ("agent",)
         )
 
-    def _source_agent(self) -> AgentPolicy:
+    def _source_agent(self) -> Path:
         source = self.suite.tasks[0]
-        policy: Any = self._agent(source).load(self._path(source, FLAT))
         self._builds_on(source, FLAT)
-        return policy.policy  # type: ignore[no-any-return]
+        path: Path = self._path(source, FLAT)
+        return path
 
     # What all share
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,15 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave import Agent, Array, EnvSpec, Skill
-from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.run import Run
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.starts import begin_with, keep_starts, learnt_in
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.scene import skill_scene
 from skillweave.training.stage import Stage
-from skillweave.training.trainer import OneAgent, StageRun
+from skillweave.training.stage_run import StageRun
+from skillweave.training.trainer import OneAgent
 
 
 @dataclass
@@ -34,8 +35,8 @@ class Flat(Agent):
     """F2: the environment with a bonus in its reward."""
     learns: Skill | None = None
     """F1: whose reward it learns."""
-    starts_as: AgentPolicy | None = field(default=None, repr=False)
-    """F3: what it was after another task."""
+    starts_from: Path | None = None
+    """F3: the run in which it has learnt another task."""
 
     def stages(self, name: str = "agent") -> list[Stage]:
         """Its only stage."""
@@ -51,7 +52,11 @@ class Flat(Agent):
         else:
             content = self.manifest(seed)
             content["stages"][0]["workers"] = 1  # runs go side by side, and counts are shared
+            learnt = {} if self.starts_from is None else learnt_in(self.starts_from)
+            if self.starts_from is not None:
+                begin_with(content["stages"], learnt, self.starts_from)
             run = RunDirectory.create(path, content | {"recipe": None, "track": ()})
+            keep_starts(run, learnt)
         try:
             run.begin()
             policy = training.train(self, run, (), partial(_FlatLearner, self))
@@ -61,7 +66,7 @@ class Flat(Agent):
 
 
 class _FlatLearner(OneAgent):
-    """Evaluates on the task itself, and may start from what was learnt before."""
+    """Evaluates on the task itself."""
 
     def __init__(self, flat: Flat, stage: StageRun) -> None:
         super().__init__(stage)
@@ -75,11 +80,6 @@ class _FlatLearner(OneAgent):
             manifest.get("eval_every"), manifest.get("eval_episodes", 0),
         )  # fmt: skip
         self._open.callback(self.evaluation.close)
-        before = self._flat.starts_as
-        if before is not None:
-            self.algorithm.set_weights(fresh, before.weights)
-            # How observations are scaled is known already, and changes slowly.
-            fresh.obs_count.fill_(1e6)
         return fresh
 
 

@@ -13,7 +13,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
 from skillweave.api.run import Run
-from skillweave.api.running import begin, declared_of, go_on
+from skillweave.api.running import StartFrom, begin, declared_of, go_on
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
@@ -43,13 +43,15 @@ class Agent(PlainAgent):
         track: Sequence[str] = (),
         evolve: Evolve = None,
         cluster: Ray | None = None,
+        start_from: StartFrom = None,
     ) -> Run:
         """Train it; all goes to ``run_dir``.
 
-        ``seed``, ``quiet``, ``track``, ``evolve`` and ``cluster`` are as in ``Hierarchy.train``.
+        ``seed``, ``quiet``, ``track``, ``evolve``, ``cluster`` and ``start_from`` are as in
+        ``Hierarchy.train``.
         """
         content = self.manifest(whole_number(seed, "seed", 0))
-        return begin(self, content, run_dir, quiet, track, evolve, cluster)
+        return begin(self, content, run_dir, quiet, track, evolve, cluster, start_from)
 
     def resume(
         self,
@@ -131,6 +133,7 @@ class Hierarchy(Declaration):
         track: Sequence[str] = (),
         evolve: Evolve = None,
         cluster: Ray | None = None,
+        start_from: StartFrom = None,
     ) -> Run:
         """Train every skill, then the selector if it is not ready; all goes to ``run_dir``.
 
@@ -144,15 +147,19 @@ class Hierarchy(Declaration):
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
             cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
                 where it pays.
+            start_from: another run, or its directory: whoever learns here and has learnt there, by
+                the same name, begins with the weights that it ended with there. Its task may be
+                another one; spaces and networks must be the same.
 
         Returns:
             The finished run.
 
         Raises:
-            SkillweaveError: the declaration does not fit the environment, or training diverged.
+            SkillweaveError: the declaration does not fit the environment, training diverged, or
+                nobody can start from ``start_from``.
         """
         content = training.manifest(self, seed=whole_number(seed, "seed", 0), flat=flat)
-        return begin(self, content, run_dir, quiet, track, evolve, cluster)
+        return begin(self, content, run_dir, quiet, track, evolve, cluster, start_from)
 
     def resume(
         self,
@@ -237,6 +244,7 @@ def train_agent(
     track: Sequence[str] = (),
     evolve: Evolve = None,
     cluster: Ray | None = None,
+    start_from: StartFrom = None,
 ) -> Run:
     """Train one plain agent on an environment's own reward; the run is like any other.
 
@@ -255,6 +263,8 @@ def train_agent(
         evolve: an ``Evolution``: a population in place of one agent.
         cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
             where it pays.
+        start_from: another plain agent's run, or its directory, to begin with the weights that it
+            ended with.
 
     Returns:
         The finished run.
@@ -271,7 +281,10 @@ def train_agent(
         eval_every=eval_every,
         eval_episodes=eval_episodes,
     )
-    return agent.train(run_dir, seed=seed, quiet=quiet, track=track, evolve=evolve, cluster=cluster)
+    return agent.train(
+        run_dir, seed=seed, quiet=quiet, track=track, evolve=evolve, cluster=cluster,
+        start_from=start_from,
+    )  # fmt: skip
 
 
 __all__ = ["Agent", "Hierarchy", "Run", "train_agent"]

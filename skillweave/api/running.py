@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from skillweave.algorithms.config import config_from_json
+from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.run import Run
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.where import HERE, Where
@@ -21,12 +23,16 @@ from skillweave.runs.command_words import saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
+from skillweave.runs.starts import Learnt, begin_with, check_start, keep_starts, learnt_in
 from skillweave.runs.trackers import make_trackers
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy
+
+StartFrom = str | Path | Run | None
+"""A run in which those who are to learn have learnt before."""
 
 
 def begin(
@@ -37,10 +43,12 @@ def begin(
     track: Sequence[str],
     evolve: Evolve,
     cluster: Ray | None,
+    start_from: StartFrom = None,
 ) -> Run:
     """Check everything, begin a run of this manifest, and train it."""
     run_dir = as_path(run_dir, "run_dir")
     _plan(declared, content, evolve, cluster)
+    learnt, note = _starts(declared, content, start_from)
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
@@ -48,7 +56,8 @@ def begin(
     if cluster is not None:
         cluster.check()
     run = RunDirectory.create(run_dir, content | {"recipe": declared.recipe, "track": track})
-    return go_on(declared, run, quiet, evolve, cluster)
+    keep_starts(run, learnt)
+    return go_on(declared, run, quiet, evolve, cluster, note)
 
 
 def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
@@ -103,6 +112,30 @@ def _plan(
                 assert isinstance(declared, Declaration)
                 acts = declared.chooses_from(name, action_space)
                 check_replay(stage | {"algorithm": config}, observation_space, acts)
+
+
+def _starts(
+    declared: Hierarchy | Agent, content: dict[str, Any], start_from: StartFrom
+) -> tuple[dict[str, Learnt], str]:
+    """Who has learnt in another run, and what people should know of it.
+
+    The manifest then says who begins with what.
+    """
+    if start_from is None:
+        return {}, ""
+    where = start_from.path if isinstance(start_from, Run) else as_path(start_from, "start_from")
+    learnt = learnt_in(where)
+    begun = begin_with(content["stages"], learnt, where)
+    observation_space, action_space = declared.check_spaces()
+    for stage in content["stages"]:
+        for name in stage.get("starts", {}):
+            own = stage.get("algorithms", {}).get(name, stage["algorithm"])
+            acts: Any = action_space
+            if isinstance(declared, Declaration) and content["kind"] == "hierarchy":
+                acts = declared.chooses_from(name, action_space)
+            algorithm = make_algorithm(config_from_json(own), observation_space, acts)
+            check_start(name, algorithm, learnt[name], where)
+    return learnt, f"{', '.join(sorted(begun))}: begins with what was learnt in {where}"
 
 
 def go_on(

@@ -49,6 +49,8 @@ class Train(OnRay):
     """Afterwards train the baseline too, on the same number of steps, and say which is better."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
+    start_from: Path | None = None
+    """Another run: those who have learnt there, by the same names, begin with what they learnt."""
     evolve: UseAppendAction[tuple[str, ...]] = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
     track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()

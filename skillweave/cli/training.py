@@ -43,7 +43,7 @@ def train(command: commands.Train) -> None:
         if not command.json:  # now: the flat agent takes as long again
             print("\n".join(lines), flush=True)
         hierarchy.flat_steps = None  # as many as the hierarchy
-        flat = _trained(command, hierarchy, True, flat_out)
+        flat = _trained(command, hierarchy, True, flat_out, baseline=True)
         result["flat"], more = _told(flat, command.evaluate)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
         lines = ["", "the flat agent:", *more, "", *verdict]
@@ -68,7 +68,9 @@ def _trained(
     flat: bool,
     out: Path | None,
     evolve: dict[str, Evolution | None] | None = None,
+    baseline: bool = False,
 ) -> Run:
+    """Train one of both; a ``baseline`` that is to be compared learns from nothing."""
     name = Path(command.recipe).stem + ("-flat" if flat else "")
     path = out or free(Path("runs") / f"{name}-s{command.seed}")
     try:
@@ -81,6 +83,7 @@ def _trained(
             track=command.track,
             evolve=evolve,
             cluster=cluster,
+            start_from=None if baseline else command.start_from,
         )
     except KeyboardInterrupt:
         raise _interrupted(path, command.ray) from None

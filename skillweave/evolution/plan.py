@@ -11,7 +11,7 @@ from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short
-from skillweave.training.trainer import MakeLearner, StageLearner, StageRun
+from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
 from skillweave.training.woven import agents_of
 from skillweave.types import SkillweaveError
 

@@ -24,10 +24,10 @@ from skillweave.evolution.part import score, spaces_of
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, Origin
-from skillweave.runs.manifest import Generation
+from skillweave.runs.population_schema import Generation
 from skillweave.seeding import Seeds
 from skillweave.training.stage_log import StageLog, resumed
-from skillweave.training.trainer import StageRun
+from skillweave.training.stage_run import StageRun
 from skillweave.types import Array, prefixed, unprefixed
 
 

@@ -188,13 +188,13 @@ class Declaration(Nestable):
         return len(self.skills) * len(lengths)
 
     def chooses_from(self, path: str, actions: gym.Space[Any]) -> gym.Space[Any]:
-        """What a selector or skill at ``path`` chooses from; ``actions``: the environment's."""
+        """What a selector, its critic or a skill chooses from; ``actions``: the environment's."""
         node, _, name = path.rpartition("/")
-        if name != SELECTOR:
+        if name not in (SELECTOR, CRITIC):
             return actions
         inner = inner_of(self.skill(node)) if node else self
         assert inner is not None
-        return gym.spaces.Discrete(inner.choices)
+        return gym.spaces.Discrete(inner.choices if name == SELECTOR else len(inner.skills))
 
     @property
     def total_steps(self) -> int:

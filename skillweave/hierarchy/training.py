@@ -27,7 +27,8 @@ from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.training.stage import SELECTOR, Policies
 from skillweave.training.stage_log import Listener
-from skillweave.training.trainer import MakeLearner, train_stages
+from skillweave.training.stage_run import MakeLearner
+from skillweave.training.trainer import train_stages
 from skillweave.training.woven import agents_of
 from skillweave.types import Policy, SkillweaveError
 

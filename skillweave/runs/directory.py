@@ -39,14 +39,8 @@ from skillweave.runs.files import (
 from skillweave.runs.jsonl import JsonLines
 from skillweave.runs.kept import to_be_judged
 from skillweave.runs.lock import Lock
-from skillweave.runs.manifest import (
-    Checkpoint,
-    LineageLine,
-    MetricsLine,
-    identity,
-    read_manifest,
-    versions,
-)
+from skillweave.runs.manifest import Checkpoint, MetricsLine, identity, read_manifest, versions
+from skillweave.runs.population_schema import LineageLine
 from skillweave.types import SkillweaveError, unprefixed
 
 S = TypeVar("S")

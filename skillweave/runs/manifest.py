@@ -96,6 +96,15 @@ class Reached(TypedDict):
     value: float
 
 
+class Start(TypedDict):
+    """What one begins a stage with, from another run."""
+
+    sha256: str
+    """Of its file there."""
+    steps: Count
+    """Environment steps that it learnt from there."""
+
+
 class StageEntry(TypedDict):
     """A stage: who learns in it and who decides, for how many steps, and how far it is."""
 
@@ -140,6 +149,8 @@ class StageEntry(TypedDict):
     """Whether skills are greedy after it is found out at its end."""
     kept: NotRequired[Kept]
     """What was found out at its end."""
+    starts: NotRequired[dict[NodePath, Start]]
+    """By name, who begins with what it has learnt in another run."""
 
 
 class Manifest(TypedDict):
@@ -168,46 +179,6 @@ class HierarchyManifest(Manifest, NestedEntry):
     skills: list[SkillEntry]
 
 
-class MemberEntry(TypedDict):
-    """A member of a population, in a checkpoint's header."""
-
-    number: Count
-    steps: Count
-    config: dict[str, Any]
-    origin: Origin
-
-
-class Origin(TypedDict):
-    """Where a member comes from."""
-
-    parent: Count | None
-    mutation: str
-    changes: dict[str, tuple[Any, Any]]
-
-
-class BestEntry(TypedDict):
-    """The best member of a population so far."""
-
-    fitness: float
-    number: Count
-    generation: Count
-    policy: dict[str, Any]
-
-
-class LineageLine(TypedDict):
-    """A line of ``lineage.jsonl``: a member in a generation."""
-
-    stage: NodePath
-    generation: Count
-    member: Count
-    parent: Count | None
-    mutation: str
-    changes: dict[str, tuple[Any, Any]]
-    fitness: float | None
-    best: bool
-    settings: dict[str, Any]
-
-
 MetricsLine = TypedDict(
     "MetricsLine",
     {
@@ -233,17 +204,6 @@ class Checkpoint(TypedDict):
     metrics_bytes: Count
     lineage_bytes: NotRequired[Count]
     run: NotRequired[str]
-
-
-class Generation(Checkpoint):
-    """The header of a population's checkpoint."""
-
-    fitness_steps: Count
-    generation: Count
-    rounds: Count
-    next_number: Count
-    members: Annotated[list[MemberEntry], Asked("at least one member", bool)]
-    best: BestEntry
 
 
 def check_manifest(data: Mapping[str, Any], file: str) -> None:

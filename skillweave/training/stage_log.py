@@ -9,6 +9,7 @@ from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.starts import drop_starts
 from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.types import SkillweaveError
 
@@ -144,6 +145,7 @@ class StageLog:
             )
         self.run.drop_checkpoints()
         drop_states(self.run, entry["name"])
+        drop_starts(self.run, entry["name"])
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import Algorithm, state_to
-from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
@@ -20,83 +18,19 @@ from skillweave.collecting.group import MakeCollector, MakeCollectors, make_coll
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
+from skillweave.runs.starts import start_of
 from skillweave.seeding import Seeds
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.loop import Progress, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
-from skillweave.training.replay_learner import learner_of
+from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.scene import Scene
-from skillweave.training.stage import Policies, Stage, Target
+from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import START, Listener, StageLog, resumed
+from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
 from skillweave.types import Array, Policy, SkillweaveError
-
-
-@dataclass(frozen=True)
-class StageRun:
-    """A stage in a run. The run's settings count: a resumed run goes on as it began."""
-
-    entry: dict[str, Any]
-    """The manifest's."""
-    run: RunDirectory
-    seeds: Seeds
-    """The stage's node of the seed tree."""
-    scene: Scene
-    policies: Policies
-    """Everyone who can act already."""
-
-    @property
-    def name(self) -> str:
-        """The stage's."""
-        return str(self.entry["name"])
-
-    @property
-    def config(self) -> AlgorithmConfig:
-        """The algorithm's settings."""
-        return config_from_json(self.entry["algorithm"])
-
-    @property
-    def budget(self) -> int:
-        """Environment steps."""
-        return int(self.entry["budget"])
-
-    @property
-    def target(self) -> Target | None:
-        """Where the stage may end early."""
-        told = self.entry.get("target")
-        return None if told is None else Target(**told)
-
-
-class StageLearner(Protocol):
-    """Who learns in a stage: one agent, or a population."""
-
-    schema: Any
-    """Of the headers of its checkpoints."""
-
-    def open(self) -> Any | None:
-        """Make the environments; the state to begin with, if checkpoints hold one."""
-        ...
-
-    def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Stand where a checkpoint says, or at the start where ``extra`` is empty."""
-        ...
-
-    def train(self, log: StageLog) -> dict[str, AgentPolicy]:
-        """Learn until the stage is over; by name, those who learnt, as they end."""
-        ...
-
-    def states(self) -> dict[str, Any]:
-        """By name, all that those have learnt who may learn on in a later stage."""
-        ...
-
-    def close(self) -> None:
-        """Release the environments."""
-        ...
-
-
-MakeLearner = Callable[[StageRun], StageLearner]
-"""Who is to learn in a stage, by its entry in the manifest."""
 
 
 class OneAgent:
@@ -135,7 +69,15 @@ class OneAgent:
         stage, scene = self.stage, self.stage.scene
         spaces = scene.observation_space, scene.action_space
         self.algorithm = make_algorithm(stage.config, *spaces)
-        return self.algorithm.init([stage.seeds / "member" / 0])
+        self.start = start_of(stage.run, stage.name, stage.name)
+        return self._beginning()
+
+    def _beginning(self) -> Any:
+        """What the agent is before it learns here."""
+        state = self.algorithm.init([self.stage.seeds / "member" / 0])
+        if self.start is not None:
+            begin_as(self.algorithm, state, self.start.policy, self.start.steps)
+        return state
 
     def maker(self) -> MakeCollector:
         """What makes collectors in which the agent acts; it may be sent to other machines."""
@@ -150,6 +92,8 @@ class OneAgent:
             goes_on_at=log.at["steps"],
         )  # fmt: skip
         keep_to_guide(found, stage.entry.get("guide_nats"))
+        if self.start is not None and isinstance(found, ReplayLearner):
+            found.act_from_the_start()
         return found
 
     def policies(self) -> dict[str, AgentPolicy]:
@@ -224,8 +168,7 @@ class OneAgent:
     def _learnt_nothing(self) -> bool:
         """Whether its weights are those that it began with."""
         (stack,) = self.learner.stacks
-        fresh = self.algorithm.init([self.stage.seeds / "member" / 0])
-        before = AgentPolicy.of(self.algorithm, fresh).weights
+        before = AgentPolicy.of(self.algorithm, self._beginning()).weights
         after = AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu")).weights
         return all(torch.equal(after[name], before[name]) for name in before)
 

@@ -24,6 +24,7 @@ from skillweave.envs.make import make_engine
 from skillweave.experience import Anchor
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
+from skillweave.runs.starts import Learnt, start_of
 from skillweave.runs.states import load_state
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
@@ -32,7 +33,8 @@ from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
 from skillweave.training.stage import CRITIC, SELECTOR, Together
 from skillweave.training.stage_log import StageLog, success_rate
-from skillweave.training.trainer import OneAgent, StageRun
+from skillweave.training.stage_run import StageRun, begin_as
+from skillweave.training.trainer import OneAgent
 from skillweave.training.woven_learner import WovenLearner, decides
 from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
@@ -111,8 +113,8 @@ class WovenAgents(OneAgent):
         for name, algorithm in self.algorithms.items():
             fresh: Any = algorithm.init([self.stage.seeds / name / "member" / 0])
             device = resolve_device(algorithm.config.device)
-            before, anchor = self.stage.policies.get(name), None
-            if isinstance(before, AgentPolicy):
+            before, anchor = self._before(name), None
+            if before is not None:
                 fresh = self._as_before(name, algorithm, fresh, before)
                 anchor = self._anchor(name, algorithm, fresh, device, log)
             if saved:
@@ -132,13 +134,19 @@ class WovenAgents(OneAgent):
             found.counts = dict(zip(parts, told.tolist(), strict=True))
         return found
 
-    def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: AgentPolicy) -> Any:
-        """The state that ``name`` ended its latest stage with; of a population its weights."""
+    def _before(self, name: str) -> Learnt | None:
+        """What ``name`` has learnt in earlier stages, or in the run that it starts from."""
+        found = self.stage.policies.get(name)
+        if isinstance(found, AgentPolicy):
+            return Learnt(found, "", self._steps_of(name))
+        return start_of(self.stage.run, self.stage.name, name)
+
+    def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: Learnt) -> Any:
+        """The state that ``name`` ended its latest stage with; else its weights alone."""
         found = load_state(self.stage.run, name, fresh)
         if found is None:
+            begin_as(algorithm, fresh, before.policy, before.steps)
             found = fresh
-            algorithm.set_weights(found, before.weights)
-            found.obs_count.fill_(max(1.0, self._steps_of(name)))
         return found
 
     def _anchor(
@@ -172,7 +180,7 @@ class WovenAgents(OneAgent):
         found = ReplayLearner(
             [stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"]
         )
-        if isinstance(self.stage.policies.get(name), AgentPolicy):
+        if self._before(name) is not None:
             found.act_from_the_start()
         return found
 

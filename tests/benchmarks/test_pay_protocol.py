@@ -251,9 +251,9 @@ def test_fine_tuning_begins_with_what_the_flat_agent_was_on_the_first_task(done,
     bench = Bench(suite(), done, seed=0)
     source = bench._source_agent()
     task = suite().tasks[1]
-    agent = Flat(task.env, replace(TINY, learning_rate=1e-12), 64, starts_as=source)
+    agent = Flat(task.env, replace(TINY, learning_rate=1e-12), 64, starts_from=source)
     run = agent.run(tmp_path / "run", seed=0)
-    for name, value in source.weights.items():
+    for name, value in agent.load(source).policy.weights.items():
         if not name.startswith("obs"):
             np.testing.assert_allclose(run.policy.weights[name], value, atol=1e-6)
     found = {r.agent: r for r in done.all("line") if r.task == "right" and r.seed == 0}

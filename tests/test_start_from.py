@@ -1,0 +1,294 @@
+"""A run that begins with what was learnt in another one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from small_runs import MEMORY, OFF, ON, SMALL, Heard, Left, Push, assert_same, new_run
+
+from skillweave import (
+    DQN,
+    PPO,
+    SAC,
+    Agent,
+    Hierarchy,
+    Network,
+    SelfImitationPPO,
+    Skill,
+    SkillweaveError,
+    Together,
+)
+from skillweave.cli import main
+from skillweave.collecting.acting import Acting
+from skillweave.hierarchy import training
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.starts import begin_with, keep_starts, learnt_in
+
+STILL = 1e-12
+"""A learning rate by which nothing moves."""
+AGENTS = {
+    "PPO": ON,
+    "recurrent PPO": MEMORY,
+    "self-imitation": SelfImitationPPO(**vars(ON), imitation_rows=50),
+    "DQN": OFF,
+    "SAC": SAC(num_envs=4, batch_size=16, learning_starts=40, buffer_size=2_000, network=SMALL),
+}
+
+
+class Other(Skill):
+    """Balances."""
+
+    max_steps = 20
+    algorithm = OFF
+
+    def reward(self, step):
+        return 1.0 - abs(step.next_obs[:, 2])
+
+
+def declare(learn="apart", rate=None, skills=(Left, Other, Push), **how):
+    settings = {
+        "call_steps": 5, "skill_steps": 600, "selector_steps": 600, "together_steps": 1_200,
+        "algorithm": ON, "selector": ON, "cut_every": 200, "greedy_skills": False,
+    }  # fmt: skip
+    found = Hierarchy("CartPole-v1", [s() for s in skills], learn=learn, **settings | how)
+    if rate is not None:
+        found.algorithm = replace(found.algorithm, learning_rate=rate)
+        for who, name in ((found, "selector"), *((s, "algorithm") for s in found.skills)):
+            if (own := getattr(who, name)) is not None and not callable(own):
+                setattr(who, name, replace(own, learning_rate=rate))
+    return found
+
+
+def weights_of(path):
+    """By name, the weights of all who have learnt in a run, without the scaling of observations."""
+    return {
+        name: {k: v for k, v in own.policy.weights.items() if not k.startswith("obs_")}
+        for name, own in learnt_in(path).items()
+    }
+
+
+def assert_near(found, wanted):
+    assert found.keys() == wanted.keys()
+    for name, weight in wanted.items():
+        torch.testing.assert_close(found[name], weight, atol=1e-6, rtol=0)
+
+
+def differ(one, other):
+    return any(not torch.allclose(one[k], other[k], atol=1e-3) for k in one)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A run in which two skills and a selector have learnt."""
+    path = tmp_path_factory.mktemp("source") / "run"
+    declare().train(path, seed=5, quiet=True)
+    return path
+
+
+@pytest.mark.parametrize("kind", AGENTS)
+def test_a_plain_agent_begins_with_the_weights_it_ended_with(kind, tmp_path):
+    config = AGENTS[kind]
+    first = Agent("CartPole-v1", config, 400).train(tmp_path / "first", seed=1, quiet=True)
+    still = Agent("CartPole-v1", replace(config, learning_rate=STILL), 200)
+    for start in (first, first.path, str(first.path)):
+        path = tmp_path / f"second-{type(start).__name__}"
+        still.train(path, seed=2, quiet=True, start_from=start)
+        assert_near(weights_of(path)["agent"], weights_of(first.path)["agent"])
+    fresh = still.train(tmp_path / "fresh", seed=2, quiet=True)
+    assert differ(weights_of(fresh.path)["agent"], weights_of(first.path)["agent"])
+
+
+@pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
+def test_all_who_have_learnt_there_begin_with_it(learn, source, tmp_path):
+    path = tmp_path / "run"
+    how = {"together": Together(anchor_nats=None)}
+    declare(learn, STILL, **how).train(path, seed=6, quiet=True, start_from=source)
+    before, after = weights_of(source), weights_of(path)
+    assert set(before) == set(after) == {"left", "other", "selector"}
+    for name, wanted in before.items():
+        assert_near(after[name], wanted)
+
+
+def test_what_was_learnt_together_is_a_start_too_with_its_critic(tmp_path):
+    how = {"interrupt": True, "together_steps": 600}
+    declare("together", **how).train(tmp_path / "a", seed=1, quiet=True)
+    declare("together", STILL, **how).train(
+        tmp_path / "b", seed=2, quiet=True, start_from=tmp_path / "a"
+    )
+    before, after = weights_of(tmp_path / "a"), weights_of(tmp_path / "b")
+    assert set(before) == {"left", "other", "selector", "skill_critic"}
+    for name in ("left", "other", "selector"):
+        assert_near(after[name], before[name])
+    assert (
+        "skill_critic" in json.loads((tmp_path / "b/run.json").read_text())["stages"][0]["starts"]
+    )
+
+
+def test_who_has_not_learnt_there_begins_afresh_and_people_are_told(source, tmp_path, capsys):
+    class Third(Left):
+        """Another one."""
+
+    small = declare(rate=STILL, skills=(Left, Third), selector=lambda obs: obs[:, 2] > 0)
+    small.train(tmp_path / "run", seed=6, start_from=source)
+    assert f"left: begins with what was learnt in {source}" in capsys.readouterr().err.replace(
+        "\n", " "
+    ).replace("  ", " ")
+    alone = small.train(tmp_path / "alone", seed=6, quiet=True)
+    after, fresh = weights_of(tmp_path / "run"), weights_of(alone.path)
+    assert_near(after["left"], weights_of(source)["left"])
+    assert_near(after["third"], fresh["third"])
+    starts = {s["name"]: s.get("starts") for s in alone.info()["stages"]}
+    assert starts == {"left": None, "third": None}
+
+
+def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_path):
+    moments = {k: v for k, v in learnt_in(source)["left"].policy.weights.items() if "obs_" in k}
+    assert set(moments) == {"obs_mean", "obs_var"}
+    run = declare().train(tmp_path / "run", seed=6, quiet=True, start_from=source)
+    (told,) = [s["starts"] for s in run.info()["stages"] if s["name"] == "left"]
+    assert told["left"]["steps"] == 640  # of the source's stage: ten rollouts
+    config = PPO(num_envs=4, n_steps=16, network=SMALL, learning_rate=STILL)
+    Agent("CartPole-v1", config, 6_400).train(tmp_path / "a", quiet=True)
+    Agent("CartPole-v1", config, 64).train(tmp_path / "b", quiet=True, start_from=tmp_path / "a")
+    a, b = (learnt_in(tmp_path / k)["agent"].policy.weights["obs_var"] for k in "ab")
+    assert ((a - b).abs() <= 0.03 * a).all(), "64 steps move what 6,400 have found by a hundredth"
+
+
+def test_who_learns_from_replay_does_not_begin_at_random(tmp_path, monkeypatch):
+    config = DQN(num_envs=4, learning_starts=200, buffer_size=2_000, network=SMALL)
+    asked, begin = [], Acting.begin
+
+    def told(self, request, *more):
+        asked.append(request.at_random)
+        begin(self, request, *more)
+
+    monkeypatch.setattr(Acting, "begin", told)
+    Agent("CartPole-v1", config, 400).train(tmp_path / "a", quiet=True)
+    assert any(asked)
+    asked.clear()
+    Agent("CartPole-v1", config, 400).train(tmp_path / "b", quiet=True, start_from=tmp_path / "a")
+    assert asked
+    assert not any(asked)
+
+
+def begun(path, source, **how):
+    """A run that starts from another one, not trained yet."""
+    hierarchy, learnt = declare(**how), learnt_in(source)
+    content = training.manifest(hierarchy, seed=3, flat=False)
+    begin_with(content["stages"], learnt, source)
+    run = RunDirectory.create(path, content | {"recipe": None})
+    keep_starts(run, learnt)
+    return run
+
+
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_a_run_that_is_killed_needs_the_other_one_no_more(learn, source, tmp_path):
+    """Also where it is killed before its first checkpoint."""
+    copy = tmp_path / "source"
+    shutil.copytree(source, copy)
+    for name in ("killed", "whole"):
+        begun(tmp_path / name, copy, learn=learn).close()
+    declare(learn).resume(tmp_path / "whole", quiet=True)
+    shutil.rmtree(copy)
+    declare(learn).resume(tmp_path / "killed", quiet=True)
+    assert_same(tmp_path / "killed", tmp_path / "whole")
+    assert not (tmp_path / "killed/starts").exists(), "what is done needs no start"
+
+
+def test_a_copy_that_is_lost_or_anothers_is_refused(source, tmp_path):
+    run = begun(tmp_path / "run", source)
+    run.close()
+    file = tmp_path / "run/starts/left.safetensors"
+    kept = file.read_bytes()
+    file.unlink()
+    with pytest.raises(SkillweaveError, match=r"left\.safetensors is not there.*train anew"):
+        declare().resume(run.path, quiet=True)
+    shutil.copy(tmp_path / "run/starts/other.safetensors", file)
+    with pytest.raises(SkillweaveError, match="does not hold what 'left' is to begin with"):
+        declare().resume(run.path, quiet=True)
+    shutil.copy(source / "policies/left.safetensors", file)
+    with pytest.raises(SkillweaveError, match="belongs to another run"):
+        declare().resume(run.path, quiet=True)
+    file.write_bytes(kept[:-8] + bytes(8))
+    with pytest.raises(SkillweaveError, match="damaged"):
+        declare().resume(run.path, quiet=True)
+    file.write_bytes(kept)
+    declare().resume(run.path, quiet=True)
+
+
+def test_runs_that_start_elsewhere_are_others(source, tmp_path):
+    ids = [
+        run.info()["id"]
+        for run in (
+            declare().train(tmp_path / "a", quiet=True, start_from=source),
+            declare().train(tmp_path / "b", quiet=True),
+        )
+    ]
+    assert ids[0] != ids[1]
+
+
+WRONG = {
+    "nowhere": ({}, "nowhere", r"nowhere holds no run"),
+    "a number": ({}, 5, r"start_from is 5"),
+    "nobody": (
+        {"skills": (type("Third", (Left,), {}), Push), "selector": lambda obs: obs[:, 2] > 0},
+        None,
+        r"nobody who learns here has learnt in .*: here learn third, and there left, other, select",
+    ),
+    "network": (
+        {"algorithm": replace(ON, network=Network((9,)))},
+        None,
+        r"'left' cannot begin with what it learnt in .*its networks have other shapes",
+    ),
+    "algorithm": ({"selector": OFF}, None, r"'selector'.*by PPO there.* by DQN here"),
+    "fewer skills": ({"skills": (Left, Other)}, None, r"'selector'.*its skills"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_cannot_be_is_said_before_anything_is_written(case, source, tmp_path):
+    how, start, says = WRONG[case]
+    if start == "nowhere":
+        start = tmp_path / start
+    with pytest.raises(SkillweaveError, match=says):
+        declare(**how).train(tmp_path / "run", quiet=True, start_from=start or source)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_population_does_not_start_from_a_run(source, tmp_path):
+    from skillweave import Evolution
+
+    evolve = {"selector": Evolution(population=2, generations=2)}
+    with pytest.raises(SkillweaveError, match=r"start_from: stage 'selector' evolves"):
+        declare().train(tmp_path / "run", quiet=True, evolve=evolve, start_from=source)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_is_not_finished_gives_what_it_has(source, tmp_path):
+    path = tmp_path / "unfinished"
+    run = new_run(declare(), path)
+    heard = Heard()
+    heard.stage = lambda name, budget: (
+        (_ for _ in ()).throw(KeyboardInterrupt) if (name == "other") else None
+    )
+    with pytest.raises(KeyboardInterrupt):
+        training.train(declare(), run, (heard,))
+    run.close()
+    assert set(learnt_in(path)) == {"left"}
+    declare(rate=STILL).train(tmp_path / "run", quiet=True, start_from=path)
+    assert_near(weights_of(tmp_path / "run")["left"], weights_of(path)["left"])
+
+
+def test_the_command_takes_a_run(source, tmp_path, capsys):
+    recipe = tmp_path / "cart.py"
+    recipe.write_text("from test_start_from import declare\nhierarchy = declare(rate=1e-12)\n")
+    out = ["--out", str(tmp_path / "run"), "--evaluate", "1"]
+    assert main(["train", str(recipe), "--start-from", str(source), *out]) == 0
+    assert "begins with what was learnt in" in capsys.readouterr().err
+    assert_near(weights_of(tmp_path / "run")["selector"], weights_of(source)["selector"])
+    assert main(["train", str(recipe), "--start-from", str(tmp_path / "no"), *out]) == 1
+    assert "holds no run" in capsys.readouterr().err
