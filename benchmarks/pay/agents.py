@@ -53,9 +53,15 @@ class Bench:
     def _hierarchy(self, tasks: Sequence[Task]) -> None:
         source = self.suite.tasks[0]
         budgets = dict(zip(self._names(), self.suite.steps(), strict=True))
-        for task in self._with_source(tasks):
+        for task in self._with_those_before(tasks):
             hierarchy = self.suite.hierarchy(task, None if task is source else self._skills())
-            self._weave(task, HIERARCHY, hierarchy, budgets[task.name], keep=task is source)
+            start = None
+            if task.starts_from is not None:
+                before = self.suite.task(task.starts_from)
+                start = self._path(before, HIERARCHY)
+                self._builds_on(before, HIERARCHY)
+            keep = self.suite.goes_on(task)
+            self._weave(task, HIERARCHY, hierarchy, budgets[task.name], keep, start)
         for task in tasks:
             for agent, declare in self.suite.variants.items():
                 hierarchy = self.suite.fitted(declare(task, self._skills()))
@@ -63,18 +69,24 @@ class Bench:
             self._without_learning(task)
 
     def _weave(
-        self, task: Task, agent: str, hierarchy: Hierarchy, budget: int, keep: bool = False
+        self,
+        task: Task,
+        agent: str,
+        hierarchy: Hierarchy,
+        budget: int,
+        keep: bool = False,
+        start_from: Path | None = None,
     ) -> None:
-        if self._found(task, agent, budget):
-            return
         path, started = self._path(task, agent), time.perf_counter()
+        if self._found(task, agent, budget) and (path.exists() or not keep):
+            return
         self.results.begin(path)
         hierarchy.eval_every = max(1, budget // self.suite.evaluations)
         hierarchy.eval_episodes = self.suite.evaluated
         if path.exists():
             run = hierarchy.resume(path, quiet=True)
         else:
-            run = hierarchy.train(path, seed=self.seed, quiet=True)
+            run = hierarchy.train(path, seed=self.seed, quiet=True, start_from=start_from)
         self._score(run, task, agent, budget, started, keep, ("selector", "together"))
 
     def _skills(self) -> dict[str, Any]:
@@ -231,6 +243,14 @@ class Bench:
         """These tasks, and before them the one on which skills are learnt."""
         source = self.suite.tasks[0]
         return [source, *(t for t in tasks if t is not source)]
+
+    def _with_those_before(self, tasks: Sequence[Task]) -> list[Task]:
+        """The same, and the tasks that selectors start from, in the suite's order."""
+        wanted = {t.name for t in self._with_source(tasks)}
+        for task in reversed(self.suite.tasks):
+            if task.name in wanted and task.starts_from is not None:
+                wanted.add(task.starts_from)
+        return [t for t in self.suite.tasks if t.name in wanted]
 
 
 def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:

@@ -11,6 +11,13 @@ from skillweave import Array, Hierarchy
 from skillweave.recipes import _mazes, mazes
 
 SOLVED = 0.9
+STARTS = {
+    "large-diverse": "large",
+    "medium-diverse": "large",
+    "medium": "medium-diverse",
+    "umaze": "medium",
+}
+"""By maze, the one whose selector its own starts from. Diverse mazes have the same walls."""
 
 
 def source(task: Task) -> Hierarchy:
@@ -38,7 +45,7 @@ def suite() -> Suite:
     """Five mazes; a score is the share of episodes that reach the goal."""
     return Suite(
         name="mazes",
-        tasks=[Task(name, _mazes.spec(name), SOLVED) for name in _mazes.MAZES],
+        tasks=[Task(name, _mazes.spec(name), SOLVED, STARTS.get(name)) for name in _mazes.MAZES],
         unit=1.0,
         source=source,
         further=further,

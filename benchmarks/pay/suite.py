@@ -24,11 +24,14 @@ class Task:
         name: letters, digits and dashes: it names files.
         env: its environment, with its own reward.
         solved: a score from here on counts as solved.
+        starts_from: an earlier task, by name: the hierarchy's selector begins with what it was at
+            the end of that one. F3 is the same of a flat agent.
     """
 
     name: str
     env: EnvSpec
     solved: float
+    starts_from: str | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,14 @@ class Suite:
     evaluated: int = 10
     scale: float = 1.0
     """All budgets are multiplied by this."""
+
+    def task(self, name: str) -> Task:
+        """The task of this name."""
+        return next(t for t in self.tasks if t.name == name)
+
+    def goes_on(self, task: Task) -> bool:
+        """Whether others need what was learnt on a task."""
+        return task is self.tasks[0] or any(t.starts_from == task.name for t in self.tasks)
 
     def scaled(self, factor: float) -> Suite:
         """The same with other budgets."""

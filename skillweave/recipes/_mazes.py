@@ -13,10 +13,10 @@ from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
 
 MAZES = {
     "large": "PointMaze_Large-v3",
-    "umaze": "PointMaze_UMaze-v3",
-    "medium": "PointMaze_Medium-v3",
-    "medium-diverse": "PointMaze_Medium_Diverse_GR-v3",
     "large-diverse": "PointMaze_Large_Diverse_GR-v3",
+    "medium-diverse": "PointMaze_Medium_Diverse_GR-v3",
+    "medium": "PointMaze_Medium-v3",
+    "umaze": "PointMaze_UMaze-v3",
 }
 """Mazes by name, and what Gymnasium-Robotics and EnvPool call them."""
 PLACE, SPEED, GOAL = slice(0, 2), slice(2, 4), slice(4, 6)
