@@ -54,7 +54,8 @@ def suite() -> Suite:
         further=further,
         skills=lambda: [skill() for skill in missions.SKILLS],
         # Pays at the end of a leg only, so it is to look further ahead than a skill.
-        flat=replace(missions.PILOT, gamma=0.999, gae_lambda=0.98, ent_coef_final=None),
+        # It sees the mission.
+        flat=replace(missions.PILOT, gamma=0.999, gae_lambda=0.98, network=missions.RELU),
         weights=(
             {s.name: 0.001 for s in missions.SKILLS},
             {"land": 0.003, "hover": 0.001, "go_left": 0.001, "go_right": 0.001},
@@ -62,7 +63,7 @@ def suite() -> Suite:
         cells=cells,
         bonus=0.01,
         fixed={"by-leg": by_leg},
-        # More than learns the first task, skills included. A further one takes a thirteenth of it.
+        # More than learns the first task, skills included. A further one takes an eleventh of that.
         flat_steps=4_000_000,
         evaluations=8,
     )

@@ -117,6 +117,9 @@ class Network:
     """A memory, for PPO; None: the policy sees one observation at a time."""
     encoder: str | None = None
     """A custom encoder by the name it was registered under; see ``register_encoder``."""
+    sees: tuple[int, ...] | None = None
+    """Which numbers of the observation it sees, by their places in it; None: all. Images are seen
+    in any case. For a skill that is not to know of the task around it: which mission it is, say."""
 
     def __post_init__(self) -> None:
         _widths(self, "hidden")
@@ -124,12 +127,25 @@ class Network:
         _choice(self, "layer_norm", (True, False))
         if not isinstance(self.encoder, str | None):
             raise SkillweaveError(f"Network.encoder is {short(self.encoder)}; it must be a name")
+        if self.sees is not None:
+            _places(self.sees)
+            if self.encoder is not None:
+                raise SkillweaveError("Network: give sees or encoder, not both")
         for name, kind in (("cnn", CNN), ("rnn", RNN)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise SkillweaveError(
                     f"Network.{name} is {short(value)}; it must be a {kind.__name__}() or None"
                 )
+
+
+def _places(sees: Any) -> None:
+    whole = isinstance(sees, tuple) and all(type(place) is int and place >= 0 for place in sees)
+    if not whole or not sees or len(set(sees)) < len(sees):
+        raise SkillweaveError(
+            f"Network.sees is {short(sees)}; it must be a tuple of places in an observation, from "
+            "0 on, each once: sees=(0, 1, 4)"
+        )
 
 
 def _widths(config: object, field: str) -> None:

@@ -16,7 +16,9 @@ from skillweave.networks.recurrent import (
     sequence,
 )
 from skillweave.networks.stacked import Views, mlp, mlp_init_, mlp_shapes, orthogonal_
+from skillweave.ops.device import Constant
 from skillweave.spaces import ObsCodec
+from skillweave.types import SkillweaveError
 
 
 class Net:
@@ -42,7 +44,9 @@ class Net:
             for i in range(len(obs.images)):
                 image = ImageEncoder(obs, i, network.cnn, network.activation)
                 self.encoders[f"{name}.cnn{i}"] = image
-        self.features = obs.size if self._vector else 0
+        self._sees = None if network.sees is None else Constant(_places(network.sees, obs.size))
+        seen = obs.size if network.sees is None else len(network.sees)
+        self.features = seen if self._vector else 0
         """Where the features of the encoders begin in what the first layer reads."""
         width = self.features + extra
         width += sum(e.size for e in self.encoders.values())
@@ -127,10 +131,30 @@ class Net:
         bias, weight = views[f"{self.head}.bias"], views[f"{self.head}.weight"]
         return torch.baddbmm(bias, x, weight)
 
+    def _seen(self, vector: Tensor) -> Tensor:
+        """The numbers (P, B, O) that this network is given."""
+        return (
+            vector if self._sees is None else vector.index_select(-1, self._sees.on(vector.device))
+        )
+
     def _joined(self, views: Views, inputs: Inputs, extra: Tensor | None) -> Tensor:
-        parts = [inputs["vector"]] if self._vector else []
+        parts = [self._seen(inputs["vector"])] if self._vector else []
         if self.encoders:
             parts += [e(part(views, prefix), inputs) for prefix, e in self.encoders.items()]
         if extra is not None:
             parts.append(extra)
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+
+
+def _places(sees: tuple[int, ...], size: int) -> Tensor:
+    """Places of an observation of so many numbers.
+
+    Raises:
+        SkillweaveError: there are fewer numbers.
+    """
+    if max(sees) >= size:
+        there = "has no number beside its images" if not size else f"has {size} (0 to {size - 1})"
+        raise SkillweaveError(
+            f"Network.sees names the number {max(sees)} of an observation, but it {there}"
+        )
+    return torch.tensor(sees)

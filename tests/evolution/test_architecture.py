@@ -43,6 +43,7 @@ KINDS = {
     "ppo, force": (PPO(), FORCE),
     "ppo, memory": (PPO(network=Network(rnn=RNN("lstm", 6))), CHOICE),
     "self-imitation": (SelfImitationPPO(imitation_rows=20), CHOICE),
+    "ppo, sees a part": (PPO(network=Network(sees=(0, 3, 4))), CHOICE),
     "dqn": (DQN(), CHOICE),
     "rainbow": (DQN.rainbow(), CHOICE),
     "td3": (TD3(), FORCE),

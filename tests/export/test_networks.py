@@ -50,6 +50,9 @@ CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
     "ppo, gru": (
         PPO(network=Network((8,), rnn=RNN("gru", 4))), SHOWS["vector"], ASKS["MultiBinary"][0]
     ),
+    "ppo, sees a part": (
+        PPO(network=Network((8,), sees=(1,))), SHOWS["vector"], ASKS["Discrete"][0]
+    ),
     "ppo, nested": (PPO(network=SMALL), NESTED, ASKS["Discrete"][0]),
     "ppo, cells": (
         PPO(network=Network((8,), encoder="cells")), SHOWS["image, channels last"],

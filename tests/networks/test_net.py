@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Discrete
 from torch.nn import functional as F
 
-from skillweave.networks.config import RNN, Network
+from skillweave.algorithms.config import (
+    DQN,
+    PPO,
+    SAC,
+    TD3,
+    config_from_json,
+    config_to_json,
+)
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.registry import make_algorithm
+from skillweave.networks.config import CNN, RNN, Network
 from skillweave.networks.net import Net
 from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Layout
+from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
+from skillweave.types import SkillweaveError
 
 P, B, A = 2, 4, 3
 OBS = obs_codec(Box(-1, 1, (5,)))
@@ -135,3 +150,64 @@ def test_a_network_with_memory_computes_steps_as_a_sequence():
         torch.testing.assert_close(memory, after[:, t])
         for m in range(P):
             torch.testing.assert_close(now[m], linear(views, "net.head", m, memory[m, :, :6]))
+
+
+ALGORITHMS = {
+    "ppo": (PPO(network=Network((8,), sees=(3, 1))), Discrete(3)),
+    "recurrent ppo": (PPO(network=Network((8,), rnn=RNN("gru", 6), sees=(3, 1))), Discrete(3)),
+    "dqn": (DQN(network=Network((8,), sees=(3, 1))), Discrete(3)),
+    "td3": (TD3(network=Network((8,), sees=(3, 1))), Box(-1, 1, (2,))),
+    "sac": (SAC(network=Network((8,), sees=(3, 1))), Box(-1, 1, (2,))),
+}
+
+
+def test_a_network_is_given_the_numbers_that_it_sees_in_their_order():
+    net = Net("pi", OBS, Network((8,), sees=(3, 1)), A)
+    layout, flat = made(net, 1.0)
+    views, x = layout.views(flat), inputs()["vector"]
+    small = Net("pi", obs_codec(Box(-1, 1, (2,))), Network((8,)), A)
+    assert net.shapes == small.shapes
+    assert torch.equal(net(views, {"vector": x}), small(views, {"vector": x[..., [3, 1]]}))
+
+
+@pytest.mark.parametrize("kind", ALGORITHMS)
+def test_what_is_not_seen_changes_no_action(kind):
+    config, actions = ALGORITHMS[kind]
+    algorithm = make_algorithm(config, Box(-1, 1, (5,)), actions)
+    state = algorithm.init([Seeds(0)])
+    state.params.normal_(generator=torch.Generator().manual_seed(1))
+    policy = AgentPolicy.of(algorithm, state)
+    rng = np.random.default_rng(0)
+    obs = rng.uniform(-1, 1, (64, 5)).astype(np.float32)
+    other = obs.copy()
+    other[:, [0, 2, 4]] = rng.uniform(-1, 1, (64, 3))
+    before, _ = policy.act(policy.start(64), obs)
+    after, _ = policy.act(policy.start(64), other)
+    np.testing.assert_array_equal(before, after)
+    other[:, 3] = -obs[:, 3]
+    assert (policy.act(policy.start(64), other)[0] != before).any()
+
+
+def test_images_are_seen_beside_the_numbers():
+    both = Dict({"camera": Box(0, 255, (12, 12, 3), np.uint8), "speed": Box(-1, 1, (5,))})
+    cnn = CNN("plain", (4,), (3,), (2,))
+    shapes = Net("pi", obs_codec(both), Network((8,), cnn=cnn, sees=(2,)), A).shapes
+    alone = Net("pi", obs_codec(both["camera"]), Network((8,), cnn=cnn), A).shapes
+    assert shapes["pi.0.weight"][0] == alone["pi.0.weight"][0] + 1
+
+
+@pytest.mark.parametrize(
+    ("space", "says"),
+    [
+        (Box(-1, 1, (3,)), r"sees names the number 3 of an observation, but it has 3 \(0 to 2\)"),
+        (Box(0, 255, (12, 12, 3), np.uint8), r"the number 3 .* has no number beside its images"),
+    ],
+)
+def test_numbers_that_are_not_there_are_named(space, says):
+    with pytest.raises(SkillweaveError, match=says):
+        make_algorithm(PPO(network=Network(sees=(3, 1))), space, Discrete(2))
+
+
+def test_what_is_seen_survives_json():
+    config = PPO(network=Network(sees=(3, 1)))
+    assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
