@@ -24,17 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import (
-    PPO,
-    Array,
-    Automaton,
-    Hierarchy,
-    Network,
-    Skill,
-    Step,
-    Together,
-    register_encoder,
-)
+from skillweave import PPO, Array, Automaton, Hierarchy, Network, Skill, Step, Together
 from skillweave.recipes._cheetah import LEG, SPEED, spec
 
 UNIT = 1000.0
@@ -102,28 +92,6 @@ class Stop(Skill):
         return -np.abs(moved(step)) - effort(step)
 
 
-class Body:
-    """An encoder without parameters: all but the leg of the patrol.
-
-    Skills see no more than that, so that they serve patrols whose legs are others: with the leg,
-    ``backward`` knows only legs in which the source task runs backwards.
-    """
-
-    size: int = LEG.start
-
-    def __init__(self, obs: Any) -> None:
-        self.shapes: dict[str, tuple[int, ...]] = {}
-
-    def init_(self, views: Any, generators: Any) -> None:
-        """There is nothing to fill."""
-
-    def __call__(self, views: Any, inputs: Mapping[str, Any]) -> Any:
-        """(P, B, O) to (P, B, size)."""
-        return inputs["vector"][..., : self.size]
-
-
-register_encoder("half-cheetah's body", Body)
-
 RELU = Network(hidden=(64, 64), activation="relu")  # tanh costs more than all the rest of it
 RUNNER = PPO(
     min_advantage_std=0.0,  # so it was measured
@@ -135,8 +103,10 @@ RUNNER = PPO(
     gamma=0.98,
     gae_lambda=0.92,
     ent_coef=0.0,
-    network=replace(RELU, encoder="half-cheetah's body"),
+    network=replace(RELU, sees=tuple(range(LEG.start))),
 )
+"""Who learns a skill. It does not see the leg of the patrol, so that it serves patrols whose legs
+are others: with the leg, ``backward`` knows only legs in which the source task runs backwards."""
 SELECTOR = PPO(
     min_advantage_std=0.0,  # so it was measured
     num_envs=64,
