@@ -188,7 +188,7 @@ class Declaration(Nestable):
         return len(self.skills) * len(lengths)
 
     def chooses_from(self, path: str, actions: gym.Space[Any]) -> gym.Space[Any]:
-        """What a selector, its critic or a skill chooses from; ``actions``: the environment's."""
+        """What a selector, its critic or a skill at ``path`` chooses from, given ``actions``."""
         node, _, name = path.rpartition("/")
         if name not in (SELECTOR, CRITIC):
             return actions

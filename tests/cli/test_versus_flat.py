@@ -56,10 +56,10 @@ def test_what_the_hierarchy_scored_is_told_before_the_flat_agent_is_trained(
     (tmp_path / "plain.py").write_text(PLAIN)
     train = training._trained
 
-    def stopped(command: Any, hierarchy: Any, flat: bool, *more: Any) -> Any:
+    def stopped(command: Any, hierarchy: Any, flat: bool, *more: Any, **named: Any) -> Any:
         if flat:
             raise KeyboardInterrupt("stopped")
-        return train(command, hierarchy, flat, *more)
+        return train(command, hierarchy, flat, *more, **named)
 
     monkeypatch.setattr(training, "_trained", stopped)
     asked = ["train", str(tmp_path / "plain.py"), "-o", str(tmp_path / "run"), "--versus-flat"]

@@ -23,7 +23,8 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
-from skillweave.runs.manifest import Generation, versions
+from skillweave.runs.manifest import versions
+from skillweave.runs.population_schema import Generation
 from skillweave.seeding import Seeds
 from skillweave.types import SkillweaveError
 

@@ -53,7 +53,8 @@ def spin():
 
 
 def hog():
-    taken = bytearray(60 << 20)
+    # Far more than what tests before this one left, and what may be given back meanwhile.
+    taken = bytearray(300 << 20)
     taken[:: 1 << 12] = b"x" * len(taken[:: 1 << 12])
     return RIGHT
 

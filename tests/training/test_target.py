@@ -30,8 +30,8 @@ from skillweave.evolution.plan import plan
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
-from skillweave.training import trainer
 from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.stage import Target
 
 NET = Network((8,))
 SMALL = PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=1, network=NET)
@@ -134,7 +134,7 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
         if where == "its policy":
             patch.setattr(RunDirectory, "save_policies", lambda *_: 1 / 0)
         else:
-            at, reached_at = [0], trainer.Target.reached
+            at, reached_at = [0], Target.reached
 
             def dies(self: Any, metrics: Any, stage: str) -> Any:
                 at[0] = max(at[0], int(metrics.get("eval_return", 0)))
@@ -142,7 +142,7 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
                     raise ZeroDivisionError
                 return reached_at(self, metrics, stage)
 
-            patch.setattr(trainer.Target, "reached", dies)
+            patch.setattr(Target, "reached", dies)
         with pytest.raises(ZeroDivisionError):
             agent.train(tmp_path / "run", quiet=True)
     assert not RunDirectory.open(tmp_path / "run").finished
