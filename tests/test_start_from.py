@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -25,8 +26,12 @@ from skillweave import (
 from skillweave.cli import main
 from skillweave.collecting.acting import Acting
 from skillweave.hierarchy import training
+from skillweave.reporting.report.facts import settings
+from skillweave.runs import starts
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.starts import begin_with, keep_starts, learnt_in
+from skillweave.training import stage_log
+from skillweave.training.woven_learner import WovenLearner
 
 STILL = 1e-12
 """A learning rate by which nothing moves."""
@@ -54,7 +59,8 @@ def declare(learn="apart", rate=None, skills=(Left, Other, Push), **how):
         "call_steps": 5, "skill_steps": 600, "selector_steps": 600, "together_steps": 1_200,
         "algorithm": ON, "selector": ON, "cut_every": 200, "greedy_skills": False,
     }  # fmt: skip
-    found = Hierarchy("CartPole-v1", [s() for s in skills], learn=learn, **settings | how)
+    env = how.pop("env", "CartPole-v1")
+    found = Hierarchy(env, [s() for s in skills], learn=learn, **settings | how)
     if rate is not None:
         found.algorithm = replace(found.algorithm, learning_rate=rate)
         for who, name in ((found, "selector"), *((s, "algorithm") for s in found.skills)):
@@ -134,9 +140,7 @@ def test_who_has_not_learnt_there_begins_afresh_and_people_are_told(source, tmp_
 
     small = declare(rate=STILL, skills=(Left, Third), selector=lambda obs: obs[:, 2] > 0)
     small.train(tmp_path / "run", seed=6, start_from=source)
-    assert f"left: begins with what was learnt in {source}" in capsys.readouterr().err.replace(
-        "\n", " "
-    ).replace("  ", " ")
+    assert f"start from {source}: left" in " ".join(capsys.readouterr().err.split())
     alone = small.train(tmp_path / "alone", seed=6, quiet=True)
     after, fresh = weights_of(tmp_path / "run"), weights_of(alone.path)
     assert_near(after["left"], weights_of(source)["left"])
@@ -175,14 +179,83 @@ def test_who_learns_from_replay_does_not_begin_at_random(tmp_path, monkeypatch):
     assert not any(asked)
 
 
+def test_a_dqn_does_not_explore_anew(tmp_path, monkeypatch):
+    epsilon, begin = [], Acting.begin
+
+    def told(self, request, *more):
+        epsilon.extend(p.extra["epsilon"].item() for p in request.params if "epsilon" in p.extra)
+        begin(self, request, *more)
+
+    monkeypatch.setattr(Acting, "begin", told)
+    Agent("CartPole-v1", OFF, 400).train(tmp_path / "a", quiet=True)
+    assert (epsilon[0], epsilon[-1]) == pytest.approx((1.0, OFF.exploration_final_eps))
+    epsilon.clear()
+    Agent("CartPole-v1", OFF, 400).train(tmp_path / "b", quiet=True, start_from=tmp_path / "a")
+    assert epsilon == pytest.approx([OFF.exploration_final_eps] * len(epsilon))
+
+
+def test_who_starts_from_a_run_is_not_held_near_what_it_was(source, tmp_path, monkeypatch):
+    anchors, make = {}, WovenLearner.__init__
+
+    def made(self, parts, *more):
+        anchors.update({name: getattr(part, "anchor", None) for name, part in parts.items()})
+        make(self, parts, *more)
+
+    monkeypatch.setattr(WovenLearner, "__init__", made)
+    declare("together").train(tmp_path / "a", quiet=True, start_from=source)
+    assert set(anchors.values()) == {None}
+    # What an earlier stage of the same run taught is an anchor, as ever.
+    declare("apart, then together").train(tmp_path / "b", quiet=True, start_from=source)
+    assert anchors["left"] is not None
+
+
+def test_where_nothing_can_be_copied_no_run_is_begun(source, tmp_path, monkeypatch):
+    write = starts.write_tensors
+
+    def full(path, *about, **how):
+        if "other" in path.name:
+            raise SkillweaveError("No space left on device")
+        return write(path, *about, **how)
+
+    monkeypatch.setattr(starts, "write_tensors", full)
+    with pytest.raises(SkillweaveError, match="No space left"):
+        declare().train(tmp_path / "run", quiet=True, start_from=source)
+    monkeypatch.undo()
+    declare().train(tmp_path / "run", quiet=True, start_from=source)
+
+
+def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
+    agent = Agent("CartPole-v1", ON, 64)
+    found = []
+    for seed in range(2):
+        first = agent.train(tmp_path / f"first-{seed}", seed=seed, quiet=True)
+        run = agent.train(tmp_path / f"then-{seed}", seed=seed, quiet=True, start_from=first)
+        found.append(settings(run.info()))
+    assert found[0] == found[1]
+    assert found[0] != settings(first.info())
+
+
+def test_what_is_left_of_a_start_goes_with_the_next_training(source, tmp_path, monkeypatch):
+    """Killed between the end of a stage and the removal of what it began with."""
+    run = begun(tmp_path / "run", source)
+    monkeypatch.setattr(stage_log, "drop_starts", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        training.train(declare(), run)
+    run.close()
+    monkeypatch.undo()
+    assert (run.path / "starts/left.safetensors").exists()
+    declare().resume(run.path, quiet=True)
+    assert not (run.path / "starts").exists()
+
+
 def begun(path, source, **how):
     """A run that starts from another one, not trained yet."""
     hierarchy, learnt = declare(**how), learnt_in(source)
     content = training.manifest(hierarchy, seed=3, flat=False)
     begin_with(content["stages"], learnt, source)
-    run = RunDirectory.create(path, content | {"recipe": None})
-    keep_starts(run, learnt)
-    return run
+    return RunDirectory.create(
+        path, content | {"recipe": None}, partial(keep_starts, learnt=learnt)
+    )
 
 
 @pytest.mark.parametrize("learn", ["apart", "together"])
@@ -242,10 +315,30 @@ WRONG = {
     "network": (
         {"algorithm": replace(ON, network=Network((9,)))},
         None,
-        r"'left' cannot begin with what it learnt in .*its networks have other shapes",
+        r"'left' cannot begin with what it learnt in .*it has other networks here",
+    ),
+    "activation": (
+        {"algorithm": replace(ON, network=Network((8,), "relu"))},
+        None,
+        r"'left'.*it has other networks here",
+    ),
+    "what it sees": (
+        {"algorithm": replace(ON, network=Network((8,), sees=(0, 1, 2, 3)))},
+        None,
+        r"'left'.*it has other networks here",
+    ),
+    "another order": (
+        {"skills": (Other, Left, Push)},
+        None,
+        r"'selector'.*chooses from left, other, push, and here from other, left, push",
+    ),
+    "another environment": (
+        {"env": "Acrobot-v1", "skills": (Left, Other)},
+        None,
+        r"'left'.*its observations are others here",
     ),
     "algorithm": ({"selector": OFF}, None, r"'selector'.*by PPO there.* by DQN here"),
-    "fewer skills": ({"skills": (Left, Other)}, None, r"'selector'.*its skills"),
+    "fewer skills": ({"skills": (Left, Other)}, None, r"'selector'.*here from left, other$"),
 }
 
 
@@ -288,7 +381,39 @@ def test_the_command_takes_a_run(source, tmp_path, capsys):
     recipe.write_text("from test_start_from import declare\nhierarchy = declare(rate=1e-12)\n")
     out = ["--out", str(tmp_path / "run"), "--evaluate", "1"]
     assert main(["train", str(recipe), "--start-from", str(source), *out]) == 0
-    assert "begins with what was learnt in" in capsys.readouterr().err
+    assert "start from" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "run")]) == 0
+    run = json.loads((source / "run.json").read_text())["id"]
+    assert f"left starts from run {run}, after 640 steps there" in capsys.readouterr().out
     assert_near(weights_of(tmp_path / "run")["selector"], weights_of(source)["selector"])
     assert main(["train", str(recipe), "--start-from", str(tmp_path / "no"), *out]) == 1
     assert "holds no run" in capsys.readouterr().err
+
+
+def nested(rate=None, **how):
+    inner = declare(rate=rate, skills=(Left, Other), **how)
+    inner.name = "inner"
+    outer = declare(rate=rate, skills=(Other,), **how)
+    return Hierarchy(
+        "CartPole-v1", [*outer.skills, inner.as_skill("inner")], call_steps=8, selector_steps=600,
+        skill_steps=600, algorithm=outer.algorithm, selector=outer.selector, cut_every=200,
+        greedy_skills=False,
+    )  # fmt: skip
+
+
+def test_all_levels_of_a_nested_hierarchy_begin_with_what_they_learnt(tmp_path):
+    nested().train(tmp_path / "a", seed=1, quiet=True)
+    nested(STILL).train(tmp_path / "b", seed=2, quiet=True, start_from=tmp_path / "a")
+    before, after = weights_of(tmp_path / "a"), weights_of(tmp_path / "b")
+    assert set(before) == {"inner/left", "inner/other", "inner/selector", "other", "selector"}
+    for name, wanted in before.items():
+        assert_near(after[name], wanted)
+
+
+def test_a_selector_below_must_choose_from_the_same_skills(tmp_path):
+    nested().train(tmp_path / "a", seed=1, quiet=True)
+    other = nested()
+    inner = other.skills[1].policy
+    inner.skills = inner.skills[::-1]
+    with pytest.raises(SkillweaveError, match=r"'inner/selector'.*from left, other, and here from"):
+        other.train(tmp_path / "b", quiet=True, start_from=tmp_path / "a")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from benchmarks.pay.suite import Policies, Suite, Task
@@ -50,8 +48,7 @@ def suite() -> Suite:
         source=source,
         further=further,
         skills=lambda: [skill() for skill in mazes.SKILLS],
-        # The selector's network, which sees the same; the goal is hundreds of steps away.
-        flat=replace(mazes.BALL, gamma=0.997, gae_lambda=0.95, ent_coef=0.003, network=mazes.MAP),
+        flat=mazes.FLAT,
         weights=(
             {"approach": 0.001},
             {s.name: 0.001 for s in mazes.SKILLS},

@@ -13,7 +13,8 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
 from skillweave.api.run import Run
-from skillweave.api.running import StartFrom, begin, declared_of, go_on
+from skillweave.api.running import begin, declared_of, go_on
+from skillweave.api.starting import StartFrom
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
@@ -148,8 +149,9 @@ class Hierarchy(Declaration):
             cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
                 where it pays.
             start_from: another run, or its directory: whoever learns here and has learnt there, by
-                the same name, begins with the weights that it ended with there. Its task may be
-                another one; spaces and networks must be the same.
+                the same name, begins with its policy (of PPO and DQN all networks, of SAC and TD3
+                the actor). The task may be another one; spaces, networks and the names of a
+                selector's skills must be the same.
 
         Returns:
             The finished run.
@@ -263,8 +265,8 @@ def train_agent(
         evolve: an ``Evolution``: a population in place of one agent.
         cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
             where it pays.
-        start_from: another plain agent's run, or its directory, to begin with the weights that it
-            ended with.
+        start_from: another plain agent's run, or its directory: it begins with that policy; see
+            ``Hierarchy.train``.
 
     Returns:
         The finished run.

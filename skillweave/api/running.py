@@ -6,12 +6,12 @@ import copy
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skillweave.algorithms.config import config_from_json
-from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.run import Run
+from skillweave.api.starting import StartFrom, starts
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.where import HERE, Where
 from skillweave.evolution.plan import Evolve, make_learner, plan
@@ -23,16 +23,13 @@ from skillweave.runs.command_words import saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
-from skillweave.runs.starts import Learnt, begin_with, check_start, keep_starts, learnt_in
+from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy
-
-StartFrom = str | Path | Run | None
-"""A run in which those who are to learn have learnt before."""
 
 
 def begin(
@@ -48,15 +45,18 @@ def begin(
     """Check everything, begin a run of this manifest, and train it."""
     run_dir = as_path(run_dir, "run_dir")
     _plan(declared, content, evolve, cluster)
-    learnt, note = _starts(declared, content, start_from)
+    learnt, note = starts(declared, content, start_from)
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
     make_trackers(track, None)  # a missing extra is said before anything is written
     if cluster is not None:
         cluster.check()
-    run = RunDirectory.create(run_dir, content | {"recipe": declared.recipe, "track": track})
-    keep_starts(run, learnt)
+    run = RunDirectory.create(
+        run_dir,
+        content | {"recipe": declared.recipe, "track": track},
+        partial(keep_starts, learnt=learnt),
+    )
     return go_on(declared, run, quiet, evolve, cluster, note)
 
 
@@ -112,30 +112,6 @@ def _plan(
                 assert isinstance(declared, Declaration)
                 acts = declared.chooses_from(name, action_space)
                 check_replay(stage | {"algorithm": config}, observation_space, acts)
-
-
-def _starts(
-    declared: Hierarchy | Agent, content: dict[str, Any], start_from: StartFrom
-) -> tuple[dict[str, Learnt], str]:
-    """Who has learnt in another run, and what people should know of it.
-
-    The manifest then says who begins with what.
-    """
-    if start_from is None:
-        return {}, ""
-    where = start_from.path if isinstance(start_from, Run) else as_path(start_from, "start_from")
-    learnt = learnt_in(where)
-    begun = begin_with(content["stages"], learnt, where)
-    observation_space, action_space = declared.check_spaces()
-    for stage in content["stages"]:
-        for name in stage.get("starts", {}):
-            own = stage.get("algorithms", {}).get(name, stage["algorithm"])
-            acts: Any = action_space
-            if isinstance(declared, Declaration) and content["kind"] == "hierarchy":
-                acts = declared.chooses_from(name, action_space)
-            algorithm = make_algorithm(config_from_json(own), observation_space, acts)
-            check_start(name, algorithm, learnt[name], where)
-    return learnt, f"{', '.join(sorted(begun))}: begins with what was learnt in {where}"
 
 
 def go_on(

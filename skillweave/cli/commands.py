@@ -50,7 +50,7 @@ class Train(OnRay):
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
     start_from: Path | None = None
-    """Another run: those who have learnt there, by the same names, begin with what they learnt."""
+    """Another run: whoever has learnt there, too, begins with that (not --versus-flat's agent)."""
     evolve: UseAppendAction[tuple[str, ...]] = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
     track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()

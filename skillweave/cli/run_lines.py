@@ -27,6 +27,9 @@ def run_lines(m: Mapping[str, Any], saved: SavedEvaluation | None, target: objec
             f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
             f"{'' if final is None else f'{final:.1f}':>8}"
         )
+        for name, start in p.get("starts", {}).items():
+            run = "" if start["run"] is None else f" {start['run']}"
+            lines.append(f"    {name} starts from run{run}, after {start['steps']:,} steps there")
         if reached := p.get("reached"):
             lines.append(
                 f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "

@@ -25,6 +25,7 @@ from skillweave.hierarchy.nesting import (
     inner_of,
 )
 from skillweave.messages import short
+from skillweave.networks.config import seeing_all
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill
@@ -102,7 +103,7 @@ class Declaration(Nestable):
     selector_target_return: float | None = None
     """The selector's stage ends early at this mean return of the periodic evaluation."""
     flat: AlgorithmConfig | None = None
-    """Trains the flat baseline; None: as ``algorithm``."""
+    """Trains the flat baseline; None: as ``algorithm``, which then sees the whole observation."""
     flat_steps: int | None = None
     """Training budget of the flat baseline; None: as many steps as the whole hierarchy takes."""
     greedy_skills: bool | None = None
@@ -241,7 +242,7 @@ class Declaration(Nestable):
             )
         return PlainAgent(
             self.env,
-            self.flat or self.algorithm,
+            self.flat or seeing_all(self.algorithm),
             self.flat_steps or self.total_steps,
             cut_every=self.cut_every,
             eval_every=self.eval_every,

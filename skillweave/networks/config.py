@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar, get_args
 
 from skillweave.messages import short
 from skillweave.types import SkillweaveError
 
+T = TypeVar("T")
 WIDEST = 65_536
 """Units of a layer."""
 Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
@@ -118,8 +119,9 @@ class Network:
     encoder: str | None = None
     """A custom encoder by the name it was registered under; see ``register_encoder``."""
     sees: tuple[int, ...] | None = None
-    """Which numbers of the observation it sees, by their places in it; None: all. Images are seen
-    in any case. For a skill that is not to know of the task around it: which mission it is, say."""
+    """Which numbers of the observation it sees, by their places; None: all. The places are those of
+    the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without images,
+    which are seen in any case. For a skill that is not to know of the task around it."""
 
     def __post_init__(self) -> None:
         _widths(self, "hidden")
@@ -137,6 +139,13 @@ class Network:
                 raise SkillweaveError(
                     f"Network.{name} is {short(value)}; it must be a {kind.__name__}() or None"
                 )
+
+
+def seeing_all(algorithm: T) -> T:
+    """The same settings of an algorithm, with networks that see the whole observation."""
+    networks = {k: getattr(algorithm, k, None) for k in ("network", "critic")}
+    seeing = {k: replace(v, sees=None) for k, v in networks.items() if isinstance(v, Network)}
+    return replace(algorithm, **seeing)  # type: ignore[type-var]
 
 
 def _places(sees: Any) -> None:

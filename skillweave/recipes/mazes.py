@@ -180,6 +180,8 @@ SELECTOR = PPO(
 )
 FURTHER_SELECTOR = replace(SELECTOR, num_envs=16, batch_size=64, update_epochs=8)
 """For fewer steps: fewer environments, so that it learns as often."""
+FLAT = replace(BALL, gamma=0.997, gae_lambda=0.95, ent_coef=0.003, network=MAP)
+"""The flat agent sees what the selector sees; the goal is hundreds of steps away."""
 SKILLS = (North, East, South, West, Approach)
 
 
@@ -189,6 +191,7 @@ def declare(maze: str = "large", **how: Any) -> Hierarchy:
         "call_steps": 25,
         "algorithm": BALL,
         "selector": SELECTOR,
+        "flat": FLAT,
         "skill_steps": 30_000,
         "selector_steps": 768_000,
     } | how

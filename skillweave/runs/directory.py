@@ -7,6 +7,7 @@ evaluation.json              the latest evaluation (``training/evaluation_file.p
 checkpoint.safetensors       the stage under way, at its latest clean cut (and the one before)
 policies/<stage>.safetensors finished stages
 states/<who>.safetensors      what learns on in a later stage, until that is done
+starts/<who>.safetensors      what learners begin with, from another run, until their stage is done
 policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights
 .lock                        empty; locked by the process that trains the run
 
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,6 +45,7 @@ from skillweave.runs.population_schema import LineageLine
 from skillweave.types import SkillweaveError, unprefixed
 
 S = TypeVar("S")
+First = Callable[["RunDirectory"], None]
 
 
 def file_name(path: str) -> str:
@@ -62,8 +64,10 @@ class RunDirectory:
         self._lock: Lock | None = None
 
     @classmethod
-    def create(cls, path: str | Path, manifest: dict[str, Any]) -> RunDirectory:
-        """A new run.
+    def create(
+        cls, path: str | Path, manifest: dict[str, Any], first: First | None = None
+    ) -> RunDirectory:
+        """A new run; ``first`` writes what it needs before ``run.json`` is there.
 
         Raises:
             SkillweaveError: the directory already holds a run, or other files.
@@ -83,6 +87,8 @@ class RunDirectory:
         created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
         content = {"versions": versions(), "created": created, "id": identity(manifest)}
         run = cls(path, content | manifest)
+        if first is not None:
+            first(run)
         run.save()
         return run
 
@@ -117,7 +123,7 @@ class RunDirectory:
 
     def _clear(self) -> None:
         """Remove half-written files, and checkpoints that nothing needs any more."""
-        for directory in (self.path, self.path / "policies"):
+        for directory in (self.path, self.path / "policies", self.path / "starts"):
             for path in directory.glob(TEMPORARY):
                 remove(path)
         self._checkpoints.clear(

@@ -103,6 +103,8 @@ class Start(TypedDict):
     """Of its file there."""
     steps: Count
     """Environment steps that it learnt from there."""
+    run: str | None
+    """That run's ``id``."""
 
 
 class StageEntry(TypedDict):

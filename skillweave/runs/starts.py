@@ -5,6 +5,7 @@ It is copied into the run when that begins, so a run needs no other one to go on
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,22 +21,36 @@ from skillweave.types import SkillweaveError
 
 @dataclass(frozen=True)
 class Learnt:
-    """What one has learnt in a finished stage of another run."""
+    """What one has learnt in the finished stages of another run."""
 
     policy: AgentPolicy
     sha256: str
     """Of its file there."""
     steps: int
     """Environment steps that it learnt from."""
+    run: str | None
+    """That run's ``id``; runs of older versions have none."""
+    chooses: Chooses
+    """From what it chooses, if it is a selector or a critic of skills."""
+
+
+Chooses = tuple[tuple[str, ...], tuple[int, ...]]
+"""Names of skills in their order, and lengths of calls that may be chosen."""
 
 
 def learnt_in(path: Path) -> dict[str, Learnt]:
     """By name, who has learnt in a run, as they were at the end of their latest finished stage.
 
     Raises:
-        SkillweaveError: there is no run, or a file of it is damaged.
+        SkillweaveError: there is no run, a file of it is damaged, or nobody has found out yet
+            whether what it learnt together is better than what was there before.
     """
     run, found = RunDirectory.open(path), dict[str, Learnt]()
+    if run.unjudged and all(entry["status"] == "done" for entry in run.manifest["stages"]):
+        raise SkillweaveError(
+            f"start_from: {path} was stopped before its end, while what it learnt was compared "
+            f"with what was there before; finish it first: skillweave resume {path}"
+        )
     for entry in run.manifest["stages"]:
         if entry["status"] != "done" or entry.get("kept", {}).get("kept") == "before":
             continue
@@ -43,9 +58,24 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
         for name, policy in run.load_policies(entry["name"]).items():
             # Runs of older versions do not say the checksum.
             sha256 = sums[name] or read_signed(run.policy_path(entry["name"], name))[2]
-            before = found[name].steps if name in found else 0
-            found[name] = Learnt(policy, sha256, before + entry["steps"])
+            steps = entry["steps"] + (found[name].steps if name in found else 0)
+            chooses = chosen_from(run.manifest, name)
+            found[name] = Learnt(policy, sha256, steps, run.manifest.get("id"), chooses)
     return found
+
+
+def chosen_from(manifest: Mapping[str, Any], name: str) -> Chooses:
+    """From what one who learns in a run chooses, if it is a selector or a critic of skills."""
+    node, _, own = name.rpartition("/")
+    if own not in ("selector", "skill_critic"):
+        return (), ()
+    within = f"{node}/" if node else ""
+    told: Mapping[str, Any] = manifest
+    if node:
+        told = next(s for s in manifest["skills"] if s["name"] == node)["hierarchy"]
+    names = [s["name"] for s in manifest["skills"] if s["name"].startswith(within)]
+    skills = tuple(k for k in (name.removeprefix(within) for name in names) if "/" not in k)
+    return skills, tuple(told.get("call_lengths", ())) if own == "selector" else ()
 
 
 def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where: Path) -> set[str]:
@@ -65,11 +95,12 @@ def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where
             raise SkillweaveError(
                 f"start_from: stage {entry['name']!r} evolves, and members of a population begin "
                 f"with settings and networks of their own, not with what {where} holds. Leave out "
-                "start_from, or name other stages: evolve={...}"
+                "start_from, or evolve only who has not learnt there: evolve={...}"
             )
         if own:
             entry["starts"] = {
-                name: {"sha256": learnt[name].sha256, "steps": learnt[name].steps} for name in own
+                name: {k: getattr(learnt[name], k) for k in ("sha256", "steps", "run")}
+                for name in own
             }
     if not begun:
         here = sorted({name for entry in stages for name in entry["learns"]})
@@ -80,36 +111,32 @@ def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where
     return begun
 
 
-def check_start(name: str, algorithm: Algorithm, learnt: Learnt, where: Path) -> None:
-    """Raise a SkillweaveError where one cannot begin with what it has learnt in another run."""
-    before = learnt.policy.algorithm
-    kinds = [type(a.config).__name__ for a in (before, algorithm)]
-    if before.weight_shapes() == algorithm.weight_shapes():
-        return
-    what = (
-        f"it learnt by {kinds[0]} there, and is to learn by {kinds[1]} here"
-        if kinds[0] != kinds[1]
-        else "its networks have other shapes: observations, what it chooses from (a selector: its "
-        "skills and lengths), network or normalize_obs differ"
-    )
-    raise SkillweaveError(
-        f"start_from: {name!r} cannot begin with what it learnt in {where}: {what}"
-    )
+def same_shapes(one: Algorithm, other: Algorithm) -> bool:
+    """Whether the weights of both have the same names and shapes."""
+    return one.weight_shapes() == other.weight_shapes()
 
 
 def keep_starts(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
-    """Copy into a new run what its stages say that their learners begin with."""
-    for entry in run.manifest["stages"]:
-        for name in entry.get("starts", {}):
-            tensors, header = learnt[name].policy.to_file()
-            path = _path(run, name)
-            make_directory(path.parent)
-            header |= {"starts": name} | run.place(entry["name"])
-            write_tensors(path, tensors, header, make_directories=False)
+    """Copy into a new run what its stages say that their learners begin with: all, or nothing."""
+    try:
+        for entry in run.manifest["stages"]:
+            for name in entry.get("starts", {}):
+                tensors, header = learnt[name].policy.to_file()
+                path = _path(run, name)
+                make_directory(path.parent)
+                header |= {"starts": name} | run.place(entry["name"])
+                write_tensors(path, tensors, header, make_directories=False)
+    except BaseException:
+        shutil.rmtree(run.path / "starts", ignore_errors=True)
+        raise
 
 
-def start_of(run: RunDirectory, stage: str, name: str) -> Learnt | None:
-    """What ``name`` begins a stage with; None: afresh, or with what an earlier stage taught.
+def start_of(
+    run: RunDirectory, stage: str, name: str, algorithm: Algorithm
+) -> tuple[AgentPolicy, int] | None:
+    """What ``name`` begins a stage with, and from how many steps it learnt that.
+
+    None: it begins afresh, or with what an earlier stage taught.
 
     Raises:
         SkillweaveError: the run's copy is not there, damaged, or belongs elsewhere.
@@ -126,7 +153,10 @@ def start_of(run: RunDirectory, stage: str, name: str) -> Learnt | None:
     run.must_be_ours(header, path)
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise SkillweaveError(f"{path} does not hold what {name!r} is to begin with")
-    return Learnt(AgentPolicy.from_file(tensors, header, str(path)), told["sha256"], told["steps"])
+    policy = AgentPolicy.from_file(tensors, header, str(path))
+    if not same_shapes(policy.algorithm, algorithm):
+        raise SkillweaveError(f"{path} holds other networks than {name!r} has in this run")
+    return policy, told["steps"]
 
 
 def drop_starts(run: RunDirectory, stage: str) -> None:

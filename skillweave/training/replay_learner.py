@@ -65,7 +65,8 @@ class ReplayLearner:
 
     def request(self, update: int, steps: int, progress: float) -> Request:
         """``train_freq`` rows of every environment."""
-        params = tuple(s.algorithm.acting_params(s.state, progress) for s in self.stacks)
+        explored = progress if self._acts_at_random else 1.0  # ε of DQN does not begin anew
+        params = tuple(s.algorithm.acting_params(s.state, explored) for s in self.stacks)
         rows = int(self.config.train_freq) * self._row_steps
         at_random = self._acts_at_random and steps < self._random_until
         seeds = self._seeds / "collect" / update

@@ -18,7 +18,7 @@ from skillweave.collecting.group import MakeCollector, MakeCollectors, make_coll
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
-from skillweave.runs.starts import start_of
+from skillweave.runs.starts import drop_starts, start_of
 from skillweave.seeding import Seeds
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
@@ -69,14 +69,14 @@ class OneAgent:
         stage, scene = self.stage, self.stage.scene
         spaces = scene.observation_space, scene.action_space
         self.algorithm = make_algorithm(stage.config, *spaces)
-        self.start = start_of(stage.run, stage.name, stage.name)
+        self.start = start_of(stage.run, stage.name, stage.name, self.algorithm)
         return self._beginning()
 
     def _beginning(self) -> Any:
         """What the agent is before it learns here."""
         state = self.algorithm.init([self.stage.seeds / "member" / 0])
         if self.start is not None:
-            begin_as(self.algorithm, state, self.start.policy, self.start.steps)
+            begin_as(self.algorithm, state, *self.start)
         return state
 
     def maker(self) -> MakeCollector:
@@ -205,6 +205,7 @@ def train_stage(
     """
     entry = run.stage(stage.name)
     if entry["status"] == "done":
+        drop_starts(run, stage.name)  # it may have been killed just before
         return run.load_policies(stage.name)
     known = policies or {}
     learner = make_learner(StageRun(entry, run, seeds, stage.scene(known), known))

@@ -24,7 +24,7 @@ from skillweave.envs.make import make_engine
 from skillweave.experience import Anchor
 from skillweave.ops.device import resolve_device
 from skillweave.ops.threads import torch_threads
-from skillweave.runs.starts import Learnt, start_of
+from skillweave.runs.starts import start_of
 from skillweave.runs.states import load_state
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Tick
@@ -115,7 +115,7 @@ class WovenAgents(OneAgent):
             device = resolve_device(algorithm.config.device)
             before, anchor = self._before(name), None
             if before is not None:
-                fresh = self._as_before(name, algorithm, fresh, before)
+                fresh = self._as_before(name, algorithm, fresh, *before)
                 anchor = self._anchor(name, algorithm, fresh, device, log)
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
@@ -134,18 +134,23 @@ class WovenAgents(OneAgent):
             found.counts = dict(zip(parts, told.tolist(), strict=True))
         return found
 
-    def _before(self, name: str) -> Learnt | None:
-        """What ``name`` has learnt in earlier stages, or in the run that it starts from."""
+    def _before(self, name: str) -> tuple[AgentPolicy, int] | None:
+        """What ``name`` has learnt before: in earlier stages, or in the run that it starts from.
+
+        Beside the policy, from how many steps it learnt.
+        """
         found = self.stage.policies.get(name)
         if isinstance(found, AgentPolicy):
-            return Learnt(found, "", self._steps_of(name))
-        return start_of(self.stage.run, self.stage.name, name)
+            return found, self._steps_of(name)
+        return start_of(self.stage.run, self.stage.name, name, self.algorithms[name])
 
-    def _as_before(self, name: str, algorithm: Algorithm, fresh: Any, before: Learnt) -> Any:
+    def _as_before(
+        self, name: str, algorithm: Algorithm, fresh: Any, policy: AgentPolicy, steps: int
+    ) -> Any:
         """The state that ``name`` ended its latest stage with; else its weights alone."""
         found = load_state(self.stage.run, name, fresh)
         if found is None:
-            begin_as(algorithm, fresh, before.policy, before.steps)
+            begin_as(algorithm, fresh, policy, steps)
             found = fresh
         return found
 
@@ -156,6 +161,8 @@ class WovenAgents(OneAgent):
         rollouts = algorithm.store == "rollout"
         if self.together.anchor_nats is None or decides(name) or not rollouts:
             return None
+        if not self._stages_of(name):
+            return None  # it starts from another run, to learn what this one asks for
         rate = success_rate(self._latest_stage(name))
         if rate == 0.0:
             log.tell(

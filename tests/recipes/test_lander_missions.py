@@ -287,6 +287,7 @@ def test_what_landing_pays_is_what_lunar_lander_pays():
 
 def test_a_skill_does_not_see_the_mission_and_the_selector_and_flat_agents_do():
     found, flat = missions.declare(), suite().flat
+    assert found.plain_agent().algorithm.network.sees is None
     assert {skill.algorithm for skill in found.skills} == {None}
     assert found.algorithm.network.sees == tuple(range(8))
     assert found.selector.network.sees is None

@@ -193,3 +193,4 @@ def test_skills_see_all_but_the_leg():
     everything = set(range(21))
     assert everything - set(shuttle.RUNNER.network.sees) == set(range(21)[cheetah.LEG])
     assert shuttle.SELECTOR.network.sees is None
+    assert shuttle.declare().plain_agent().algorithm.network.sees is None

@@ -114,7 +114,9 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     for skill in m.get("skills", ()):
         found |= flat(f"skills.{skill['name']}", {k: v for k, v in skill.items() if k != "name"})
     for entry in m["stages"]:
-        own = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name"}}
+        own = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}
+        # From which run differs from seed to seed.
+        own |= {f"starts.{name}": "another run" for name in entry.get("starts", {})}
         found |= flat(entry["name"], own)
     return found
 
