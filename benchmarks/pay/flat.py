@@ -55,8 +55,8 @@ class Flat(Agent):
             learnt = {} if self.starts_from is None else learnt_in(self.starts_from)
             if self.starts_from is not None:
                 begin_with(content["stages"], learnt, self.starts_from)
-            run = RunDirectory.create(path, content | {"recipe": None, "track": ()})
-            keep_starts(run, learnt)
+            keep = partial(keep_starts, learnt=learnt)
+            run = RunDirectory.create(path, content | {"recipe": None, "track": ()}, keep)
         try:
             run.begin()
             policy = training.train(self, run, (), partial(_FlatLearner, self))

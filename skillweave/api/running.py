@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skillweave.api.run import Run
-from skillweave.api.starting import StartFrom, starts
+from skillweave.api.starting import Spaces, StartFrom, starts
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.where import HERE, Where
 from skillweave.evolution.plan import Evolve, make_learner, plan
@@ -44,8 +44,8 @@ def begin(
 ) -> Run:
     """Check everything, begin a run of this manifest, and train it."""
     run_dir = as_path(run_dir, "run_dir")
-    _plan(declared, content, evolve, cluster)
-    learnt, note = starts(declared, content, start_from)
+    spaces = _plan(declared, content, evolve, cluster)
+    learnt, note = starts(declared, content, start_from, spaces)
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
@@ -92,8 +92,8 @@ def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDir
 
 def _plan(
     declared: Hierarchy | Agent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
-) -> None:
-    """Check everything, and write into a manifest's stages how they are trained."""
+) -> Spaces:
+    """Check everything, and write into a manifest's stages how they are trained; the spaces."""
     observation_space, action_space = declared.check_spaces()
     plan(content["stages"], evolve)
     check_stages(content["stages"], content["eval_every"])
@@ -112,6 +112,7 @@ def _plan(
                 assert isinstance(declared, Declaration)
                 acts = declared.chooses_from(name, action_space)
                 check_replay(stage | {"algorithm": config}, observation_space, acts)
+    return observation_space, action_space
 
 
 def go_on(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
+
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import make_algorithm
@@ -20,10 +22,12 @@ if TYPE_CHECKING:
 
 StartFrom = str | Path | Run | None
 """A run in which those who are to learn have learnt before."""
+Spaces = tuple[gym.Space[Any], gym.Space[Any]]
+"""Of observations and of actions."""
 
 
 def starts(
-    declared: Hierarchy | Agent, content: dict[str, Any], start_from: StartFrom
+    declared: Hierarchy | Agent, content: dict[str, Any], start_from: StartFrom, spaces: Spaces
 ) -> tuple[dict[str, Learnt], str]:
     """Who has learnt in another run, and what people should know of it.
 
@@ -34,7 +38,7 @@ def starts(
     where = start_from.path if isinstance(start_from, Run) else as_path(start_from, "start_from")
     learnt = learnt_in(where)
     begun = begin_with(content["stages"], learnt, where)
-    observation_space, action_space = declared.check_spaces()
+    observation_space, action_space = spaces
     for stage in content["stages"]:
         for name in stage.get("starts", {}):
             own = stage.get("algorithms", {}).get(name, stage["algorithm"])

@@ -46,6 +46,7 @@ from skillweave.types import SkillweaveError, unprefixed
 
 S = TypeVar("S")
 First = Callable[["RunDirectory"], None]
+"""Writes what a new run needs from its beginning."""
 
 
 def file_name(path: str) -> str:

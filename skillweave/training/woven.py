@@ -119,7 +119,8 @@ class WovenAgents(OneAgent):
                 anchor = self._anchor(name, algorithm, fresh, device, log)
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
-            part = self._part(name, Stack(algorithm, state_to(fresh, device)), log)
+            stack = Stack(algorithm, state_to(fresh, device))
+            part = self._part(name, stack, log, learnt_before=before is not None)
             if anchor is not None:
                 part.anchor = anchor  # type: ignore[attr-defined]
             keep_to_guide(part, self._nats(name))
@@ -174,7 +175,7 @@ class WovenAgents(OneAgent):
         # Who seldom succeeded has little to lose, and much to learn.
         return Anchor(params, torch.ones(1, device=device), self.together.anchor_nats / rate)
 
-    def _part(self, name: str, stack: Stack, log: StageLog) -> Learner:
+    def _part(self, name: str, stack: Stack, log: StageLog, *, learnt_before: bool) -> Learner:
         """The learner of the selector, or of a skill."""
         num_envs, seeds = self.stage.config.num_envs, self.stage.seeds / name
         config, row_steps = stack.algorithm.config, self.scene.steps_of_row(self._below(name))
@@ -187,7 +188,7 @@ class WovenAgents(OneAgent):
         found = ReplayLearner(
             [stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"]
         )
-        if self._before(name) is not None:
+        if learnt_before:
             found.act_from_the_start()
         return found
 
