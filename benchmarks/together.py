@@ -68,6 +68,7 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     """
     every = {
         "episode_calls": 8,
+        "call_cost": 0.001,
         "algorithm": doorkey.algorithm(ent_coef=0.03),  # with less `goal` settles too early
     }
     return Task(
@@ -156,11 +157,11 @@ def no_least_deviation(task: Task, steps: int, **how: Any) -> Hierarchy:
     return together(task, steps, **asked, **how)
 
 
-def no_imitation(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """Skills learn from each rollout once, by PPO."""
-    own: Any = together(task, steps).algorithm
-    plain = PPO(**{f.name: getattr(own, f.name) for f in fields(PPO)})
-    return together(task, steps, algorithm=plain, **how)
+def no_imitation(task: Task, steps: int, who: tuple[str, ...], **how: Any) -> Hierarchy:
+    """They learn from each rollout once, by PPO; ``who``: ``algorithm`` (skills), ``selector``."""
+    own = together(task, steps)
+    asked = {w: {f.name: getattr(getattr(own, w), f.name) for f in fields(PPO)} for w in who}
+    return together(task, steps, **{w: PPO(**plain) for w, plain in asked.items()}, **how)
 
 
 def less_entropy(task: Task, steps: int, **how: Any) -> Hierarchy:
@@ -195,9 +196,11 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(otherwise, changed={"floor": 0.3, "floor_final": 0.02}),
     "no least deviation": no_least_deviation,
-    "no imitation": no_imitation,
+    "no imitation": functools.partial(no_imitation, who=("algorithm", "selector")),
+    "selector does not imitate": functools.partial(no_imitation, who=("selector",)),
     "no floor": functools.partial(otherwise, changed={"floor": 0.0, "floor_final": 0.0}),
     "no call cost": functools.partial(together, call_cost=0.0),
+    "call cost": functools.partial(together, call_cost=0.001),
     "task advantage": functools.partial(otherwise, changed={"task_weight": 1.0}),
     "lengths": functools.partial(together, call_steps=Lengths(4, ..., 64)),
     "interrupt": functools.partial(together, interrupt=True),

@@ -115,7 +115,7 @@ def declare(
         room: MiniGrid's name of it, without version.
         engine: auto: in EnvPool, where it is installed; sync: in Python.
     """
-    # In larger rooms successes are rare at first: PPO forgets one before the next comes.
+    # In other rooms successes are rare at first: PPO forgets one before the next comes.
     learner = algorithm() if room == ROOM else algorithm(sw.SelfImitationPPO)
     settings = {
         "call_steps": 32,
@@ -123,13 +123,13 @@ def declare(
         "together_steps": steps,
         # At first any skill that may start is called: else one that may start anywhere takes all.
         "together": sw.Together(floor=1.0, floor_final=0.1),
-        # A call that ends at once is not worth as much as one that does not. Far from the goal a
-        # decision is worth 0.02. Before anything is won, a cost as large as that teaches the
-        # selector to call the skill with the longest calls.
-        "call_cost": 0.001,
+        # A call that ends at once is not worth as much as one that does not. But before anything is
+        # won, a cost teaches the selector to call the skill with the longest calls, and in other
+        # rooms that lasts long.
+        "call_cost": 0.001 if room == ROOM else 0.0,
         "greedy_skills": False,
         "algorithm": learner,
-        "selector": algorithm(),
+        "selector": learner,
     } | how
     other = {} if room == ROOM else {"room": room}
     env = sw.EnvSpec(make, other, pool=partial(many, **other), engine=engine, workers=workers)

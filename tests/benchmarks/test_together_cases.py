@@ -42,18 +42,23 @@ def test_a_case_changes_what_it_names_and_nothing_else(
 
 
 def test_who_learns_is_the_same_but_for_what_a_case_names() -> None:
-    usual, plain, errors = (
+    usual, plain, skills, errors = (
         CASES[case](TASKS["unlock-pickup"], 1_000)
-        for case in ("together", "no imitation", "no least deviation")
+        for case in ("together", "no imitation", "selector does not imitate", "no least deviation")
     )
     assert isinstance(usual, Hierarchy)
     assert isinstance(plain, Hierarchy)
+    assert isinstance(skills, Hierarchy)
     assert isinstance(errors, Hierarchy)
-    assert type(usual.algorithm) is SelfImitationPPO
-    assert type(plain.algorithm) is PPO
-    common = vars(usual.algorithm)
-    assert vars(plain.algorithm) == {k: common[k] for k in vars(PPO())}
-    assert plain.selector == usual.selector
+    assert type(usual.algorithm) is type(usual.selector) is SelfImitationPPO
+    assert type(plain.algorithm) is type(plain.selector) is PPO
+    for own, without in (
+        (usual.algorithm, plain.algorithm),
+        (usual.selector, plain.selector),
+        (usual.selector, skills.selector),
+    ):
+        assert vars(without) == {k: vars(own)[k] for k in vars(PPO())}
+    assert skills.algorithm == usual.algorithm
     assert errors.algorithm == replace(usual.algorithm, min_advantage_std=0.0)
     assert errors.selector == replace(usual.selector, min_advantage_std=0.0)
 
