@@ -145,10 +145,11 @@ def main() -> None:
     parser.add_argument("--room", default=ROOM)
     parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", type=int, default=100, help="to score it")
     parser.add_argument("--out", default="runs/doorkey")
     asked = parser.parse_args()
     run = declare(asked.room, asked.steps).train(asked.out, seed=asked.seed)
-    found = run.evaluate(100)
+    found = run.evaluate(asked.episodes)
     print(found.for_people())
     print(f"solved: {np.mean(np.array(found.returns) > 0):.0%} of the episodes")
 

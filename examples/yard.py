@@ -134,10 +134,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=300_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", type=int, default=100, help="to score it")
     parser.add_argument("--out", default="runs/yard")
     asked = parser.parse_args()
     run = declare(steps=asked.steps).train(asked.out, seed=asked.seed)
-    found = run.evaluate(100)
+    found = run.evaluate(asked.episodes)
     print(found.for_people())
     print(f"solved: {found.mean:.0%} of the episodes")
 

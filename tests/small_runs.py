@@ -138,7 +138,15 @@ def new_run(hierarchy: Hierarchy, path: Path, **options: Any) -> RunDirectory:
 
 def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> RunDirectory:
     """A new run that was interrupted by an exception at a tick."""
-    run = new_run(hierarchy, path, **options)
+    return _stopped(hierarchy, new_run(hierarchy, path, **options), tick)
+
+
+def stopped_again(hierarchy: Hierarchy, path: Path, tick: int) -> RunDirectory:
+    """A run that went on, and was interrupted again."""
+    return _stopped(hierarchy, RunDirectory.open(path), tick)
+
+
+def _stopped(hierarchy: Hierarchy, run: RunDirectory, tick: int) -> RunDirectory:
     try:
         with pytest.raises(Stopped):
             training.train(hierarchy, run, (StopAt(tick),))
@@ -176,12 +184,19 @@ class Whole:
             self._made[kind] = self.kinds[kind]().train(path, seed=3, quiet=True), path
         return self._made[kind]
 
-    def assert_resumes(self, kind: str, tick: int, path: Path) -> None:
-        """A run that is stopped at a tick, and resumed, ends as if it had not been."""
-        run = stopped_run(self.kinds[kind](), path, tick)
+    def assert_resumes(self, kind: str, ticks: tuple[int, ...], path: Path) -> None:
+        """A run that is stopped, and resumed, again and again, ends as if it had not been.
+
+        Args:
+            ticks: after how many, counted from where it went on, it is stopped.
+        """
+        run = stopped_run(self.kinds[kind](), path, ticks[0])
+        for tick in ticks[1:]:
+            assert not run.finished
+            run = stopped_again(self.kinds[kind](), path, tick)
         assert not run.finished
-        self.kinds[kind]().resume(run.path, quiet=True)
-        assert_same(run.path, self(kind)[1])
+        self.kinds[kind]().resume(path, quiet=True)
+        assert_same(path, self(kind)[1])
 
     def assert_loads(self, kind: str, file: Path) -> None:
         """What was learnt is loaded from the run, and from one file of weights."""

@@ -13,14 +13,14 @@ COUNT = 10
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 SMALL = {
     "bridge.py": ("--steps", "3000", "--out", "{folder}/run"),
-    "doorkey.py": ("--steps", "3000", "--out", "{folder}/run"),
+    "doorkey.py": ("--steps", "3000", "--episodes", "5", "--out", "{folder}/run"),
     "foreign_skills.py": ("--steps", "3000"),
     "four_rooms.py": ("--steps", "3000"),
     "nested.py": ("--steps", "5000", "--out", "{folder}/run"),
     "own_algorithm.py": ("--steps", "2000", "--out", "{folder}/run"),
     "sb3_selector.py": ("--steps", "3000", "--episodes", "2"),
     "tutorial.py": ("--scale", "0.01", "--episodes", "2", "--out", "{folder}/run"),
-    "yard.py": ("--steps", "5000", "--out", "{folder}/run"),
+    "yard.py": ("--steps", "5000", "--episodes", "5", "--out", "{folder}/run"),
 }
 """Small budgets, for those that take long."""
 NEEDS = {
