@@ -115,7 +115,8 @@ def declare(
         room: MiniGrid's name of it, without version.
         engine: auto: in EnvPool, where it is installed; sync: in Python.
     """
-    # In other rooms successes are rare at first: PPO forgets one before the next comes.
+    # Other rooms are taken to be harder: where successes are rare at first, PPO forgets one before
+    # the next comes.
     learner = algorithm() if room == ROOM else algorithm(sw.SelfImitationPPO)
     settings = {
         "call_steps": 32,
@@ -125,7 +126,8 @@ def declare(
         "together": sw.Together(floor=1.0, floor_final=0.1),
         # A call that ends at once is not worth as much as one that does not. But before anything is
         # won, a cost teaches the selector to call the skill with the longest calls, and in other
-        # rooms that lasts long.
+        # rooms that lasts long. There is none there, at the risk of calls that end at once again
+        # and again.
         "call_cost": 0.001 if room == ROOM else 0.0,
         "greedy_skills": False,
         "algorithm": learner,
@@ -145,7 +147,7 @@ def main() -> None:
     parser.add_argument("--room", default=ROOM)
     parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--episodes", type=int, default=100, help="to score it")
+    parser.add_argument("--episodes", type=int, default=100, help="that score it")
     parser.add_argument("--out", default="runs/doorkey")
     asked = parser.parse_args()
     run = declare(asked.room, asked.steps).train(asked.out, seed=asked.seed)

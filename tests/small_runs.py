@@ -142,7 +142,7 @@ def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> 
 
 
 def stopped_again(hierarchy: Hierarchy, path: Path, tick: int) -> RunDirectory:
-    """A run that went on, and was interrupted again."""
+    """A run that went on, in place and without ``Hierarchy.resume``, and was stopped again."""
     return _stopped(hierarchy, RunDirectory.open(path), tick)
 
 
@@ -188,7 +188,8 @@ class Whole:
         """A run that is stopped, and resumed, again and again, ends as if it had not been.
 
         Args:
-            ticks: after how many, counted from where it went on, it is stopped.
+            ticks: how many it makes before each stop, counted from the checkpoint that it goes on
+                from. A stop at a cut's own tick comes before its checkpoint is written.
         """
         run = stopped_run(self.kinds[kind](), path, ticks[0])
         for tick in ticks[1:]:

@@ -186,7 +186,7 @@ def whole(tmp_path_factory):
     return Whole(KINDS, tmp_path_factory)
 
 
-LATER = [("apart", (12, 10)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
+LATER = [("apart", (12, 12)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
 
 
 @pytest.mark.parametrize(("kind", "ticks"), [*((k, (3, 4)) for k in KINDS), *LATER])

@@ -85,7 +85,7 @@ def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
     declared.start_calls = told.get("start_calls")
     declared.search_steps = told.get("search_steps")
     declared.episode_calls = told.get("episode_calls", 1)
-    declared.call_cost = told.get("call_cost", declared.call_cost)
+    declared.call_cost = told.get("call_cost", 0.0)
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:

@@ -63,6 +63,19 @@ def test_who_learns_is_the_same_but_for_what_a_case_names() -> None:
     assert errors.selector == replace(usual.selector, min_advantage_std=0.0)
 
 
+def test_calls_cost_something_where_successes_come_early_or_skills_learn_apart() -> None:
+    costs = {
+        (task, case): CASES[case](TASKS[task], 1_000).call_cost  # type: ignore[union-attr]
+        for task in ("8x8", "16x16")
+        for case in ("together", "apart", "then")
+    }
+    assert [key for key, cost in costs.items() if not cost] == [("16x16", "together")]
+    for case in ("apart", "then"):
+        learner = CASES[case](TASKS["16x16"], 1_000)
+        assert isinstance(learner, Hierarchy)
+        assert type(learner.algorithm) is type(learner.selector) is PPO
+
+
 @pytest.mark.parametrize(
     ("task", "room"),
     [

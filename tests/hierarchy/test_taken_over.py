@@ -95,6 +95,7 @@ EVOLVE = Evolution(population=2, generations=2, episodes=2)
         ({}, {"call_steps": 7}, "call_steps is 6 (declared now: 7)"),
         ({}, {"start_calls": 3}, "start_calls is none (declared now: 3)"),
         ({}, {"episode_calls": 3}, "episode_calls is 1 (declared now: 3)"),
+        ({}, {"call_cost": 0.5}, "call_cost is 0 (declared now: 0.5)"),
         ({"evolve": {"left": EVOLVE}}, {}, ""),
     ],
 )
@@ -111,6 +112,7 @@ def test_settings_that_differ_are_told_where_a_run_goes_on(
     assert ("goes on with its own settings" in told) == bool(says)
     assert says in told
     assert run.info()["stages"][0]["algorithm"]["gamma"] == ON.gamma
+    assert run.hierarchy.call_cost == 0.0
     assert RunDirectory.open(tmp_path / "run").finished
 
 

@@ -127,7 +127,7 @@ def whole(tmp_path_factory):
     return Whole(KINDS, tmp_path_factory)
 
 
-STOPS = [(kind, (3, 2, 17) if "then" in kind else (3, 2)) for kind in KINDS]
+STOPS = [(kind, (3, 4, 19) if "then" in kind else (3, 4)) for kind in KINDS]
 
 
 @pytest.mark.parametrize(("kind", "ticks"), STOPS)

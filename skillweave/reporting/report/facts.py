@@ -105,12 +105,12 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
     told = (
         "kind", "learn", "call_steps", "call_lengths", "interrupt", "greedy_skills", "start_calls",
-        "search_steps", "call_cost", "reflexes", "reflexes_in_training", "cut_every", "eval_every",
+        "search_steps", "reflexes", "reflexes_in_training", "cut_every", "eval_every",
         "eval_episodes",
     )  # fmt: skip
     found |= {k: m[k] for k in told if k in m}
     if m["kind"] == "hierarchy":
-        found["episode_calls"] = m.get("episode_calls", 1)
+        found |= {"episode_calls": m.get("episode_calls", 1), "call_cost": m.get("call_cost", 0.0)}
     for skill in m.get("skills", ()):
         found |= flat(f"skills.{skill['name']}", {k: v for k, v in skill.items() if k != "name"})
     for entry in m["stages"]:
