@@ -8,7 +8,7 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SEED ?= 0
-# One process more than there are cores (tests/conftest.py); one that has no tests left takes over some.
+# One process for each core; a process that has no tests left takes some of another's.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
 .PHONY: demo test check docs torture bench figures weights smoke clean

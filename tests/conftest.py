@@ -25,15 +25,6 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
     check_shapes("returns", "losses", "distributions", "optim")
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """One process more than there are cores: a test that waits leaves its core idle."""
-    if os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS"):
-        return None  # xdist reads it
-    allowed = getattr(os, "sched_getaffinity", None)
-    return (len(allowed(0)) if allowed else os.cpu_count() or 1) + 1
-
-
 @pytest.fixture(autouse=True)
 def forget_registered() -> Iterator[None]:
     """Algorithms that a test registers are forgotten after it."""
