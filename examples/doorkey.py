@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--room", default=ROOM)
     parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--episodes", type=int, default=100, help="that score it")
+    parser.add_argument("--episodes", type=int, default=100, help="how many episodes score it")
     parser.add_argument("--out", default="runs/doorkey")
     asked = parser.parse_args()
     run = declare(asked.room, asked.steps).train(asked.out, seed=asked.seed)

@@ -134,7 +134,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=300_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--episodes", type=int, default=100, help="that score it")
+    parser.add_argument("--episodes", type=int, default=100, help="how many episodes score it")
     parser.add_argument("--out", default="runs/yard")
     asked = parser.parse_args()
     run = declare(steps=asked.steps).train(asked.out, seed=asked.seed)
