@@ -186,7 +186,7 @@ def whole(tmp_path_factory):
     return Whole(KINDS, tmp_path_factory)
 
 
-STOPS = {kind: (3, 4) for kind in KINDS}
+STOPS = dict.fromkeys(KINDS, (3, 4))
 # Their first stages are over before there is a checkpoint.
 STOPS |= {"inside, then": (11, 4), "then, inside and outside": (11, 4)}
 LATER = [("apart", (15, 10)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
