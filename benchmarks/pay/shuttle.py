@@ -48,7 +48,8 @@ def by_automaton(task: Task, skills: Policies) -> Hierarchy:
 def cells(obs: Array) -> Array:
     """How far the point is in metres, how fast in 2 metres a second, and on which leg, (n, 3)."""
     leg = obs[:, cheetah.LEG].argmax(axis=1)
-    return np.stack([np.floor(obs[:, cheetah.X]), np.floor(obs[:, cheetah.SPEED] / 2.0), leg], 1)
+    x = cheetah.in_metres(obs[:, cheetah.X])
+    return np.stack([np.floor(x), np.floor(obs[:, cheetah.SPEED] / 2.0), leg], 1)
 
 
 def suite() -> Suite:

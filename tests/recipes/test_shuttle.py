@@ -120,7 +120,8 @@ def test_the_half_cheetah_itself_has_the_papers_observations_rewards_and_length(
     for i in range(1, 1001):
         obs, reward, terminated, truncated, info = env.step(action)
         point = (2.0, -2.0)[int(obs[cheetah.LEG].argmax())]
-        assert obs[cheetah.X] == pytest.approx(info["x_position"] - point, abs=1e-5)
+        away = info["x_position"] - point
+        assert obs[cheetah.X] == pytest.approx(np.sign(away) * np.log1p(abs(away)), abs=1e-5)
         assert (truncated, terminated) == (i == 1000, False)
         if reward < 500:
             assert reward == pytest.approx(-0.15)  # 0.1·6·0.5²
@@ -129,8 +130,11 @@ def test_the_half_cheetah_itself_has_the_papers_observations_rewards_and_length(
 def test_x_is_seen_from_the_point_that_is_run_to():
     env = cheetah.Patrol(Runner([1.0, 3.0, -1.0]), (2.0, -2.0))
     seen = [env.reset()[0], *(env.step(np.zeros(6))[0] for _ in range(3))]
-    # 2 is run to from 0 and 1; from 3 and −1 it is −2.
-    assert [float(obs[cheetah.X]) for obs in seen] == [-2.0, -1.0, 5.0, 1.0]
+    # 2 is run to from 0 and 1; from 3 and −1 it is −2. Seen is the logarithm of one metre more.
+    metres = [-2.0, -1.0, 5.0, 1.0]
+    by_hand = [-np.log(3.0), -np.log(2.0), np.log(6.0), np.log(2.0)]
+    assert [obs[cheetah.X] for obs in seen] == pytest.approx(by_hand)
+    assert cheetah.in_metres(np.array([obs[cheetah.X] for obs in seen])) == pytest.approx(metres)
 
 
 class Runners:
