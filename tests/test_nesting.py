@@ -187,9 +187,9 @@ def whole(tmp_path_factory):
 
 
 STOPS = dict.fromkeys(KINDS, (3, 4))
-# Their first stages are over before there is a checkpoint.
-STOPS |= {"inside, then": (11, 4), "then, inside and outside": (11, 4)}
-LATER = [("apart", (15, 10)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
+# After (3, 4) ticks these are at the start of a stage, where there is no checkpoint yet.
+STOPS |= {"inside, then": (11, 4), "then, inside and outside": (11, 10)}
+LATER = [("apart", (15, 11)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
 
 
 @pytest.mark.parametrize(("kind", "ticks"), [*STOPS.items(), *LATER])

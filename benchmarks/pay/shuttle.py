@@ -46,9 +46,9 @@ def by_automaton(task: Task, skills: Policies) -> Hierarchy:
 
 
 def cells(obs: Array) -> Array:
-    """How far the point is in metres, how fast in 2 metres a second, and on which leg, (n, 3)."""
+    """Metres from the point, speed in 2 metres a second, and the leg, (n, 3)."""
     leg = obs[:, cheetah.LEG].argmax(axis=1)
-    x = cheetah.in_metres(obs[:, cheetah.X])
+    x = cheetah.from_log(obs[:, cheetah.X])
     return np.stack([np.floor(x), np.floor(obs[:, cheetah.SPEED] / 2.0), leg], 1)
 
 

@@ -37,6 +37,9 @@ def main() -> int:
     options = parse()
     torch.set_num_threads(1)
     preload()
+    if options.case is not None:
+        samples: Any = importlib.import_module("scripts.torture.samples")
+        samples.DRAWN = 1  # it may be one that was plotted
     tallies = []
     for part in options.parts or (SMALL if options.small else PARTS):
         if (tally := run_part(part, options)) is not None:

@@ -51,7 +51,8 @@ Play = dict[str, Any]
 """What a policy does, so that two can be compared by ==."""
 ROWS = 32
 DRAWN = 5
-"""Of cases that change what is drawn, one in so many is drawn: it takes a second."""
+"""Of cases that change a .jsonl file, one in so many is plotted, and all whose file is no file any
+more or is empty: plotting takes a second. 1: all, where one case is done again."""
 CART_SPACE = gym.make(CART).observation_space
 
 

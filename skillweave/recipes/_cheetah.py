@@ -48,11 +48,11 @@ class Route:
     def see(self, obs: Array, leg: Array) -> Array:
         """Observations (k, O) whose first number is x, with the legs (k,).
 
-        x is seen from the point that is run to, on a scale that grows with the logarithm.
+        x is seen from the point that is run to, on a logarithmic scale.
         """
         found = np.zeros((len(obs), obs.shape[1] + LEGS), np.float32)
         found[:, : obs.shape[1]] = obs
-        found[:, X] = compressed(obs[:, X] - self.points[leg])
+        found[:, X] = to_log(obs[:, X] - self.points[leg])
         found[np.arange(len(obs)), obs.shape[1] + leg] = 1.0
         return found
 
@@ -62,18 +62,18 @@ class Route:
         return gym.spaces.Box(-np.inf, np.inf, (before.shape[0] + LEGS,), np.float32)
 
 
-def compressed(metres: Array) -> Array:
-    """How far away the point is as it is seen: sign(x)·log(1 + |x|).
+def to_log(metres: Array) -> Array:
+    """``metres`` x from a point on a logarithmic scale: sign(x)·log(1 + |x|).
 
-    While it explores, a half-cheetah strays 50 metres. In metres, the last one before the point
-    would be too small to be told from the next one, once observations are normalised.
+    In metres, x varies by about 10 (its standard deviation) while skills are drawn by lot. Once
+    observations are normalised, it then hardly changes in the last two metres before the point.
     """
     found: Array = np.sign(metres) * np.log1p(np.abs(metres))
     return found
 
 
-def in_metres(seen: Array) -> Array:
-    """The inverse of ``compressed``."""
+def from_log(seen: Array) -> Array:
+    """The inverse of ``to_log``, in metres."""
     found: Array = np.sign(seen) * np.expm1(np.abs(seen))
     return found
 
@@ -165,5 +165,6 @@ def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
     def cheetah(render_mode: str | None = None) -> gym.Env[Any, Any]:
         return make(points, render_mode)
 
-    cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)})"
+    # The name says how x is seen: runs of older versions saw metres, and are not taken for these.
+    cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)}; log x)"
     return EnvSpec(cheetah, pool=partial(many, points=points))

@@ -5,10 +5,10 @@ run to x > 2, then to x < −2, and so on, for 1,000 steps. A finished round pay
 step costs 0.1·‖action‖². Their scores are returns divided by 1,000, and so are ours
 (``UNIT``): a round counts about 1, so 8.31 (their best median after 3M steps) are about nine.
 
-Observations: x as seen from the point that is run to, so that skills serve other points, too, on a
-scale that grows with the logarithm; z and the angles (1 to 8), velocities (9 to 17), the leg of the
-patrol that is run now, one-hot (18 to 20; the paper's task has two legs, so the last number is
-always 0). The selector sees all of it, skills all but the leg.
+Observations: x on a logarithmic scale (0: sign(d)·log(1 + |d|), where d = x − the point that is run
+to, so that skills serve other points, too), z and the angles (1 to 8), velocities (9 to 17), the
+leg of the patrol that is run now, one-hot (18 to 20; the paper's task has two legs, so the last
+number is always 0). The selector sees all of it, skills all but the leg.
 
     skillweave train shuttle
 

@@ -134,7 +134,11 @@ def test_x_is_seen_from_the_point_that_is_run_to():
     metres = [-2.0, -1.0, 5.0, 1.0]
     by_hand = [-np.log(3.0), -np.log(2.0), np.log(6.0), np.log(2.0)]
     assert [obs[cheetah.X] for obs in seen] == pytest.approx(by_hand)
-    assert cheetah.in_metres(np.array([obs[cheetah.X] for obs in seen])) == pytest.approx(metres)
+    assert cheetah.from_log(np.array([obs[cheetah.X] for obs in seen])) == pytest.approx(metres)
+
+
+def test_its_name_says_how_x_is_seen_so_that_runs_that_saw_metres_are_refused():
+    assert shuttle.declare().spec.name == "Shuttle(2, -2; log x)"
 
 
 class Runners:
