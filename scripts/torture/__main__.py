@@ -39,7 +39,7 @@ def main() -> int:
     preload()
     if options.case is not None:
         samples: Any = importlib.import_module("scripts.torture.samples")
-        samples.DRAWN = 1  # it may be one that was plotted
+        samples.PLOTTED = 1  # samples differ from run to run, and so does who is plotted
     tallies = []
     for part in options.parts or (SMALL if options.small else PARTS):
         if (tally := run_part(part, options)) is not None:

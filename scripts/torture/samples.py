@@ -50,9 +50,9 @@ from skillweave.types import Policy
 Play = dict[str, Any]
 """What a policy does, so that two can be compared by ==."""
 ROWS = 32
-DRAWN = 5
-"""Of cases that change a .jsonl file, one in so many is plotted, and all whose file is no file any
-more or is empty: plotting takes a second. 1: all, where one case is done again."""
+PLOTTED = 5
+"""Plotting takes a second, so of the cases that change a .jsonl file one in so many is plotted, and
+each in which the file is empty, or no file any more. 1: all are."""
 CART_SPACE = gym.make(CART).observation_space
 
 
@@ -106,7 +106,7 @@ def looked_at(run: Path, changed: str) -> None:
         for stage in found.manifest["stages"]:
             read_lineage(found, stage["name"])
         file = run.parent / changed
-        if zlib.crc32(file.read_bytes() if file.is_file() else b"") % DRAWN == 0:
+        if zlib.crc32(file.read_bytes() if file.is_file() else b"") % PLOTTED == 0:
             plot_run(found, run / "plots")
 
 
