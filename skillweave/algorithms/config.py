@@ -134,6 +134,8 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
         raise SkillweaveError(f"{where}{_not_registered(shown(kind))}")
     if issubclass(_REGISTERED[kind].config, OffPolicy):
         values.setdefault("bouts", 0.0)  # they were recorded before there were bouts
+    if issubclass(_REGISTERED[kind].config, TD3):
+        values.setdefault("action_l2", 0.0)  # likewise
     if issubclass(_REGISTERED[kind].config, (PPO, SkillCritic)):
         values.setdefault("min_advantage_std", 0.0)  # likewise
     config: AlgorithmConfig = fit(_REGISTERED[kind].config, values, file, path or kind)

@@ -217,22 +217,26 @@ class TD3(ActorCritic):
     """The smaller of two critics is the target's; else there is one critic."""
     actor_rate: float = 0.3
     """The actor's learning rate, as a share of the critics'."""
+    action_l2: float = 0.003
+    """Cost of the squared outputs of the actor before tanh, as a share of the mean size of values
+    (Andrychowicz et al. 2017, appendix A): where values say little, actions stay small."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive(self, "actor_rate")
-        number(self, "exploration_noise", "target_noise", "target_noise_clip")
+        number(self, "exploration_noise", "target_noise", "target_noise_clip", "action_l2")
         whole(self, "policy_delay")
 
     @classmethod
     def ddpg(cls, **settings: Any) -> TD3:
         """DDPG (Lillicrap et al. 2016): one critic, no delay, no noise on targets, one step.
 
-        Actor and critic learn at one rate, and there are no bouts; ``settings`` override.
+        Actor and critic learn at one rate, there are no bouts, and large outputs cost nothing;
+        ``settings`` override.
         """
         plain = {
             "twin": False, "policy_delay": 1, "target_noise": 0.0, "bouts": 0.0, "n_step": 1,
-            "exploration_noise": 0.1, "actor_rate": 1.0,
+            "exploration_noise": 0.1, "actor_rate": 1.0, "action_l2": 0.0,
         }  # fmt: skip
         return cls(**{**plain, **settings})
 

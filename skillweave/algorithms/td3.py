@@ -120,10 +120,12 @@ class TD3Algorithm(ActorCriticAlgorithm):
         state.policy_loss = loss.detach()
 
     def policy_loss(self, views: Views, state: State, inputs: Inputs) -> Tensor:
-        """``−Q₁(s, π(s))`` (eq. 15 with one critic, as in the paper), (P,)."""
+        """``−Q₁(s, π(s))`` (eq. 15 with one critic, as in the paper) and ``action_l2``, (P,)."""
         first = self.critics.views(state.critic[:, :1])
-        q = self.critics(first, inputs, self.net(views, inputs).tanh())
-        return -q.flatten(1).mean(1)
+        before_tanh = self.net(views, inputs)  # (P, B, A)
+        q = self.critics(first, inputs, before_tanh.tanh()).flatten(1)
+        size = before_tanh.square().flatten(1).mean(1)
+        return self.config.action_l2 * q.detach().abs().mean(1) * size - q.mean(1)
 
     def move_targets(self, state: State, due: bool) -> None:
         """Let the slow copies follow where it is the actor's turn, in place."""

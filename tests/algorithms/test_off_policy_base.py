@@ -58,7 +58,8 @@ RANGES: list[tuple[type, str, object, str]] = [
     (DQN, "v_max", None, "a finite number"),  # as v_min is
     (DQN, "loss", "mae", "one of huber, mse"),
     *((TD3, name, bad, "at least 0 and finite") for name in (
-        "exploration_noise", "target_noise", "target_noise_clip") for bad in (-0.1, INF, NAN)),
+        "exploration_noise", "target_noise", "target_noise_clip", "action_l2",
+    ) for bad in (-0.1, INF, NAN)),
     *((TD3, "actor_rate", bad, "positive and finite") for bad in (0.0, -1.0, INF, NAN)),
     *((kind, "policy_delay", 0, "at least 1") for kind in (TD3, SAC)),
     *((kind, "critic", (64,), r"a Network\(\) or None") for kind in (TD3, SAC, PPO)),

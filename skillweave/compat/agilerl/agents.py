@@ -131,7 +131,7 @@ class TD3(Agent):
         accelerator: Any = None, wrap: bool = True,
     ) -> None:  # fmt: skip
         # In place of what the Setting says of lr_actor alone: a share needs both rates.
-        own = {"actor_rate": lr_actor / lr_critic, "twin": self.twin, "n_step": 1}
+        own = {"actor_rate": lr_actor / lr_critic, "twin": self.twin, "n_step": 1, "action_l2": 0.0}
         own |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
         actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
         self._start(locals(), actions, **own)
