@@ -257,3 +257,10 @@ def test_a_run_that_began_before_there_were_bouts_goes_on_without_them(kind):
     assert config_from_json(told).bouts == 0.5
     del told["bouts"]
     assert config_from_json(told).bouts == 0.0
+
+
+def test_a_run_of_td3_from_before_large_outputs_cost_anything_goes_on_as_it_was():
+    told = config_to_json(TD3(action_l2=0.5))
+    assert config_from_json(told).action_l2 == 0.5
+    del told["action_l2"]
+    assert config_from_json(told).action_l2 == 0.0
