@@ -125,7 +125,8 @@ class TD3Algorithm(ActorCriticAlgorithm):
         before_tanh = self.net(views, inputs)  # (P, B, A)
         q = self.critics(first, inputs, before_tanh.tanh()).flatten(1)
         size = before_tanh.square().flatten(1).mean(1)
-        return self.config.action_l2 * q.detach().abs().mean(1) * size - q.mean(1)
+        cost: Tensor = self.config.action_l2 * q.detach().abs().mean(1) * size
+        return cost - q.mean(1)
 
     def move_targets(self, state: State, due: bool) -> None:
         """Let the slow copies follow where it is the actor's turn, in place."""

@@ -19,13 +19,13 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave.envs.checks import Watch
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks, info_rows
+from skillweave.envs.sync import SyncEnvs
 from skillweave.spaces import pack
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 
 @dataclass(slots=True)
@@ -88,34 +88,6 @@ class Engine(Protocol):
         ...
 
 
-class Pausable(gym.Wrapper[Any, Any, Any, Any]):
-    """Takes (go, action); where ``go`` is 0 the environment stands still.
-
-    This is how some environments of a Gymnasium vector are stepped and others wait.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.action_space = gym.spaces.Tuple((gym.spaces.Discrete(2), env.action_space))
-        self._obs: Any = None
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Start anew."""
-        self._obs, info = self.env.reset(seed=seed, options=options)
-        return self._obs, info
-
-    def step(self, action: Any) -> Any:
-        """Step, or stand still."""
-        go, inner = action
-        if not go:
-            return self._obs, 0.0, False, False, {}
-        # A row of a batch that has no axes is a number of numpy's, which a Box does not contain.
-        one = isinstance(self.env.action_space, gym.spaces.Discrete)
-        inner = int(inner) if one else np.asarray(inner)
-        self._obs, reward, terminated, truncated, info = self.env.step(inner)
-        return self._obs, float(reward), terminated, truncated, info
-
-
 class GymnasiumEngine:
     """Gymnasium environments, one after another in this process.
 
@@ -126,22 +98,19 @@ class GymnasiumEngine:
     """
 
     def __init__(self, make: Any, num_envs: int, name: str, first: int = 0) -> None:
-        makers = [functools.partial(_pausable, make, first + i) for i in range(num_envs)]
-        self._vector: Any = _vector_here(makers, name)
+        makers = [functools.partial(make, number=first + i) for i in range(num_envs)]
+        self._envs = SyncEnvs(makers, name)
         self.num_envs, self.steps_made = num_envs, 0
-        self.observation_space: gym.Space[Any] = self._vector.single_observation_space
-        go_and_action: Any = self._vector.single_action_space
-        self.action_space: gym.Space[Any] = go_and_action[1]
+        self.observation_space: gym.Space[Any] = self._envs.single_observation_space
+        self.action_space: gym.Space[Any] = self._envs.single_action_space
         self._masks = ActionMasks(self.action_space, num_envs)
         self._watch = Watch(name, self.observation_space, num_envs, first)
-        # A full-size action, overwritten row by row: paused rows keep whatever stands there.
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
-        self._actions: Array = np.asarray(empty)
         self._all = np.arange(num_envs)
         self._root = 0
         self._episode = np.zeros(num_envs, np.int64)  # episodes begun since the root seed
         self._seed = np.zeros(num_envs, np.int64)  # of the open episode
-        self._history = History(num_envs, self._actions)
+        self._history = History(num_envs, np.asarray(empty))
 
     def reset(self, seed: int) -> Array:
         """Start all anew from one seed; observations (N, *obs_shape)."""
@@ -202,7 +171,7 @@ class GymnasiumEngine:
 
     def close(self) -> None:
         """Release the environments."""
-        self._vector.close()
+        self._envs.close()
 
     def _next_seed(self, row: int) -> int:
         node = np.random.SeedSequence(self._root, spawn_key=(row, int(self._episode[row])))
@@ -210,59 +179,23 @@ class GymnasiumEngine:
 
     def _begin(self, ids: Array) -> Array:
         """Reset environments ``ids`` to their seeds."""
-        mask = np.zeros(self.num_envs, bool)
-        mask[ids] = True
-        each: list[int | None] = [None] * self.num_envs
-        for i in ids:
-            each[int(i)] = int(self._seed[i])
-        options = None if mask.all() else {"reset_mask": mask}
-        obs, info = self._vector.reset(seed=each, options=options)
+        obs, info = self._envs.begin(ids, self._seed[ids])
         self._masks.see(info_rows(info, ids, self.num_envs), ids)
-        return self._watch.begun(np.array(pack(self.observation_space, obs)[ids]), ids)
+        return self._watch.begun(np.array(pack(self.observation_space, obs)), ids)
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
-        go = np.ones(self.num_envs, np.int64)
-        if ids is None:
-            self._actions[:] = action
-        else:
-            go[:] = 0
-            go[ids] = 1
-            self._actions[ids] = action
+        rows = self._all if ids is None else ids
         # A copy: environments get views of it, and may keep them.
-        acted = go, self._actions.copy()
-        obs, reward, terminated, truncated, info = self._vector.step(acted)
-        obs = pack(self.observation_space, obs)
+        acted = np.array(action, self.action_space.dtype)
+        obs, reward, terminated, truncated, info = self._envs.act(rows, acted)
         if ids is not None:
-            obs, reward, terminated, truncated = (
-                x[ids] for x in (obs, reward, terminated, truncated)
-            )
             info = info_rows(info, ids, self.num_envs)
         self._masks.see(info, ids, terminated | truncated)
         truncated = truncated & ~terminated
-        raw = RawStep(obs, reward.astype(np.float32), terminated, truncated, info)
+        next_obs = pack(self.observation_space, obs)
+        raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
         self._watch.stepped(raw, ids)
         return raw
-
-
-def _pausable(make: Any, number: int) -> Pausable:
-    return Pausable(make(number=number))
-
-
-def _vector_here(makers: Sequence[Any], name: str) -> SyncVectorEnv[Any, Any]:
-    """The environments in this process.
-
-    Raises:
-        SkillweaveError: they have different spaces, or are one and the same.
-    """
-    try:
-        vector = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
-    except RuntimeError as error:
-        raise SkillweaveError(f"{name}: its environments differ: {error}") from error
-    if len({id(env.unwrapped) for env in vector.envs}) < len(makers):
-        raise SkillweaveError(
-            f"{name} gives the same environment each time; the function must make a new one"
-        )
-    return vector
 
 
 def checksums(obs: Array) -> Array:

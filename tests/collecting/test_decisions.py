@@ -125,7 +125,7 @@ def test_reflexes_override_and_the_last_one_wins(call_steps, reflexes):
     scalars = scalars_of(skills.skills, call_steps, reflexes=reflexes)
     for request in itertools.islice(requests(40), 4):
         compare(collector.collect(request), scalars)
-    for env, scalar in zip(collector.engine._vector.envs, scalars, strict=True):
+    for env, scalar in zip(collector.engine._envs.envs, scalars, strict=True):
         assert env.unwrapped.log[: len(scalar.env.log)] == scalar.env.log
     assert {a for s in scalars for _, _, a in s.env.log} == {0, 1, 2}
 
@@ -364,7 +364,7 @@ def test_a_skill_that_is_called_again_at_once_goes_on_with_its_memory():
     for t in range(14):  # a call has three steps; that in which the episode ends has two
         acting.then = np.array([0, int(3 <= t < 6)])
         collector.collect(next(asked))
-    acted = [[a for _, _, a in e.unwrapped.log] for e in collector.engine._vector.envs]
+    acted = [[a for _, _, a in e.unwrapped.log] for e in collector.engine._envs.envs]
     assert acted[0] == [*range(11), *range(3)]
     assert acted[1][:3] + acted[1][6:] == [0, 1, 2, *range(5), *range(3)]
 
@@ -568,7 +568,7 @@ def test_what_skills_draw_follows_from_the_requests_seeds(kind):
         collector = collector_of(skills)
         for request in itertools.islice(requests(20), first, first + 3):
             collector.collect(request)
-        return [e.unwrapped.log for e in collector.engine._vector.envs]
+        return [e.unwrapped.log for e in collector.engine._envs.envs]
 
     sampled = play(0, greedy=False)
     assert sampled == play(0, greedy=False)
@@ -583,7 +583,7 @@ def test_skills_go_on_sampling_anew_from_call_to_call():
     collector = collector_of(skill_set(Die, call_steps=3, greedy=False), 1)
     for request in itertools.islice(requests(30), 4):
         collector.collect(request)
-    acted = [a for _, _, a in collector.engine._vector.envs[0].unwrapped.log]
+    acted = [a for _, _, a in collector.engine._envs.envs[0].unwrapped.log]
     assert len({tuple(acted[i : i + 3]) for i in range(0, 90, 3)}) > 10
 
 

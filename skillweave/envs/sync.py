@@ -1,0 +1,75 @@
+"""Gymnasium environments in this process: those named are stepped, the others stand still."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import concatenate, create_empty_array
+
+from skillweave.types import Array, SkillweaveError
+
+
+class SyncEnvs(SyncVectorEnv[Any, Any]):
+    """Gymnasium's vector of environments; ``begin`` and ``act`` take the numbers of some of them.
+
+    ``reset`` and ``step`` of the vector itself are of all environments, and copy what they return.
+
+    Args:
+        makers: each makes one of the N environments.
+        name: what messages call them.
+
+    Raises:
+        SkillweaveError: they have different spaces, or are one and the same.
+    """
+
+    def __init__(self, makers: Sequence[Callable[[], gym.Env[Any, Any]]], name: str) -> None:
+        try:
+            super().__init__(makers, autoreset_mode=AutoresetMode.DISABLED)
+        except RuntimeError as error:
+            raise SkillweaveError(f"{name}: its environments differ: {error}") from error
+        if len({id(env.unwrapped) for env in self.envs}) < len(makers):
+            raise SkillweaveError(
+                f"{name} gives the same environment each time; the function must make a new one"
+            )
+        self._discrete = isinstance(self.single_action_space, gym.spaces.Discrete)
+
+    def begin(self, ids: Array, seeds: Array) -> tuple[Any, dict[str, Any]]:
+        """Reset environments ``ids`` (n,) to ``seeds`` (n,); n observations, and infos of all."""
+        obs: list[Any] = []
+        infos: dict[str, Any] = {}
+        for i, seed in zip(ids.tolist(), seeds, strict=True):
+            one, info = self.envs[i].reset(seed=int(seed))
+            obs.append(one)
+            infos = self._add_info(infos, info, i)
+        return self._batch(obs), infos
+
+    def act(self, ids: Array, action: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """Step environments ``ids`` (n,) by ``action`` (n, ...).
+
+        The environments may keep what they are given: it must not change afterwards.
+
+        Returns:
+            As a vector's ``step`` does, with n rows each, but infos of all environments.
+        """
+        n = len(ids)
+        obs: list[Any] = []
+        infos: dict[str, Any] = {}
+        reward, terminated, truncated = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
+        # A row of a batch that has no axes is a number of numpy's, which a Box does not contain.
+        each = action.tolist() if self._discrete else map(np.asarray, action)
+        for row, (i, one) in enumerate(zip(ids.tolist(), each, strict=True)):
+            seen, reward[row], terminated[row], truncated[row], info = self.envs[i].step(one)
+            obs.append(seen)
+            if info:
+                infos = self._add_info(infos, info, i)
+        return self._batch(obs), reward, terminated, truncated, infos
+
+    def _batch(self, obs: list[Any]) -> Any:
+        """Observations as one batch of the space's kind."""
+        space = self.single_observation_space
+        empty: Any = create_empty_array(space, len(obs), np.zeros)
+        return concatenate(space, obs, empty)
