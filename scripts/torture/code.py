@@ -9,10 +9,15 @@ from pathlib import Path
 from scripts.torture.report import Tally
 
 TESTS = Path(__file__).parents[2] / "tests"
+PORTION = 1_000
+"""Examples of one run of Hypothesis: 1,000 take two minutes, 10,000 more than twenty times that."""
 
 
 def tally(count: int, seed: int) -> Tally | None:
-    """The counts of so many examples, failures in capitals; None: there is no tests/hostile.py."""
+    """The counts of so many examples, failures in capitals; None: there is no tests/hostile.py.
+
+    They are drawn in portions, whose seeds are ``seed``, ``seed + 1``, and so on.
+    """
     sys.path.insert(0, str(TESTS))
     try:
         hostile = importlib.import_module("hostile")
@@ -23,10 +28,12 @@ def tally(count: int, seed: int) -> Tally | None:
         return None
     finally:
         sys.path.remove(str(TESTS))
-    bad: list[str] = []
     found = Tally("code", f"--seed {seed}")
-    for (_, outcome), number in hostile.run_hostile(count, seed, bad).items():
-        found.counts[outcome] += number
-    for text in bad[:20]:
-        print(f"code: {text}\n")
+    for number, done in enumerate(range(0, count, PORTION), seed):
+        bad: list[str] = []
+        drawn = hostile.run_hostile(min(PORTION, count - done), number, bad)
+        for (_, outcome), cases in drawn.items():
+            found.counts[outcome] += cases
+        for text in bad[:20]:
+            print(f"code, --seed {number}: {text}\n")
     return found
