@@ -20,6 +20,20 @@ def test_outcomes_are_counted_over_all_categories(monkeypatch, capsys):
     assert "Case(x)" in capsys.readouterr().out
 
 
+def test_many_are_drawn_in_portions_each_with_a_seed_of_its_own(monkeypatch, capsys):
+    drawn = []
+
+    def run_hostile(examples, seed, bad):
+        drawn.append((examples, seed))
+        bad.extend(["Case(y)"] if seed == 5 else [])
+        return Counter({("env", "refused"): examples})
+
+    monkeypatch.setitem(sys.modules, "hostile", SimpleNamespace(run_hostile=run_hostile))
+    assert tally(2_300, 4).counts == {"refused": 2_300}
+    assert drawn == [(1_000, 4), (1_000, 5), (300, 6)]
+    assert "--seed 5: Case(y)" in capsys.readouterr().out
+
+
 def test_without_the_module_the_part_is_left_out_and_says_so(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "hostile", None)  # an import of it fails
     assert tally(9, 4) is None
