@@ -27,6 +27,7 @@ from skillweave.envs.make import make_engine
 from skillweave.hierarchy import judging, training
 from skillweave.hierarchy.judging import settled
 from skillweave.hierarchy.nesting import every_hierarchy, every_skill
+from skillweave.runs import kept
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.call_log import CallLog
@@ -185,7 +186,8 @@ def ready(obs):
 def few_episodes():
     """Who learnt together is judged by few episodes: here it is of no matter who wins."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(judging, "EPISODES", 10)
+        for module in (judging, kept):
+            patch.setattr(module, "EPISODES", 10)
         yield
 
 

@@ -126,8 +126,7 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
         config["update_ratio"] = 1.0 / data["learn_step"]
     if kind is TD3:
         config |= {"twin": algo == "TD3", "n_step": 1, "exploration_noise": 0.1}
-        config["action_l2"] = 0.0
-        config["policy_delay"] = int(data.get("policy_freq", 2))
+        config |= {"action_l2": 0.0, "policy_delay": int(data.get("policy_freq", 2))}
         config["actor_rate"] = float(data.get("lr_actor", rate)) / float(rate)
     if kind is not DQN:
         config["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])

@@ -160,7 +160,7 @@ class GymnasiumEngine:
                 raw = self._act(action, ids)
                 obs[ids] = raw.next_obs
                 ended = ids[raw.terminated | raw.truncated]
-                if len(ended):  # nothing can be stepped beside an episode that is over
+                if len(ended):  # what was done in them afterwards is left out
                     obs[ended] = self.reset_some(ended)
                     early.append(ended)
         return obs, np.unique(np.concatenate(early))
@@ -181,13 +181,13 @@ class GymnasiumEngine:
         """Reset environments ``ids`` to their seeds."""
         obs, info = self._envs.begin(ids, self._seed[ids])
         self._masks.see(info_rows(info, ids, self.num_envs), ids)
-        return self._watch.begun(np.array(pack(self.observation_space, obs)), ids)
+        return self._watch.begun(pack(self.observation_space, obs), ids)
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
         rows = self._all if ids is None else ids
         # A copy: environments get views of it, and may keep them.
         acted = np.array(action, self.action_space.dtype)
-        obs, reward, terminated, truncated, info = self._envs.act(rows, acted)
+        obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
         if ids is not None:
             info = info_rows(info, ids, self.num_envs)
         self._masks.see(info, ids, terminated | truncated)

@@ -14,9 +14,10 @@ from skillweave.types import Array, SkillweaveError
 
 
 class SyncEnvs(SyncVectorEnv[Any, Any]):
-    """Gymnasium's vector of environments; ``begin`` and ``act`` take the numbers of some of them.
+    """Gymnasium's vector of environments, some of which begin and act.
 
-    ``reset`` and ``step`` of the vector itself are of all environments, and copy what they return.
+    ``begin`` and ``act`` stand in place of the vector's ``reset`` and ``step``, which are of all
+    environments and know nothing of these.
 
     Args:
         makers: each makes one of the N environments.
@@ -35,6 +36,7 @@ class SyncEnvs(SyncVectorEnv[Any, Any]):
             raise SkillweaveError(
                 f"{name} gives the same environment each time; the function must make a new one"
             )
+        self._over = np.zeros(self.num_envs, bool)  # whose episode has ended
         self._discrete = isinstance(self.single_action_space, gym.spaces.Discrete)
 
     def begin(self, ids: Array, seeds: Array) -> tuple[Any, dict[str, Any]]:
@@ -45,9 +47,10 @@ class SyncEnvs(SyncVectorEnv[Any, Any]):
             one, info = self.envs[i].reset(seed=int(seed))
             obs.append(one)
             infos = self._add_info(infos, info, i)
+        self._over[ids] = False
         return self._batch(obs), infos
 
-    def act(self, ids: Array, action: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+    def act(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Step environments ``ids`` (n,) by ``action`` (n, ...).
 
         The environments may keep what they are given: it must not change afterwards.
@@ -55,6 +58,7 @@ class SyncEnvs(SyncVectorEnv[Any, Any]):
         Returns:
             As a vector's ``step`` does, with n rows each, but infos of all environments.
         """
+        assert not self._over[ids].any(), "an episode that is over must be reset first"
         n = len(ids)
         obs: list[Any] = []
         infos: dict[str, Any] = {}
@@ -66,6 +70,7 @@ class SyncEnvs(SyncVectorEnv[Any, Any]):
             obs.append(seen)
             if info:
                 infos = self._add_info(infos, info, i)
+        self._over[ids] = terminated | truncated
         return self._batch(obs), reward, terminated, truncated, infos
 
     def _batch(self, obs: list[Any]) -> Any:

@@ -83,7 +83,7 @@ USUAL: dict[str, Range] = {
     "exploration_final_eps": Range(0.001, 0.2),
     "target_kl": Range(0.002, 0.1),
 }
-"""Every setting that can mutate, and its usual range; all others shape the experience itself."""
+"""Every setting that can mutate, and its usual range."""
 _MUTATED = ("learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "tau")
 """Those that do where nothing else is said: they never part a stack."""
 

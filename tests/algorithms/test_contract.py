@@ -66,7 +66,7 @@ IMITATING = SelfImitationPPO(**vars(ON), imitation_rows=64, imitation_steps=2)
 SQUASHED = replace(ON, squash_actions=True)
 STATE_STD = replace(ON, action_std="state", learning_rate=5e-3)
 LSTM = replace(ON, network=Network((16,), rnn=RNN("lstm", 8)))
-# At twice this rate it learns, and forgets again: by how processors round, not by its budget.
+# At 1e-2 it learns, and on some processors, which round otherwise, forgets again.
 GRU = replace(ON, learning_rate=5e-3, network=Network((16,), rnn=RNN("gru", 8)))
 Q = DQN(**BUFFERED)
 RAINBOW = DQN.rainbow(**BUFFERED, v_min=-2.0, v_max=0.0, n_atoms=11)

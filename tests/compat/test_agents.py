@@ -211,6 +211,7 @@ def test_settings_are_those_of_the_native_agent():
     other = KINDS["td3"](lr_actor=1e-4, lr_critic=1e-3, learn_step=5)
     assert (other.lr_critic, other.learn_step) == (1e-3, 5)
     assert other.native.member.config.actor_rate == pytest.approx(0.1)
+    assert other.native.member.config.action_l2 == 0.0  # AgileRL has no such cost
     other.learn_step = 3
     assert other.learn_step == 3
 

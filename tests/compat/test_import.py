@@ -125,6 +125,7 @@ def test_a_td3_checkpoint_has_its_critics(tmp_path):
     torch.save(data, tmp_path / "old.pt")
     assert command(tmp_path / "old.pt", "--trust") == 0
     agent = TD3.load(tmp_path / "old.safetensors")
+    assert agent.native.member.config.action_l2 == 0.0  # AgileRL has no such cost
     obs = torch.from_numpy(OBS)
     want = actor.feature_net(obs).detach()
     np.testing.assert_allclose(agent.native.numpy_actor.output(OBS), want, atol=1e-5)

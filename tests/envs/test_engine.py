@@ -146,8 +146,25 @@ def test_nested_infos_of_a_partial_step_stand_in_the_order_asked(engine, name):
 def test_an_environment_may_keep_the_action_it_was_given(engine, name):
     e = engine(name, Rememberer, num_envs=2)
     e.reset(0)
-    changes = [e.step(np.full((2, 1), a, np.float32)).reward.tolist() for a in (0.5, -0.5, -0.5)]
+    action, changes = np.zeros((2, 1), np.float32), []
+    for a in (0.5, -0.5, -0.5):
+        action[:] = a  # the caller may use its array again
+        changes.append(e.step(action).reward.tolist())
     assert changes == [[0.5, 0.5], [1.0, 1.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize("name", ["sync"])
+def test_an_episode_that_is_over_must_be_reset_and_the_others_go_on(engine, name):
+    e = engine(name, Ledger, num_envs=2)  # both episodes have two steps
+    e.reset(0)
+    both, second = np.zeros(2, np.int64), np.array([1])
+    e.step(both)
+    assert e.step(both[:1], second).terminated.all()
+    e.step(both[:1], np.array([0]))
+    with pytest.raises(AssertionError, match="must be reset first"):
+        e.step(both[:1], second)
+    e.reset_some(second)
+    e.step(both[:1], second)
 
 
 @pytest.mark.parametrize("name", ["envpool", "sync"])
