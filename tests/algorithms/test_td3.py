@@ -145,7 +145,7 @@ def test_ddpg_is_td3_without_its_additions():
     assert make(twin=False)[1].critic.shape[1] == 1
 
 
-def test_large_outputs_before_tanh_cost_a_share_of_the_size_of_values_which_is_no_way_out():
+def test_large_outputs_before_tanh_cost_a_share_of_the_size_of_values():
     algorithm, state = make(action_l2=0.5)
     leaf = state.params.clone().requires_grad_()
     inputs = algorithm.inputs(algorithm.acting_params(state), torch.ones(P, 6, 3))
@@ -154,6 +154,7 @@ def test_large_outputs_before_tanh_cost_a_share_of_the_size_of_values_which_is_n
         algorithm.critics.views(state.critic[:, :1]), inputs, algorithm.net(views, inputs).tanh()
     )
     size = algorithm.net(views, inputs).square().mean((1, 2))
+    # The size of values is held fixed: they are not made small so that outputs cost less.
     by_hand = 0.5 * q.detach().abs().mean((1, 2, 3)) * size - q.mean((1, 2, 3))
     expected = torch.autograd.grad(by_hand.sum(), leaf)[0]
     loss = algorithm.policy_loss(views, state, inputs)
