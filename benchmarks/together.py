@@ -4,11 +4,12 @@
 
 Tasks: ``8x8`` and ``16x16``, MiniGrid's DoorKey, and ``unlock-pickup``, its room with a box behind
 the door (``examples/doorkey.py``); ``bridge``, a longer chain (``examples/bridge.py``); ``yard``,
-one with continuous actions (``examples/yard.py``). Every case has the same number of environment
-steps in all. Scores are 100 episodes with a selector that samples, with seeds that training never
-saw. MiniGrid's rooms are scored in its own environments; training steps EnvPool's, or with
-``--engine sync`` MiniGrid's own. Two runs go side by side (``--processes``), so the seconds are
-those of a busy machine.
+one with continuous actions (``examples/yard.py``); ``lander``, the recipe ``lunar-lander`` apart,
+then together. Every case has the same number of environment steps in all. Scores are 100 episodes
+with seeds that training never saw: the share that is solved by a selector that samples, or on
+``lander`` the mean return of a greedy one. MiniGrid's rooms are scored in its own environments;
+training steps EnvPool's, or with ``--engine sync`` MiniGrid's own. Two runs go side by side
+(``--processes``), so the seconds are those of a busy machine.
 
 Flat agents: ``flat`` (F0), ``"skill rewards x 0.1"`` and other weights (F1), ``bonus`` (F2). With
 ``--f4`` the skills of each hierarchy are also scored without its selector: chosen by lot, and each
@@ -23,98 +24,18 @@ import functools
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from benchmarks.chains import TASKS, Task
 from benchmarks.common import cases_asked, median, report, table, workers
 from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat, with_bonus
 from benchmarks.pay.suite import Shaped
-from examples import bridge, doorkey, yard
-from skillweave import PPO, Array, Hierarchy, Lengths, Run
+from skillweave import PPO, Array, Hierarchy, Lengths, Run, Skill, Step
 
 FLOORS = {"floor": 1.0, "floor_final": 0.1}
-
-
-@dataclass(frozen=True)
-class Task:
-    """A chain of skills to learn."""
-
-    declare: Callable[..., Hierarchy]
-    algorithm: Callable[..., PPO]
-    parts: tuple[int, ...]
-    """Of the steps apart, how many parts each skill gets, and last the selector."""
-    apart: Mapping[str, Any]
-    """Settings where skills learn apart."""
-    cells: Callable[[Array], Array]
-    """Observations (n, …) to whole numbers (n, k): what ``bonus`` counts visits of."""
-    last_skill: PPO | None = None
-    """Who trains the last skill apart; None: who trains the others."""
-    has_engines: bool = True
-    """``--engine`` is about it."""
-
-
-def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart: Any) -> Task:
-    """Three skills in a room with a key and a door.
-
-    Args:
-        room: MiniGrid's name of it, without version.
-        parts: of the steps apart.
-        goal: who trains the third skill apart; None: who trains the others.
-        apart: settings where skills learn apart, beside those of every room.
-    """
-    every = {
-        "episode_calls": 8,
-        "call_cost": 0.001,  # as measured; together, rooms other than 8x8 have none
-        "algorithm": doorkey.algorithm(ent_coef=0.03),  # with less `goal` settles too early
-    }
-    return Task(
-        functools.partial(doorkey.declare, room),
-        doorkey.algorithm,
-        parts,
-        every | apart,
-        cells=lambda obs: obs.reshape(len(obs), -1),
-        last_skill=goal,
-    )
-
-
-TASKS = {
-    "8x8": _doorkey("DoorKey-8x8", (1, 2, 3, 2)),
-    "unlock-pickup": _doorkey("UnlockPickup", (1, 2, 3, 2)),
-    # `goal` succeeds once in 1,000 steps at first: it needs most of the steps, and rollouts with
-    # several successes. It learns from them without a limit on its advantages: the entropy's bonus
-    # would be larger than what the first few teach. The selector begins with a low floor: a high
-    # one hides from it what it does by itself.
-    "16x16": _doorkey(
-        "DoorKey-16x16",
-        (1, 2, 6, 1),
-        goal=replace(
-            doorkey.algorithm(ent_coef=0.015, min_advantage_std=0.0), n_steps=512, update_epochs=10
-        ),
-        start_calls=16,
-        algorithm=doorkey.algorithm(ent_coef=0.03, min_advantage_std=0.0),
-        selector=doorkey.algorithm(floor=0.1, floor_final=0.0),
-    ),
-    "bridge": Task(
-        bridge.declare,
-        bridge.algorithm,
-        (4, 5, 5, 3, 3),
-        {},
-        cells=lambda obs: obs[:, :5],
-        has_engines=False,
-    ),
-    "yard": Task(
-        yard.declare,
-        yard.algorithm,
-        (1, 1, 1, 1),
-        {},
-        cells=lambda obs: np.floor(obs / 0.1),
-        has_engines=False,
-    ),
-}
 
 
 def together(task: Task, steps: int, **how: Any) -> Hierarchy:
@@ -150,6 +71,35 @@ def then(task: Task, steps: int, **how: Any) -> Hierarchy:
     return apart(task, steps // 2, learn="apart, then together", together_steps=steps // 2, **how)
 
 
+def then_otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: Any) -> Hierarchy:
+    """``then`` with other settings of learning together (fields of ``Together``)."""
+    own = then(task, steps).together
+    return then(task, steps, together=replace(own, **changed), **how)
+
+
+def limit_ends(task: Task, steps: int, **how: Any) -> Hierarchy:
+    """A skill's value ends where its call reaches the limit, as if nothing came after it."""
+    usual = together(task, steps, **how)
+    for skill in usual.skills:
+        limits = (usual.call_steps, skill.call_steps, skill.max_steps)
+        limit = min(n for n in limits if isinstance(n, int))
+        skill.__class__ = _ended_after(limit, type(skill))
+    return usual
+
+
+def _ended_after(limit: int, kind: type[Skill]) -> type[Skill]:
+    """The same skill, but that it stops by itself after so many steps."""
+
+    class Ended(kind):  # type: ignore[misc, valid-type]
+        name = kind.name
+
+        def termination(self, step: Step) -> Array:
+            ended: Array = super().termination(step) | (step.elapsed >= limit)
+            return ended
+
+    return Ended
+
+
 def no_least_deviation(task: Task, steps: int, **how: Any) -> Hierarchy:
     """The critic's errors are made as large as a success, where hardly anything was won yet."""
     own = together(task, steps)
@@ -177,7 +127,7 @@ def flat(task: Task, steps: int, weight: float = 0.0, bonus: float = 0.0, **how:
         bonus: for the first visit of a cell (F2).
     """
     hierarchy = together(task, steps, **how)
-    agent = Flat(hierarchy.spec, hierarchy.algorithm, steps)
+    agent = Flat(hierarchy.spec, hierarchy.flat or hierarchy.algorithm, steps)
     if weight:
         weights = {skill.name: weight for skill in hierarchy.skills}
         agent.learns = Shaped(list(hierarchy.skills), weights, task_weight=1.0)
@@ -203,6 +153,10 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     # As `together` on 8x8; there `no call cost` differs, and in the other rooms this one does.
     "small call cost": functools.partial(together, call_cost=0.001),
     "task advantage": functools.partial(otherwise, changed={"task_weight": 1.0}),
+    "no task advantage": functools.partial(otherwise, changed={"task_weight": 0.0}),
+    "anchor": functools.partial(otherwise, changed={"anchor_nats": 0.05}),
+    "then, no anchor": functools.partial(then_otherwise, changed={"anchor_nats": None}),
+    "limit ends": limit_ends,
     "lengths": functools.partial(together, call_steps=Lengths(4, ..., 64)),
     "interrupt": functools.partial(together, interrupt=True),
     "flat": flat,
@@ -225,31 +179,28 @@ def one(case: str, task: str, steps: int, engine: str, f4: bool, seed: int) -> d
         else:
             run = learner.train(path, seed=seed, quiet=True)
         seconds = time.perf_counter() - started
-        score, usage = solved(run)
+        score, usage = TASKS[task].score(run)
         stages = run.info()["stages"]
-        told = {"seed": seed, "solved": score, "usage": usage, "seconds": seconds}
+        told = {"seed": seed, "score": score, "usage": usage, "seconds": seconds}
         if f4 and isinstance(same := declare(), Hierarchy):
-            told["f4"] = without_selector(run, same, Path(folder) / "lot", seed)
+            told["f4"] = without_selector(run, same, TASKS[task], Path(folder) / "lot", seed)
     told["steps"] = sum(s["steps"] + s["evaluation_steps"] for s in stages)
     kept = stages[-1].get("kept")
     return told | ({} if kept is None else {"kept": kept})
 
 
-def solved(run: Run, greedy: bool = False, **how: Any) -> tuple[float, dict[str, float]]:
-    """The share of 100 episodes that is solved, and how much each skill acted in them."""
-    found = run.evaluate(100, deterministic=greedy, **how)
-    return float(np.mean(np.array(found.returns) > 0)), found.to_json()["skill_usage"]
-
-
-def without_selector(run: Run, same: Hierarchy, path: Path, seed: int) -> dict[str, float]:
-    """F4: what skills that were learnt solve when chosen by lot, and each when called alone."""
+def without_selector(
+    run: Run, same: Hierarchy, task: Task, path: Path, seed: int
+) -> dict[str, float]:
+    """F4: the score of skills that were learnt when chosen by lot, and of each called alone."""
     policy: Any = run.policy
     for skill, learnt in zip(same.skills, policy.skills.policies, strict=True):
         skill.policy = learnt
     greedy = same.greedy_skills = policy.skills.greedy  # as in the run itself
     chosen = by_lot(same, seed).train(path, seed=seed, quiet=True)
-    alone = {s.name: solved(run, greedy, skill=s.name)[0] for s in same.skills}
-    return {"by lot": solved(chosen)[0]} | alone
+    how = {} if task.by_return else {"greedy": greedy}
+    alone = {s.name: task.score(run, skill=s.name, **how)[0] for s in same.skills}
+    return {"by lot": task.score(chosen)[0]} | alone
 
 
 def main() -> None:
@@ -258,6 +209,7 @@ def main() -> None:
     parser.add_argument("--engine", choices=("auto", "sync"), default="auto")
     parser.add_argument("--f4", action="store_true", help="score skills without the selector, too")
     asked = cases_asked(parser, CASES, steps=500_000)
+    shown = TASKS[asked.task].shown
     rows: list[tuple[str, ...]] = []
     found: dict[str, list[dict[str, Any]]] = {}
     with workers(asked.processes) as pool:
@@ -273,15 +225,15 @@ def main() -> None:
             for future in pending:
                 runs.append(future.result())
                 told = runs[-1]
-                said = f"{case}, seed {told['seed']}: {told['solved']:.0%} solved"
+                said = f"{case}, seed {told['seed']}: {shown(told['score'])}"
                 print(
                     said, told["usage"], *(told[k] for k in ("kept", "f4") if k in told), flush=True
                 )
-            solved = [r["solved"] for r in runs]
+            scores = [r["score"] for r in runs]
             seconds = f"{median(r['seconds'] for r in runs):.0f}"
             steps = f"{median(r['steps'] for r in runs):,.0f}"
-            each = " ".join(f"{x:.0%}" for x in solved)
-            rows.append((case, f"{median(solved):.0%}", f"{min(solved):.0%}", steps, seconds, each))
+            each = " ".join(map(shown, scores))
+            rows.append((case, shown(median(scores)), shown(min(scores)), steps, seconds, each))
             print(table(("case", "median", "worst", "steps", "s", "each"), rows), flush=True)
     report("together", {"task": asked.task, "seeds": asked.seeds, "cases": found})
 

@@ -1,0 +1,149 @@
+"""The tasks of ``benchmarks.together``: chains of skills, and the tutorial's three."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from examples import bridge, doorkey, yard
+from skillweave import PPO, Array, Hierarchy, Run, Together, recipes
+from skillweave.recipes import lunar_lander
+
+
+@dataclass(frozen=True)
+class Task:
+    """A chain of skills to learn."""
+
+    declare: Callable[..., Hierarchy]
+    algorithm: Callable[..., PPO]
+    parts: tuple[int, ...]
+    """Of the steps apart, how many parts each skill gets, and last the selector."""
+    apart: Mapping[str, Any]
+    """Settings where skills learn apart."""
+    cells: Callable[[Array], Array]
+    """Observations (n, …) to whole numbers (n, k): what ``bonus`` counts visits of."""
+    last_skill: PPO | None = None
+    """Who trains the last skill apart; None: who trains the others."""
+    has_engines: bool = True
+    """``--engine`` is about it."""
+    by_return: bool = False
+    """The score is the mean return of greedy episodes, not the share of episodes solved."""
+
+    def score(self, run: Run, **how: Any) -> tuple[float, dict[str, float]]:
+        """Of 100 episodes, and how much each skill acted in them.
+
+        Args:
+            how: other arguments of ``run.evaluate``, such as ``skill``.
+        """
+        if self.by_return:
+            found = run.evaluate(100, **how)
+            return found.mean, found.to_json()["skill_usage"]
+        return solved(run, **how)
+
+    def shown(self, score: float) -> str:
+        """A score in words."""
+        return f"{score:.1f}" if self.by_return else f"{score:.0%}"
+
+
+def solved(run: Run, greedy: bool = False, **how: Any) -> tuple[float, dict[str, float]]:
+    """The share of 100 episodes that is solved, and how much each skill acted in them."""
+    found = run.evaluate(100, deterministic=greedy, **how)
+    return float(np.mean(np.array(found.returns) > 0)), found.to_json()["skill_usage"]
+
+
+def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart: Any) -> Task:
+    """Three skills in a room with a key and a door.
+
+    Args:
+        room: MiniGrid's name of it, without version.
+        parts: of the steps apart.
+        goal: who trains the third skill apart; None: who trains the others.
+        apart: settings where skills learn apart, beside those of every room.
+    """
+    every = {
+        "episode_calls": 8,
+        "call_cost": 0.001,  # as measured; together, rooms other than 8x8 have none
+        "algorithm": doorkey.algorithm(ent_coef=0.03),  # with less `goal` settles too early
+    }
+    return Task(
+        functools.partial(doorkey.declare, room),
+        doorkey.algorithm,
+        parts,
+        every | apart,
+        cells=lambda obs: obs.reshape(len(obs), -1),
+        last_skill=goal,
+    )
+
+
+def _lander(steps: int, workers: int, **how: Any) -> Hierarchy:
+    """The recipe ``lunar-lander``, its skills apart at first, then all together.
+
+    Args:
+        steps: in all.
+        workers: of its environments.
+        how: other settings of the hierarchy.
+    """
+    hierarchy = recipes.load("lunar-lander")
+    *each, selector, jointly = (steps * part // 39 for part in (1, 1, 6, 2, 29))
+    for skill, own in zip(hierarchy.skills, each, strict=True):
+        skill.steps = own
+    asked: dict[str, Any] = {
+        "env": replace(hierarchy.spec, workers=workers),
+        "learn": "apart, then together",
+        "selector_steps": selector,
+        "together_steps": jointly,
+        "together": Together(task_weight=10, anchor_nats=None, floor=0.3, floor_final=0.02),
+    }
+    return replace(hierarchy, **asked | how)
+
+
+TASKS = {
+    "8x8": _doorkey("DoorKey-8x8", (1, 2, 3, 2)),
+    "unlock-pickup": _doorkey("UnlockPickup", (1, 2, 3, 2)),
+    # `goal` succeeds once in 1,000 steps at first: it needs most of the steps, and rollouts with
+    # several successes. It learns from them without a limit on its advantages: the entropy's bonus
+    # would be larger than what the first few teach. The selector begins with a low floor: a high
+    # one hides from it what it does by itself.
+    "16x16": _doorkey(
+        "DoorKey-16x16",
+        (1, 2, 6, 1),
+        goal=replace(
+            doorkey.algorithm(ent_coef=0.015, min_advantage_std=0.0), n_steps=512, update_epochs=10
+        ),
+        start_calls=16,
+        algorithm=doorkey.algorithm(ent_coef=0.03, min_advantage_std=0.0),
+        selector=doorkey.algorithm(floor=0.1, floor_final=0.0),
+    ),
+    "bridge": Task(
+        bridge.declare,
+        bridge.algorithm,
+        (4, 5, 5, 3, 3),
+        {},
+        cells=lambda obs: obs[:, :5],
+        has_engines=False,
+    ),
+    "yard": Task(
+        yard.declare,
+        yard.algorithm,
+        (1, 1, 1, 1),
+        {},
+        cells=lambda obs: np.floor(obs / 0.1),
+        has_engines=False,
+    ),
+    # Figure 3 of the hierarchies: what helps here is the task's advantage, so all cases are
+    # measured with it.
+    "lander": Task(
+        _lander,
+        functools.partial(replace, lunar_lander.SELECTOR),
+        (5, 5, 56, 12),
+        {"start_calls": None, "selector": lunar_lander.SELECTOR},
+        cells=lambda obs: np.floor(obs / 0.1),
+        has_engines=False,
+        by_return=True,
+    ),
+}
+"""By name, what is to be learnt."""
