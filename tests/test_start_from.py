@@ -29,6 +29,7 @@ from skillweave.hierarchy import training
 from skillweave.reporting.report.facts import settings
 from skillweave.runs import starts
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.runs.starts import begin_with, keep_starts, learnt_in
 from skillweave.training import stage_log
 from skillweave.training.woven_learner import WovenLearner
@@ -288,6 +289,11 @@ def test_a_copy_that_is_lost_or_anothers_is_refused(source, tmp_path):
         declare().resume(run.path, quiet=True)
     file.write_bytes(kept[:-8] + bytes(8))
     with pytest.raises(SkillweaveError, match="damaged"):
+        declare().resume(run.path, quiet=True)
+    file.write_bytes(kept)
+    tensors, header = read_tensors(file)
+    write_tensors(file, {k: 2 * v for k, v in tensors.items()}, header)  # with a right checksum
+    with pytest.raises(SkillweaveError, match="not the file that the run wrote there"):
         declare().resume(run.path, quiet=True)
     file.write_bytes(kept)
     declare().resume(run.path, quiet=True)

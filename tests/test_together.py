@@ -312,6 +312,19 @@ def test_success_is_judged_by_all_calls_of_a_stage_and_its_rate_by_the_last(
     assert success_rate(entry) == rate
 
 
+def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(tmp_path):
+    run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
+    log = StageLog("left", run, (), START)
+    log.tick(0, 64, 0.1, {"success": 0.0})
+    run.log({"success": 1.0})
+    log.done({}, {})
+    assert run.stage("left")["succeeded"] is False
+    run.log({"stage": "left", "success": "often"})
+    with pytest.raises(SkillweaveError, match=r"metrics\.jsonl, line 3.*success"):
+        log.done({}, {})
+    run.close()
+
+
 class Right(Skill):
     """The reward of the task, so that it is learnt by a flat agent as well."""
 

@@ -102,22 +102,37 @@ def leans_left(obs: Any) -> Any:
 
 @dataclass(frozen=True)
 class Kind:
-    """One training: how it is declared, and how it evolves."""
+    """One training: how it is declared, how it evolves, and in which other run it learnt before."""
 
     declare: Callable[[], Hierarchy | Agent]
     evolve: Evolution | None = None
+    before: Callable[[], Hierarchy | Agent] | None = None
 
     def train(self, run: Path) -> Run:
-        """Train from the start."""
-        return self.declare().train(run, seed=SEED, quiet=True, evolve=self.evolve)
+        """Train from the start, after the run that it starts from."""
+        other = _before(run)
+        shutil.rmtree(other, ignore_errors=True)
+        try:
+            learnt = self.before and self.before().train(other, seed=SEED, quiet=True)
+            return self.declare().train(
+                run, seed=SEED, quiet=True, evolve=self.evolve, start_from=learnt
+            )
+        finally:
+            shutil.rmtree(other, ignore_errors=True)
 
     def go_on(self, run: Path) -> Run:
         """Do what a user does after a kill: resume the run, or begin where there is none."""
         if (run / "run.json").exists():
+            shutil.rmtree(_before(run), ignore_errors=True)  # a run needs no other one to go on
             return self.declare().resume(run, quiet=True)
         if run.exists():
             shutil.rmtree(run)
         return self.train(run)
+
+
+def _before(run: Path) -> Path:
+    """Where the run is that another one starts from."""
+    return run.with_name(f"{run.name}-before")
 
 
 NET = Network((6,))
@@ -212,6 +227,9 @@ KINDS: dict[str, Kind] = {
     ),
     "together": Kind(lambda: together(1200)),
     "apart, then together, replay": Kind(lambda: together_replay(200)),
+    "start from another run": Kind(
+        lambda: together_replay(200), before=lambda: together_replay(100)
+    ),
     "population, replay": Kind(
         lambda: alone(IN_PYTHON, DQN(**REPLAYS), 300),
         evolve=Evolution(**EVOLVES),

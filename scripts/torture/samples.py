@@ -187,7 +187,7 @@ def unfinished(kind: Kind, cuts: int) -> Callable[[Path], None]:
         def stop(run: RunDirectory, *arguments: Any) -> None:
             nonlocal count
             saved(run, *arguments)
-            count += 1
+            count += run.path == folder / "run"  # not of the run that it starts from
             if count == cuts:
                 raise _Stop
 
@@ -297,6 +297,7 @@ SHORT_REPLAY = Kind(
 )
 SHORT_TOGETHER = Kind(lambda: together(576))
 SHORT_TOGETHER_REPLAY = Kind(lambda: together_replay(80))
+SHORT_START = Kind(lambda: together_replay(80), before=lambda: together_replay(80))
 SAMPLES: dict[str, Sample] = {
     "hierarchy": Sample(
         whole("skills and selector, replay"), declared(KINDS["skills and selector, replay"])
@@ -321,6 +322,9 @@ SAMPLES: dict[str, Sample] = {
     ),
     "unfinished together, replay": Sample(
         unfinished(SHORT_TOGETHER_REPLAY, 8), resumed(SHORT_TOGETHER_REPLAY), share=0.2
+    ),
+    "unfinished start from another run": Sample(
+        unfinished(SHORT_START, 1), resumed(SHORT_START), share=0.2
     ),
     "weights": Sample(
         weights("skills and selector"), weights_file(KINDS["skills and selector"])

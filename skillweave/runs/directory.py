@@ -31,6 +31,7 @@ from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import command_words
 from skillweave.runs.files import (
     TEMPORARY,
+    check_unchanged,
     make_directory,
     read_signed,
     remove,
@@ -260,11 +261,7 @@ class RunDirectory:
             raise SkillweaveError(f"{path} holds the policy of stage {shown(header['stage'])}")
         self.must_be_ours(header, path)
         known = entry.get("policies", {}).get(name, entry.get("sha256", sha256))
-        if known != sha256:
-            raise SkillweaveError(
-                f"{path} is not the file that the run wrote there: another checksum. Put it back, "
-                "or train anew"
-            )
+        check_unchanged(path, sha256, known)
         return AgentPolicy.from_file(tensors, header, str(path))
 
     def policy_path(self, stage: str, name: str | None = None) -> Path:

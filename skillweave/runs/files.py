@@ -205,6 +205,15 @@ def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     return {k: v.clone() for k, v in tensors.items()}, header_today(header), sha256
 
 
+def check_unchanged(path: Path, found: str, written: str) -> None:
+    """Raise a SkillweaveError where a file's checksum is not that of what the run wrote there."""
+    if found != written:
+        raise SkillweaveError(
+            f"{path} is not the file that the run wrote there: another checksum. Put it back, or "
+            "train anew"
+        )
+
+
 def read_header(path: Path) -> dict[str, Any]:
     """The header alone, quickly: its checksum is not compared.
 

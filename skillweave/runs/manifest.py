@@ -189,6 +189,8 @@ MetricsLine = TypedDict(
         "steps": NotRequired[Count],
         "seconds": NotRequired[Seconds],
         "return": NotRequired[float],
+        "success": NotRequired[float],
+        "eval_success": NotRequired[float],
     },
 )
 """A line of ``metrics.jsonl``: an update, with numbers of its algorithm's own."""

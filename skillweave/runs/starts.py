@@ -15,7 +15,13 @@ from typing import Any
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.directory import RunDirectory, file_name
-from skillweave.runs.files import make_directory, read_signed, read_tensors, remove, write_tensors
+from skillweave.runs.files import (
+    check_unchanged,
+    make_directory,
+    read_signed,
+    remove,
+    write_tensors,
+)
 from skillweave.types import SkillweaveError
 
 
@@ -117,15 +123,18 @@ def same_shapes(one: Algorithm, other: Algorithm) -> bool:
 
 
 def keep_starts(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
-    """Copy into a new run what its stages say that their learners begin with: all, or nothing."""
+    """Copy into a new run what its stages say that their learners begin with: all, or nothing.
+
+    The stages then say the checksums of the copies.
+    """
     try:
         for entry in run.manifest["stages"]:
-            for name in entry.get("starts", {}):
+            for name, told in entry.get("starts", {}).items():
                 tensors, header = learnt[name].policy.to_file()
                 path = _path(run, name)
                 make_directory(path.parent)
                 header |= {"starts": name} | run.place(entry["name"])
-                write_tensors(path, tensors, header, make_directories=False)
+                told["copy"] = write_tensors(path, tensors, header, make_directories=False)
     except BaseException:
         shutil.rmtree(run.path / "starts", ignore_errors=True)
         raise
@@ -149,10 +158,11 @@ def start_of(
         raise SkillweaveError(
             f"{path} is not there: {name!r} was to begin with it. Put it back, or train anew"
         )
-    tensors, header = read_tensors(path)
+    tensors, header, sha256 = read_signed(path)
     run.must_be_ours(header, path)
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise SkillweaveError(f"{path} does not hold what {name!r} is to begin with")
+    check_unchanged(path, sha256, told.get("copy", sha256))  # older runs do not say it
     policy = AgentPolicy.from_file(tensors, header, str(path))
     if not same_shapes(policy.algorithm, algorithm):
         raise SkillweaveError(f"{path} holds other networks than {name!r} has in this run")

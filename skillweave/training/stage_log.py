@@ -153,7 +153,7 @@ class StageLog:
         """Whether any call of the skill was a success; None: nobody says so."""
         if self.entry["kind"] != "skill" or self.entry.get("evolution"):
             return None
-        lines = [line for line in self.run.metrics() if line["stage"] == self.entry["name"]]
+        lines = [line for line in self.run.metrics() if line.get("stage") == self.entry["name"]]
         told = [line[k] for line in lines for k in ("success", "eval_success") if k in line]
         return max(told) > 0.0 if told else None
 
