@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from contextlib import ExitStack
+from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy
 
 
+READING: ContextVar[str | None] = ContextVar("READING", default=None)
+"""The Python file that is being read for what it declares; None: none is."""
+
+
 def begin(
     declared: Hierarchy | Agent,
     content: dict[str, Any],
@@ -43,6 +48,11 @@ def begin(
     start_from: StartFrom = None,
 ) -> Run:
     """Check everything, begin a run of this manifest, and train it."""
+    if (file := READING.get()) is not None:
+        raise SkillweaveError(
+            f"{file} trains as soon as it is read, and here it is only asked what it declares. Put "
+            "what trains, and all after it, below this line: if __name__ == '__main__':"
+        )
     run_dir = as_path(run_dir, "run_dir")
     spaces = _plan(declared, content, evolve, cluster)
     learnt, note = starts(declared, content, start_from, spaces)

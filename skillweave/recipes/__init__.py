@@ -38,9 +38,11 @@ def load(recipe: str) -> Hierarchy:
     A file's hierarchy is its variable ``hierarchy``, or its only ``Hierarchy``.
 
     Raises:
-        SkillweaveError: no such recipe (with close matches) or file, or no hierarchy in it.
+        SkillweaveError: no such recipe (with close matches) or file, no hierarchy in it, or the
+            file trains as soon as it is read.
     """
     from skillweave.api import Hierarchy
+    from skillweave.api.running import READING
 
     path = file_of(recipe)
     if path.suffix == ".py" and path.is_file():
@@ -49,7 +51,11 @@ def load(recipe: str) -> Hierarchy:
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module
-        spec.loader.exec_module(module)
+        outer = READING.set(recipe)
+        try:
+            spec.loader.exec_module(module)
+        finally:
+            READING.reset(outer)
     else:
         near = difflib.get_close_matches(recipe, names(), n=3, cutoff=0.4)
         hint = f" Did you mean {' or '.join(near)}?" if near else ""

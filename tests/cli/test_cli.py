@@ -569,6 +569,27 @@ def test_a_file_without_a_hierarchy_says_so(call: Call, tmp_path: Path) -> None:
     assert "defines no Hierarchy" in answer.err
 
 
+@pytest.mark.parametrize(
+    "line",
+    ["hierarchy.train('inner', quiet=True)", "train_agent('CartPole-v1', small, 64, 'inner')"],
+)
+def test_a_file_that_trains_as_soon_as_it_is_read_says_so(
+    call: Call, tmp_path: Path, line: str
+) -> None:
+    file = tmp_path / "script.py"
+    file.write_text(f"{PLAIN}\nfrom skillweave import train_agent\n{line}\n")
+    answer = call("train", file, "-o", "run")
+    assert answer.code == 1
+    assert f"{file} trains as soon as it is read" in " ".join(answer.err.split())
+    assert "__main__" in answer.err
+    assert not Path("inner").exists()
+    assert not Path("run").exists()
+    # The same lines below that one: the file is both a script and a recipe.
+    file.write_text(f"{PLAIN}\nif __name__ == '__main__':\n    hierarchy.train('inner')\n")
+    assert call("train", file, "-o", "run", "--scale", "0.2").code == 0
+    assert not Path("inner").exists()
+
+
 def test_a_failed_command_with_json_prints_one_json_object_too(call: Call) -> None:
     answer = call("train", "lunar-landr", "--json")
     assert answer.code == 1
