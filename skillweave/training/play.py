@@ -136,11 +136,9 @@ class SeededEpisodes:
         first, left = self._upcoming, len(self._seeds) - self._upcoming
         fresh, spare = ended[:left], ended[left:]
         self.rows = np.setdiff1d(self.rows, spare)
-        if len(ended) and len(self.rows):
-            # Those that play no more are started anew, too: an engine may step all together.
+        if len(fresh):
             self._upcoming = first + len(fresh)
-            seeds = [*self._seeds[first : self._upcoming], *([0] * len(spare))]
-            self.obs[ended] = self.engine.reset_some(ended, seeds)
+            self.obs[fresh] = self.engine.reset_some(fresh, self._seeds[first : self._upcoming])
             self._episode[fresh] = np.arange(first, self._upcoming)
             self._elapsed[fresh] = 0
         return fresh
