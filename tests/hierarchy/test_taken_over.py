@@ -116,6 +116,21 @@ def test_settings_that_differ_are_told_where_a_run_goes_on(
     assert RunDirectory.open(tmp_path / "run").finished
 
 
+def test_a_cost_of_calls_below_that_differs_is_told(tmp_path, monkeypatch, capsys):
+    def whole(cost):
+        inner = declare(skills=[Left(), Push()], call_cost=cost, name="inner")
+        return declare(skills=[Balance(), inner])
+
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt):
+            whole(0.0).train(tmp_path / "run", quiet=True)
+    capsys.readouterr()
+    whole(0.5).resume(tmp_path / "run")
+    told = "".join(capsys.readouterr())
+    assert "skills.inner.hierarchy.call_cost is 0 (declared now: 0.5)" in told
+
+
 def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
     class Left(SmallLeft):
         pass

@@ -100,6 +100,10 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     return found
 
 
+UNSAID = {"episode_calls": 1, "call_cost": 0.0}
+"""Settings of a hierarchy that its record leaves out where they are so."""
+
+
 def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     """Every setting in a run's manifest by its dotted name; not its seed, nor what came of it."""
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
@@ -110,9 +114,12 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     )  # fmt: skip
     found |= {k: m[k] for k in told if k in m}
     if m["kind"] == "hierarchy":
-        found |= {"episode_calls": m.get("episode_calls", 1), "call_cost": m.get("call_cost", 0.0)}
+        found |= {k: m.get(k, usual) for k, usual in UNSAID.items()}
     for skill in m.get("skills", ()):
-        found |= flat(f"skills.{skill['name']}", {k: v for k, v in skill.items() if k != "name"})
+        own = {k: v for k, v in skill.items() if k != "name"}
+        if "hierarchy" in own:
+            own["hierarchy"] = UNSAID | own["hierarchy"]
+        found |= flat(f"skills.{skill['name']}", own)
     for entry in m["stages"]:
         own = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}
         # From which run differs from seed to seed.
