@@ -134,8 +134,8 @@ TASKS = {
         cells=lambda obs: np.floor(obs / 0.1),
         has_engines=False,
     ),
-    # Figure 3 of the hierarchies: what helps here is the task's advantage, so all cases are
-    # measured with it.
+    # Its skills learn from ten times the task's advantage beside their own rewards, as in the table
+    # of docs/measured.md; `no task advantage` says what that is worth.
     "lander": Task(
         _lander,
         functools.partial(replace, lunar_lander.SELECTOR),
