@@ -33,26 +33,23 @@ class Task:
     by_return: bool = False
     """The score is the mean return of greedy episodes, not the share of episodes solved."""
 
-    def score(self, run: Run, **how: Any) -> tuple[float, dict[str, float]]:
+    def score(
+        self, run: Run, greedy: bool | None = None, **how: Any
+    ) -> tuple[float, dict[str, float]]:
         """Of 100 episodes, and how much each skill acted in them.
 
         Args:
+            greedy: whether who decides is greedy, or samples; None: as the task is scored.
             how: other arguments of ``run.evaluate``, such as ``skill``.
         """
-        if self.by_return:
-            found = run.evaluate(100, **how)
-            return found.mean, found.to_json()["skill_usage"]
-        return solved(run, **how)
+        greedy = self.by_return if greedy is None else greedy
+        found = run.evaluate(100, deterministic=greedy, **how)
+        won = found.mean if self.by_return else float(np.mean(np.array(found.returns) > 0))
+        return won, found.to_json()["skill_usage"]
 
     def shown(self, score: float) -> str:
         """A score in words."""
         return f"{score:.1f}" if self.by_return else f"{score:.0%}"
-
-
-def solved(run: Run, greedy: bool = False, **how: Any) -> tuple[float, dict[str, float]]:
-    """The share of 100 episodes that is solved, and how much each skill acted in them."""
-    found = run.evaluate(100, deterministic=greedy, **how)
-    return float(np.mean(np.array(found.returns) > 0)), found.to_json()["skill_usage"]
 
 
 def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart: Any) -> Task:
@@ -79,12 +76,13 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     )
 
 
-def _lander(steps: int, workers: int, **how: Any) -> Hierarchy:
+def _lander(steps: int, workers: int, engine: Any = "auto", **how: Any) -> Hierarchy:
     """The recipe ``lunar-lander``, its skills apart at first, then all together.
 
     Args:
         steps: in all.
         workers: of its environments.
+        engine: auto: EnvPool, where it is installed; sync: Gymnasium.
         how: other settings of the hierarchy.
     """
     hierarchy = recipes.load("lunar-lander")
@@ -92,7 +90,7 @@ def _lander(steps: int, workers: int, **how: Any) -> Hierarchy:
     for skill, own in zip(hierarchy.skills, each, strict=True):
         skill.steps = own
     asked: dict[str, Any] = {
-        "env": replace(hierarchy.spec, workers=workers),
+        "env": replace(hierarchy.spec, workers=workers, engine=engine),
         "learn": "apart, then together",
         "selector_steps": selector,
         "together_steps": jointly,
@@ -142,7 +140,6 @@ TASKS = {
         (5, 5, 56, 12),
         {"start_calls": None, "selector": lunar_lander.SELECTOR},
         cells=lambda obs: np.floor(obs / 0.1),
-        has_engines=False,
         by_return=True,
     ),
 }

@@ -316,11 +316,12 @@ def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(t
     run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
     log = StageLog("left", run, (), START)
     log.tick(0, 64, 0.1, {"success": 0.0})
-    run.log({"success": 1.0})
+    for other in (1.0, True, None):
+        run.log({"success": other})
     log.done({}, {})
     assert run.stage("left")["succeeded"] is False
     run.log({"stage": "left", "success": "often"})
-    with pytest.raises(SkillweaveError, match=r"metrics\.jsonl, line 3.*success"):
+    with pytest.raises(SkillweaveError, match=r"metrics\.jsonl: 'left' has .* 'often', .* resume"):
         log.done({}, {})
     run.close()
 

@@ -30,7 +30,10 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.types import SkillweaveError
 
-NAMES = ("skills and selector", "replay of continuous actions", "population, replay")
+NAMES = (
+    "skills and selector", "replay of continuous actions", "population, replay",
+    "start from another run",
+)  # fmt: skip
 """Together they write every file that a training writes."""
 FAULTS = ("no space, once", "no space from here on", "an error, once", "death")
 SENTENCE = 3
@@ -113,7 +116,7 @@ def train_badly(kind: Kind, run: Path, operation: int | None, fault: str) -> int
 
     def met(what: str, path: Any) -> bool:
         """Whether an operation fails; may not come back."""
-        if isinstance(path, int) or not str(os.fspath(path)).startswith(str(run)):
+        if isinstance(path, int) or not Path(os.fspath(path)).is_relative_to(run):
             return False
         number = len(seen)
         name = Path(os.path.relpath(path, run)).name.lstrip(".").split(".")[0]
@@ -202,7 +205,7 @@ def position(run: Path) -> tuple[int, int, int]:
     found = RunDirectory.open(run)
     done = [p["name"] for p in found.manifest["stages"] if p["status"] == "done"]
     for name in done:
-        found.load_policy(name)
+        found.load_policies(name)
     for file in ("checkpoint", "checkpoint.previous"):
         try:
             header = read_tensors(run / f"{file}.safetensors")[1]

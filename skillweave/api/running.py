@@ -37,6 +37,17 @@ READING: ContextVar[str | None] = ContextVar("READING", default=None)
 """The Python file that is being read for what it declares; None: none is."""
 
 
+def _may_train() -> None:
+    """Raise a SkillweaveError while a Python file is only read for what it declares."""
+    if (file := READING.get()) is not None:
+        raise SkillweaveError(
+            f"{file} trains as soon as it is read, and here it is only asked what it declares. Put "
+            "what trains inside a block that begins with: if __name__ == '__main__':\nIf a skill "
+            "is made of what it trains, train that once in another file, and load it here: "
+            "Agent(...).load(directory).as_skill(name)"
+        )
+
+
 def begin(
     declared: Hierarchy | Agent,
     content: dict[str, Any],
@@ -48,11 +59,7 @@ def begin(
     start_from: StartFrom = None,
 ) -> Run:
     """Check everything, begin a run of this manifest, and train it."""
-    if (file := READING.get()) is not None:
-        raise SkillweaveError(
-            f"{file} trains as soon as it is read, and here it is only asked what it declares. Put "
-            "what trains, and all after it, below this line: if __name__ == '__main__':"
-        )
+    _may_train()
     run_dir = as_path(run_dir, "run_dir")
     spaces = _plan(declared, content, evolve, cluster)
     learnt, note = starts(declared, content, start_from, spaces)
@@ -134,6 +141,8 @@ def go_on(
     note: str = "",
 ) -> Run:
     """Train what is left of a run; ``note``: what people should know first."""
+    if not run.finished:
+        _may_train()
     must_be_own(run.path)
     with ExitStack() as stack:
         stack.callback(run.close)

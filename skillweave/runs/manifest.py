@@ -105,6 +105,8 @@ class Start(TypedDict):
     """Environment steps that it learnt from there."""
     run: str | None
     """That run's ``id``."""
+    copy: NotRequired[str]
+    """Checksum of this run's copy; older runs do not say it."""
 
 
 class StageEntry(TypedDict):
@@ -189,8 +191,6 @@ MetricsLine = TypedDict(
         "steps": NotRequired[Count],
         "seconds": NotRequired[Seconds],
         "return": NotRequired[float],
-        "success": NotRequired[float],
-        "eval_success": NotRequired[float],
     },
 )
 """A line of ``metrics.jsonl``: an update, with numbers of its algorithm's own."""

@@ -8,6 +8,8 @@ from typing import Any, Protocol, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.reading import shown
+from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.starts import drop_starts
 from skillweave.runs.states import drop_states, learns_again, save_state
@@ -155,6 +157,12 @@ class StageLog:
             return None
         lines = [line for line in self.run.metrics() if line.get("stage") == self.entry["name"]]
         told = [line[k] for line in lines for k in ("success", "eval_success") if k in line]
+        if wrong := [value for value in told if type(value) not in (int, float)]:
+            raise SkillweaveError(
+                f"{self.run.path / 'metrics.jsonl'}: {self.entry['name']!r} has a share of calls "
+                f"that succeeded of {shown(wrong[0])}, which is no number; remove that line, then "
+                f"{command_words('resume', self.run)}"
+            )
         return max(told) > 0.0 if told else None
 
 

@@ -9,40 +9,74 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.chains import TASKS
+from benchmarks.chains import TASKS, Task
 from benchmarks.pay.flat import Flat
-from benchmarks.together import CASES, one, without_selector
+from benchmarks.together import CASES, check_case, one, without_selector
 from examples.bridge import AXE, BRIDGE, RIVER, WIDTH, WOOD, WORK, GetAxe, River, declare
 from examples.doorkey import ROOM
-from skillweave import PPO, Hierarchy, SelfImitationPPO, Step
+from skillweave import PPO, Hierarchy, SelfImitationPPO, SkillweaveError, Step
+from skillweave.hierarchy.training import manifest
+
+OF_ALL_ALIKE = ("no least deviation", "no imitation", "limit ends")
 
 
-@pytest.mark.parametrize("task", ["bridge", "lander"])
-@pytest.mark.parametrize("case", CASES)
-def test_every_case_has_the_steps_that_are_asked(case: str, task: str) -> None:
+@pytest.mark.parametrize(
+    ("task", "case"),
+    [("bridge", case) for case in CASES]
+    + [("lander", case) for case in CASES if case not in OF_ALL_ALIKE],
+)
+def test_every_case_has_the_steps_that_are_asked(task: str, case: str) -> None:
     learner = CASES[case](TASKS[task], 10_000)
     steps = learner.total_steps if isinstance(learner, Hierarchy) else learner.steps
     assert 9_980 <= steps <= 10_000
 
 
-@pytest.mark.parametrize("task", ["8x8", "bridge", "yard", "lander"])
+CHAINS = ("8x8", "bridge", "yard")
+EVERY = (*CHAINS, "lander")
+
+
 @pytest.mark.parametrize(
-    ("case", "changed"),
+    ("case", "tasks", "usual", "changed"),
     [
-        ("low floor", {"floor": 0.3, "floor_final": 0.02}),
-        ("no floor", {"floor": 0.0, "floor_final": 0.0}),
-        ("task advantage", {"task_weight": 1.0}),
-        ("no task advantage", {"task_weight": 0.0}),
-        ("anchor", {"anchor_nats": 0.05}),
+        ("low floor", CHAINS, "together", {"floor": 0.3, "floor_final": 0.02}),
+        ("no floor", EVERY, "together", {"floor": 0.0, "floor_final": 0.0}),
+        ("task advantage", EVERY, "together", {"task_weight": 1.0}),
+        ("no task advantage", ("lander",), "together", {"task_weight": 0.0}),
+        ("anchor", ("lander",), "together", {"anchor_nats": 0.05}),
+        ("then, no anchor", CHAINS, "then", {"anchor_nats": None}),
     ],
 )
 def test_a_case_changes_what_it_names_and_nothing_else(
-    task: str, case: str, changed: dict[str, Any]
+    case: str, tasks: tuple[str, ...], usual: str, changed: dict[str, Any]
 ) -> None:
-    usual, other = (CASES[name](TASKS[task], 1_000) for name in ("together", case))
-    assert isinstance(usual, Hierarchy)
-    assert isinstance(other, Hierarchy)
-    assert other.together == replace(usual.together, **changed)
+    for task in tasks:
+        before, after = (CASES[name](TASKS[task], 1_000) for name in (usual, case))
+        assert isinstance(before, Hierarchy)
+        assert isinstance(after, Hierarchy)
+        assert before.together != after.together
+        before.together = replace(before.together, **changed)
+        assert manifest(after, seed=0, flat=False) == manifest(before, seed=0, flat=False)
+
+
+@pytest.mark.parametrize(
+    ("task", "case", "says"),
+    [
+        ("8x8", "anchor", "'anchor' is the same as 'together' on 8x8"),
+        ("16x16", "no call cost", "'no call cost' is the same as 'together' on 16x16"),
+        ("lander", "low floor", "'low floor' is the same as 'together' on lander"),
+        ("lander", "then, no anchor", "is the same as 'then' on lander"),
+        ("lander", "no imitation", "'landing' has an algorithm of its own"),
+        ("lander", "limit ends", "skills that learn apart have no calls"),
+    ],
+)
+def test_a_case_that_says_nothing_on_a_task_is_refused(task: str, case: str, says: str) -> None:
+    with pytest.raises(SkillweaveError, match=says):
+        check_case(case, task)
+
+
+@pytest.mark.parametrize("case", ["together", "limit ends", "then, no anchor", "flat", "bonus"])
+def test_a_case_that_says_something_is_not(case: str) -> None:
+    check_case(case, "bridge")
 
 
 def test_a_skills_value_ends_at_the_limit_of_its_calls() -> None:
@@ -59,6 +93,7 @@ def test_a_skills_value_ends_at_the_limit_of_its_calls() -> None:
         ]
         assert [bool(skill.termination(step)) for step in at] == [False, False]
         assert [bool(same.termination(step)) for step in at] == [False, True]
+        assert not any(same.success(step) for step in at), "it has not done its work"
 
 
 def test_the_lander_is_what_the_measured_table_says() -> None:
@@ -186,3 +221,16 @@ def test_skills_are_scored_without_their_selector(tmp_path: Path) -> None:
 def test_a_hierarchys_skills_are_scored_when_asked() -> None:
     found = one("together", "bridge", 4_000, "auto", f4=True, seed=0)
     assert list(found["f4"]) == ["by lot", "get_axe", "chop", "build", "cross"]
+
+
+def test_skills_alone_are_scored_as_the_run_plays_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def score(task: Task, run: Any, greedy: bool | None = None, **how: Any) -> tuple[float, Any]:
+        asked.append((greedy, how.get("skill")))
+        return 0.0, {}
+
+    monkeypatch.setattr(Task, "score", score)
+    found = one("together", "lander", 4_000, "auto", f4=True, seed=0)
+    kept = found["kept"]["kept"] != "sampled"
+    assert asked[1:] == [*((kept, s) for s in ("stabilize", "center", "landing")), (None, None)]

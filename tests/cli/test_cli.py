@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_runs import interrupt_at_checkpoint
 
 from skillweave import recipes
 from skillweave.cli import main
@@ -584,10 +585,26 @@ def test_a_file_that_trains_as_soon_as_it_is_read_says_so(
     assert "__main__" in answer.err
     assert not Path("inner").exists()
     assert not Path("run").exists()
-    # The same lines below that one: the file is both a script and a recipe.
+    # The same lines in that block: the file is both a script and a recipe.
     file.write_text(f"{PLAIN}\nif __name__ == '__main__':\n    hierarchy.train('inner')\n")
     assert call("train", file, "-o", "run", "--scale", "0.2").code == 0
     assert not Path("inner").exists()
+
+
+def test_a_file_that_resumes_a_run_as_soon_as_it_is_read_may_do_so_only_if_that_is_finished(
+    call: Call, trained: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "script.py"
+    file.write_text(PLAIN + "\nhierarchy.resume('run', quiet=True)\n")
+    shutil.copytree(trained.plain_run, "run")
+    assert call("info", file).code == 0
+    shutil.rmtree("run")
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        assert call("train", trained.plain, "-o", "run").code != 0
+    answer = call("info", file)
+    assert answer.code == 1
+    assert "trains as soon as it is read" in " ".join(answer.err.split())
 
 
 def test_a_failed_command_with_json_prints_one_json_object_too(call: Call) -> None:

@@ -91,6 +91,21 @@ def test_the_result_does_not_depend_on_how_many_environments_stand_side_by_side(
     assert len(set(results[0].lengths)) > 3
 
 
+def test_no_episode_begins_that_nobody_asked_for():
+    begun = []
+
+    class Counted(gym.Wrapper):
+        def reset(self, **how):
+            begun.append(how["seed"])
+            return super().reset(**how)
+
+    spec = EnvSpec("CartPole-v1", wrappers=(Counted,))
+    found = evaluate(agent("CartPole-v1"), spec, episodes=7, num_envs=3)
+    assert len(set(found.lengths)) > 1, "they end one after the other"
+    asked = begun[3:]  # the first three, when they are made, are no episodes
+    assert sorted(asked) == list(range(FIRST_SEED, FIRST_SEED + 7))
+
+
 def test_more_episodes_begin_with_the_same_ones_and_another_seed_has_others():
     policy, spec = agent("CartPole-v1"), EnvSpec("CartPole-v1")
     few, many = (evaluate(policy, spec, episodes=n, num_envs=4).returns for n in (6, 15))
