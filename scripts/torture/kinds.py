@@ -111,7 +111,6 @@ class Kind:
     def train(self, run: Path) -> Run:
         """Train from the start, after the run that it starts from."""
         other = _before(run)
-        shutil.rmtree(other, ignore_errors=True)
         try:
             learnt = self.before and self.before().train(other, seed=SEED, quiet=True)
             return self.declare().train(
@@ -122,8 +121,8 @@ class Kind:
 
     def go_on(self, run: Path) -> Run:
         """Do what a user does after a kill: resume the run, or begin where there is none."""
+        shutil.rmtree(_before(run), ignore_errors=True)  # a run needs no other one to go on
         if (run / "run.json").exists():
-            shutil.rmtree(_before(run), ignore_errors=True)  # a run needs no other one to go on
             return self.declare().resume(run, quiet=True)
         if run.exists():
             shutil.rmtree(run)

@@ -13,6 +13,7 @@ from skillweave.hierarchy.training import manifest
 from skillweave.hierarchy.weights import adopt_calls, check_selector
 from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import UNSAID
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
 
@@ -84,8 +85,8 @@ def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
     declared.reflexes_in_training = told.get("reflexes_in_training", True)
     declared.start_calls = told.get("start_calls")
     declared.search_steps = told.get("search_steps")
-    declared.episode_calls = told.get("episode_calls", 1)
-    declared.call_cost = told.get("call_cost", 0.0)
+    for name, usual in UNSAID.items():
+        setattr(declared, name, told.get(name, usual))
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:

@@ -22,6 +22,7 @@ from skillweave.ops.threads import torch_threads
 from skillweave.runs.command_words import command_words
 from skillweave.runs.copies import keep_policy, recorded_policy
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import UNSAID
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
@@ -206,7 +207,6 @@ def _hierarchy_entry(declaration: Declaration, *, woven: bool) -> dict[str, Any]
         "reflexes": [r.name for r in declaration.reflexes],
         "start_calls": declaration.start_calls,
         "search_steps": declaration.search_steps,
-        **({"episode_calls": calls} if (calls := declaration.episode_calls) > 1 else {}),
-        **({"call_cost": declaration.call_cost} if declaration.call_cost else {}),
+        **{k: v for k, usual in UNSAID.items() if (v := getattr(declaration, k)) != usual},
         **_selector_entry(declaration),
     }

@@ -57,8 +57,11 @@ class NestedEntry(TypedDict):
     start_calls: NotRequired[int | None]
     search_steps: NotRequired[int | None]
     episode_calls: NotRequired[Positive]
-    """Absent: 1."""
     call_cost: NotRequired[float]
+
+
+UNSAID = {"episode_calls": 1, "call_cost": 0.0}
+"""Fields of a ``NestedEntry`` that are absent where they have these values."""
 
 
 class SkillEntry(TypedDict):

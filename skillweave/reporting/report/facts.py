@@ -9,6 +9,7 @@ from skillweave.reporting.report.skills_table import number
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import kept_words
+from skillweave.runs.manifest import UNSAID
 from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
@@ -100,10 +101,6 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     return found
 
 
-UNSAID = {"episode_calls": 1, "call_cost": 0.0}
-"""Settings of a hierarchy that its record leaves out where they are so."""
-
-
 def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     """Every setting in a run's manifest by its dotted name; not its seed, nor what came of it."""
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
@@ -114,7 +111,7 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     )  # fmt: skip
     found |= {k: m[k] for k in told if k in m}
     if m["kind"] == "hierarchy":
-        found |= {k: m.get(k, usual) for k, usual in UNSAID.items()}
+        found |= UNSAID | {k: m[k] for k in UNSAID if k in m}
     for skill in m.get("skills", ()):
         own = {k: v for k, v in skill.items() if k != "name"}
         if "hierarchy" in own:
