@@ -8,6 +8,7 @@ import sys
 import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -88,9 +89,23 @@ def is_own_code(module: ModuleType) -> bool:
     top = name.partition(".")[0]
     if top == "skillweave":
         return False
-    if PathFinder.find_spec(top) is None:
-        return True  # loaded from its file, as recipes are: nobody else finds it by its name
+    # One that was loaded from its file, as recipes are, is found by its name by nobody else.
+    return not _is_found(top, tuple(sys.path)) or not _is_installed(file)
+
+
+# There are thousands of modules, and a sweep asks of all of them for each of its runs.
+
+
+@cache
+def _is_found(name: str, path: tuple[str, ...]) -> bool:
+    """Whether a module of this name is found in ``path``."""
+    return PathFinder.find_spec(name, path) is not None
+
+
+@cache
+def _is_installed(file: str) -> bool:
+    """Whether a file lies where packages are installed, here or anywhere."""
     path = Path(file).resolve()
     if _PACKAGES & set(path.parts):
-        return False
-    return not any(path.is_relative_to(place) for place in _INSTALLED)
+        return True
+    return any(path.is_relative_to(place) for place in _INSTALLED)
