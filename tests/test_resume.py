@@ -422,8 +422,14 @@ LEARNERS = {
 }
 
 
+FEWER_STEPS = {"skill_steps=600": "skill_steps=300", "selector_steps=1500": "selector_steps=600"}
+
+
 def recipe_of(folder: Path, learner: str, workers: int) -> str:
     text = RECIPE.replace("ENGINE", "sync").replace("workers=1", f"workers={workers}")
+    for old, new in FEWER_STEPS.items():
+        assert old in text
+        text = text.replace(old, new)
     text = text.replace(
         "import Network, PPO,", "import DQN, RNN, SAC, SelfImitationPPO, Network, PPO,"
     )
