@@ -8,8 +8,10 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SEED ?= 0
-# One process for each core; a process that has no tests left takes some of another's.
-PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
+# One process for each core, and one more, as some tests wait for other processes; a process that
+# has no tests left takes some of another's.
+WORKERS := $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .PHONY: demo test check docs torture bench figures weights smoke clean
 

@@ -3,13 +3,15 @@
     python -m benchmarks.reading
 
 One round of training (collect, keep, learn) is watched: which files of the library have functions
-that run, how many lines these files have, and how many lines the functions have that ran.
+that run, how many lines these files have, and how many lines the functions have that ran. Beside
+it stands the walk through them that ``docs/one-gradient.md`` proposes.
 """
 
 from __future__ import annotations
 
 import inspect
 import json
+import re
 import sys
 import threading
 from collections.abc import Callable
@@ -18,7 +20,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import skillweave
-from skillweave import PPO, SAC, EnvSpec
+from skillweave import PPO, SAC, EnvSpec, SkillweaveError
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.group import Collectors
@@ -30,6 +32,11 @@ from skillweave.training.replay_learner import learner_of
 from skillweave.training.scene import skill_scene
 
 ROOT = Path(skillweave.__file__).parent
+PAGE = Path(__file__).parents[1] / "docs" / "one-gradient.md"
+ROUNDS: dict[str, tuple[str, Any]] = {
+    "PPO": ("CartPole-v1", PPO(num_envs=4, n_steps=32)),
+    "SAC": ("Pendulum-v1", SAC(num_envs=4, learning_starts=8)),
+}
 
 
 def one_round(env: str, config: Any, steps: int) -> Callable[[], None]:
@@ -65,24 +72,62 @@ def watched(run: Callable[[], None]) -> set[CodeType]:
     return found
 
 
+def walk(algorithm: str) -> dict[str, list[str]]:
+    """By file, the functions that the page names for this algorithm."""
+    section = PAGE.read_text().split(f"## {algorithm}")[1].split("\n## ")[0]
+    found: dict[str, list[str]] = {}
+    for line in section.splitlines():
+        if line.startswith("| ") and line.split("|")[1].strip().isdigit():
+            _, _, file, functions, *_ = line.split("|")
+            found.setdefault(file.strip(" `"), []).extend(re.findall(r"`([^`]+)`", functions))
+    return found
+
+
+def lines_of(codes: set[CodeType]) -> int:
+    """The lines of functions, docstrings included; of one inside another, once."""
+    return sum(len(inspect.getsourcelines(c)[0]) for c in codes if "<" not in c.co_qualname)
+
+
+def file_of(code: CodeType) -> str:
+    """Relative to the package."""
+    return Path(code.co_filename).relative_to(ROOT).as_posix()
+
+
+def on_the_walk(algorithm: str, codes: set[CodeType]) -> set[CodeType]:
+    """Those of the functions that ran which the page names.
+
+    Raises:
+        SkillweaveError: it names one that did not run.
+    """
+    by_name = {(file_of(c), c.co_qualname): c for c in codes}
+    named = {(file, name) for file, names in walk(algorithm).items() for name in names}
+    if missing := named - by_name.keys():
+        listed = ", ".join(f"{name} in {file}" for file, name in sorted(missing))
+        raise SkillweaveError(f"{PAGE.name}, {algorithm}: these did not run: {listed}")
+    return {by_name[place] for place in named}
+
+
+def counted(codes: set[CodeType], sizes: dict[str, int]) -> dict[str, int]:
+    """How many files and lines these functions are; ``sizes`` are the lines of whole files."""
+    files = {file_of(c) for c in codes}
+    whole = sum(sizes[file] for file in files)
+    return {"files": len(files), "lines": lines_of(codes), "of whole files": whole}
+
+
 def main() -> None:
     figures = {}
-    for name, env, config in (
-        ("PPO", "CartPole-v1", PPO(num_envs=4, n_steps=32)),
-        ("SAC", "Pendulum-v1", SAC(num_envs=4, learning_starts=8)),
-    ):
+    for name, (env, config) in ROUNDS.items():
         codes = watched(one_round(env, config, 256))
-        files = sorted({c.co_filename for c in codes})
-        named = {
-            Path(f).relative_to(ROOT).as_posix(): len(Path(f).read_text().splitlines())
-            for f in files
-        }
-        ran = sum(len(inspect.getsourcelines(c)[0]) for c in codes if not c.co_name.startswith("<"))
-        figures[name] = {"files": len(named), "lines": sum(named.values()), "of functions": ran}
-        for file, lines in named.items():
+        sizes = {f: len((ROOT / f).read_text().splitlines()) for f in {file_of(c) for c in codes}}
+        parts = {"walk": on_the_walk(name, codes), "all that runs": codes}
+        figures[name] = {part: counted(found, sizes) for part, found in parts.items()}
+        for file, lines in sorted(sizes.items()):
             print(f"{name}  {lines:4}  {file}")
     print(json.dumps(figures))
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except SkillweaveError as error:
+        sys.exit(f"error: {error}")
