@@ -108,11 +108,14 @@ def _ended_after(limit: int, kind: type[Skill]) -> type[Skill]:
     return Ended
 
 
-def no_least_deviation(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """The critic's errors are made as large as a success, where hardly anything was won yet."""
-    own = _alike(together(task, steps))
-    asked = {k: replace(getattr(own, k), min_advantage_std=0.0) for k in ("algorithm", "selector")}
-    return together(task, steps, **asked, **how)
+def learnt_otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: Any) -> Hierarchy:
+    """Skills and selector with other settings of their algorithms."""
+    found = together(task, steps, **how)
+    skills: list[tuple[Any, str]] = [(skill, "algorithm") for skill in found.skills]
+    for who, name in [*skills, (found, "algorithm"), (found, "selector")]:
+        if (own := getattr(who, name)) is not None:
+            setattr(who, name, replace(own, **changed))
+    return found
 
 
 def no_imitation(task: Task, steps: int, who: tuple[str, ...], **how: Any) -> Hierarchy:
@@ -166,7 +169,12 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "large call cost": functools.partial(apart, call_cost=0.01),
     "low floor": functools.partial(otherwise, changed={"floor": 0.3, "floor_final": 0.02}),
-    "no least deviation": no_least_deviation,
+    # The critic's errors are made as large as a success, where hardly anything was won yet.
+    "no least deviation": functools.partial(learnt_otherwise, changed={"min_advantage_std": 0.0}),
+    # In units of reward for all, instead of each learner's in those of its own deviation.
+    "one advantage scale": functools.partial(
+        learnt_otherwise, changed={"normalize_advantage": False}
+    ),
     "no imitation": functools.partial(no_imitation, who=("algorithm", "selector")),
     "selector does not imitate": functools.partial(no_imitation, who=("selector",)),
     "no floor": functools.partial(otherwise, changed={"floor": 0.0, "floor_final": 0.0}),
