@@ -26,6 +26,18 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
     check_shapes("returns", "losses", "distributions", "optim")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def few_episodes() -> Iterator[None]:
+    """Who learnt together is judged by few episodes: here it is of no matter who wins."""
+    from skillweave.hierarchy import judging
+    from skillweave.runs import kept
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (judging, kept):
+            patch.setattr(module, "EPISODES", 10)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def forget_registered() -> Iterator[None]:
     """Algorithms that a test registers are forgotten after it."""

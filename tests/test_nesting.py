@@ -24,10 +24,9 @@ from skillweave import (
 )
 from skillweave.cli import main
 from skillweave.envs.make import make_engine
-from skillweave.hierarchy import judging, training
+from skillweave.hierarchy import training
 from skillweave.hierarchy.judging import settled
 from skillweave.hierarchy.nesting import every_hierarchy, every_skill
-from skillweave.runs import kept
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.call_log import CallLog
@@ -180,15 +179,6 @@ def far(obs):
 def ready(obs):
     """A selector that is not trained."""
     return np.where(np.abs(obs[:, 2]) < 0.05, 0, 1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_episodes():
-    """Who learnt together is judged by few episodes: here it is of no matter who wins."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (judging, kept):
-            patch.setattr(module, "EPISODES", 10)
-        yield
 
 
 @pytest.fixture(scope="module")
