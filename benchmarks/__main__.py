@@ -36,6 +36,7 @@ ALL = (
     ["four_rooms"],
     ["together"],
     ["nested"],
+    ["one_skill"],
     ["export"],
 )
 

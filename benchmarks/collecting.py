@@ -1,12 +1,14 @@
 """How fast experience is collected: in one process and in several, and with calls of any length.
 
-    python -m benchmarks.collecting [workers] [calls] [--rounds 3] [--steps 40000]
+    python -m benchmarks.collecting [workers] [calls] [together] [--rounds 3] [--steps 40000]
 
 ``workers``: PPO on MiniGrid's DoorKey-8x8 in Python, by two workers, by one, by Stable-Baselines3
 with ``SubprocVecEnv`` (the same network, rollouts and epochs), and the same number of environments
 stepped alone in two processes. ``calls``: a selector on EnvPool's LunarLander whose calls last 1 to
-64 steps at random, against the same selector with all calls of 32. Ratios are of steps per second
-by the clock, within a round; the median round counts.
+64 steps at random, against the same selector with all calls of 32. ``together``: the recipe
+``lunar-lander``, whose selector learns over skills that stay as they are, then all together,
+without and with the task's advantage for skills. Ratios are of steps per second by the clock,
+within a round; the median round counts.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.common import machine
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Ray, Skill, train_agent
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Ray, Skill, recipes, train_agent
+from skillweave.cli.overrides import apply_overrides
 from skillweave.types import Array, Step
 
 GRID = "MiniGrid-DoorKey-8x8-v0"
@@ -141,6 +144,29 @@ def calls(random_lengths: bool, steps: int) -> float:
         return float(run.info()["stages"][-1]["steps_per_second"])
 
 
+def together(task_weight: float, steps: int) -> tuple[float, float]:
+    """Of the selector over frozen skills, then of all who learn together."""
+    hierarchy = recipes.load("lunar-lander")
+    settings = ["learn=apart, then together", "skill_steps=5000", "skills.landing.steps=5000"]
+    settings += [f"selector_steps={steps}", f"together_steps={steps}"]
+    apply_overrides(hierarchy, [*settings, f"together.task_weight={task_weight}"])
+    with tempfile.TemporaryDirectory() as folder:
+        run = hierarchy.train(Path(folder) / "run", quiet=True)
+        selector, after = (float(s["steps_per_second"]) for s in run.info()["stages"][-2:])
+    return selector, after
+
+
+def weighed(steps: int, rounds: int) -> dict[str, float]:
+    """Together against the selector alone: medians of the ratios within rounds."""
+    found: dict[str, list[float]] = {"skills' own rewards": [], "and the task's advantage": []}
+    for _ in range(rounds):
+        for name, weight in zip(found, (0.0, 10.0), strict=True):
+            selector, after = together(weight, steps)
+            found[name].append(after / selector)
+            print(f"{name}: {after:,.0f} / {selector:,.0f} steps/s", flush=True)
+    return {name: round(statistics.median(ratios), 3) for name, ratios in found.items()}
+
+
 def compared(
     measures: dict[str, Callable[[], float]], ratios: dict[str, tuple[str, str]], rounds: int
 ) -> dict[str, Any]:
@@ -158,7 +184,7 @@ def compared(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("which", nargs="*", default=["workers", "calls"])
+    parser.add_argument("which", nargs="*", default=["workers", "calls", "together"])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=40_960)
     given = parser.parse_args()
@@ -180,6 +206,8 @@ def main() -> None:
         }
         ratio = {"calls of 1 to 64 / calls of 32": ("1 to 64", "32")}
         summary |= {"calls": compared(lengths, ratio, given.rounds)}
+    if "together" in given.which:
+        summary["together / selector alone"] = weighed(10 * steps, given.rounds)
     print(json.dumps({"machine": machine()} | summary))
 
 
