@@ -43,12 +43,15 @@ NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_ob
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning")
 
 
+SOON = {"health_check_period_ms": 1000, "health_check_failure_threshold": 3}
+"""When Ray takes a node for lost: after 3 seconds, not 15."""
+
+
 @pytest.fixture(scope="module")
 def cluster():
     """Nodes on this machine: the head has two CPUs."""
-    made = cluster_utils.Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False}
-    )
+    head = {"num_cpus": 2, "include_dashboard": False, "_system_config": SOON}
+    made = cluster_utils.Cluster(initialize_head=True, head_node_args=head)
     ray.init(made.address, logging_level="ERROR", log_to_driver=False)
     yield made
     ray.shutdown()
