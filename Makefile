@@ -10,8 +10,8 @@ BIN := .venv/bin
 SEED ?= 0
 # One process for each core, and one more, as some tests wait for other processes; a process that
 # has no tests left takes some of another's.
-WORKERS := $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+CORES := $(BIN)/python -c 'import os; a = getattr(os, "sched_getaffinity", None); print(len(a(0)) if a else os.cpu_count())'
+PYTEST := $(BIN)/python -m pytest -n $$(($$($(CORES)) + 1)) --dist worksteal
 
 .PHONY: demo test check docs torture bench figures weights smoke clean
 

@@ -2,9 +2,9 @@
 
     python -m benchmarks.reading
 
-One round of training (collect, keep, learn) is watched: which files of the library have functions
-that run, how many lines these files have, and how many lines the functions have that ran. Beside
-it stands the walk through them that ``docs/one-gradient.md`` proposes.
+A few rounds of training (collect, keep, learn) are watched: which files of the library have
+functions that run, how many lines these files have, and how many lines the functions have that ran.
+Beside it stands the walk through them that ``docs/one-gradient.md`` proposes.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def walk(algorithm: str) -> dict[str, list[str]]:
     section = PAGE.read_text().split(f"## {algorithm}")[1].split("\n## ")[0]
     found: dict[str, list[str]] = {}
     for line in section.splitlines():
-        if line.startswith("| ") and line.split("|")[1].strip().isdigit():
-            _, _, file, functions, *_ = line.split("|")
+        if line.startswith("| `"):
+            _, file, functions, *_ = line.split("|")
             found.setdefault(file.strip(" `"), []).extend(re.findall(r"`([^`]+)`", functions))
     return found
 

@@ -118,6 +118,18 @@ def learnt_otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: 
     return found
 
 
+def one_advantage_scale(task: Task, steps: int, **how: Any) -> Hierarchy:
+    """Advantages as they are, in units of reward, not less their mean and by their deviation.
+
+    Raises:
+        SkillweaveError: skills learn from the task's advantage, too, which is always divided.
+    """
+    found = learnt_otherwise(task, steps, {"normalize_advantage": False}, **how)
+    if found.together.task_weight > 0:
+        raise SkillweaveError("one advantage scale: the task's advantage keeps one of its own here")
+    return found
+
+
 def no_imitation(task: Task, steps: int, who: tuple[str, ...], **how: Any) -> Hierarchy:
     """Whoever is in ``who`` learns by plain PPO: ``algorithm`` (the skills), ``selector``."""
     own = together(task, steps)
@@ -171,10 +183,7 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "low floor": functools.partial(otherwise, changed={"floor": 0.3, "floor_final": 0.02}),
     # The critic's errors are made as large as a success, where hardly anything was won yet.
     "no least deviation": functools.partial(learnt_otherwise, changed={"min_advantage_std": 0.0}),
-    # In units of reward for all, instead of each learner's in those of its own deviation.
-    "one advantage scale": functools.partial(
-        learnt_otherwise, changed={"normalize_advantage": False}
-    ),
+    "one advantage scale": one_advantage_scale,
     "no imitation": functools.partial(no_imitation, who=("algorithm", "selector")),
     "selector does not imitate": functools.partial(no_imitation, who=("selector",)),
     "no floor": functools.partial(otherwise, changed={"floor": 0.0, "floor_final": 0.0}),

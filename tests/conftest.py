@@ -32,6 +32,7 @@ def few_episodes() -> Iterator[None]:
     from skillweave.hierarchy import judging
     from skillweave.runs import kept
 
+    assert kept.EPISODES == judging.EPISODES == 100, "so it is documented"
     with pytest.MonkeyPatch.context() as patch:
         for module in (judging, kept):
             patch.setattr(module, "EPISODES", 10)

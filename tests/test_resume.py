@@ -422,7 +422,11 @@ LEARNERS = {
 }
 
 
-FEWER_STEPS = {"skill_steps=600": "skill_steps=300", "selector_steps=1500": "selector_steps=600"}
+FEWER_STEPS = {
+    "skill_steps=600": "skill_steps=300",
+    "selector_steps=1500": "selector_steps=600",
+    "cut_every=150": "cut_every=75",
+}
 
 
 def recipe_of(folder: Path, learner: str, workers: int) -> str:
@@ -441,6 +445,21 @@ def recipe_of(folder: Path, learner: str, workers: int) -> str:
     return str(path)
 
 
+def restored_stages(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """The stages that go on from a checkpoint, from now on."""
+    found: set[str] = set()
+    plain = RunDirectory.load_checkpoint
+
+    def noted(self: RunDirectory, kind: Any, stage: str, **how: Any) -> Any:
+        loaded = plain(self, kind, stage, **how)
+        if loaded is not None:
+            found.add(stage)
+        return loaded
+
+    monkeypatch.setattr(RunDirectory, "load_checkpoint", noted)
+    return found
+
+
 class Killer(StopAt):
     """Kills one of the processes that collect, at every third tick."""
 
@@ -457,8 +476,9 @@ class Killer(StopAt):
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_run_of_any_learner_stopped_again_and_again_ends_as_if_it_had_not_been(
-    tmp_path: Path, learner: str, workers: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, learner: str, workers: int
 ) -> None:
+    gone_on = restored_stages(monkeypatch)
     recipe = recipe_of(tmp_path, learner, workers)
     whole = new_run(recipes.load(recipe), tmp_path / "whole")
     training.train(recipes.load(recipe), whole)
@@ -475,6 +495,7 @@ def test_a_run_of_any_learner_stopped_again_and_again_ends_as_if_it_had_not_been
             run.close()
         run = RunDirectory.open(run.path)
     assert stops >= 2
+    assert {"balance", "selector"} <= gone_on
     assert (Killer.killed - before > 3) == (workers > 1)
     assert_same(run.path, whole.path)
 

@@ -89,14 +89,12 @@ def is_own_code(module: ModuleType) -> bool:
     top = name.partition(".")[0]
     if top == "skillweave":
         return False
-    # One that was loaded from its file, as recipes are, is found by its name by nobody else.
-    return not _is_found(top, tuple(sys.path)) or not _is_installed(file)
+    # One that was loaded from its file, as recipes are, is found by its name by nobody else,
+    # wherever it lies.
+    return not _is_installed(file) or not _is_found(top, tuple(sys.path))
 
 
-# There are thousands of modules, and a sweep asks of all of them for each of its runs.
-
-
-@cache
+@cache  # a sweep asks it of thousands of modules for each of its runs
 def _is_found(name: str, path: tuple[str, ...]) -> bool:
     """Whether a module of this name is found in ``path``."""
     return PathFinder.find_spec(name, path) is not None

@@ -17,7 +17,7 @@ from examples.doorkey import ROOM
 from skillweave import PPO, Hierarchy, SelfImitationPPO, SkillweaveError, Step
 from skillweave.hierarchy.training import manifest
 
-OF_ALL_ALIKE = ("no imitation", "limit ends")
+OF_ALL_ALIKE = ("no imitation", "limit ends", "one advantage scale")
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_every_case_has_the_steps_that_are_asked(task: str, case: str) -> None:
     assert 9_980 <= steps <= 10_000
 
 
-@pytest.mark.parametrize("task", ["8x8", "16x16", "lander"])
+@pytest.mark.parametrize("task", ["8x8", "16x16", "bridge"])
 def test_with_one_scale_nobody_divides_advantages_by_their_own_deviation(task: str) -> None:
     found = CASES["one advantage scale"](TASKS[task], 10_000)
     assert isinstance(found, Hierarchy)
@@ -77,6 +77,7 @@ def test_a_case_changes_what_it_names_and_nothing_else(
         ("lander", "then, no anchor", "is the same as 'then' on lander"),
         ("lander", "no imitation", "'landing' has an algorithm of its own"),
         ("lander", "limit ends", "skills that learn apart have no calls"),
+        ("lander", "one advantage scale", "the task's advantage keeps one of its own"),
     ],
 )
 def test_a_case_that_says_nothing_on_a_task_is_refused(task: str, case: str, says: str) -> None:
