@@ -104,8 +104,7 @@ TASKS = {
     "unlock-pickup": _doorkey("UnlockPickup", (1, 2, 3, 2)),
     # `goal` succeeds once in 1,000 steps at first: it needs most of the steps, and rollouts with
     # several successes. It learns from them without a limit on its advantages: the entropy's bonus
-    # would be larger than what the first few teach. The selector begins with a low floor: a high
-    # one hides from it what it does by itself.
+    # would be larger than what the first few teach.
     "16x16": _doorkey(
         "DoorKey-16x16",
         (1, 2, 6, 1),
@@ -114,7 +113,6 @@ TASKS = {
         ),
         start_calls=16,
         algorithm=doorkey.algorithm(ent_coef=0.03, min_advantage_std=0.0),
-        selector=doorkey.algorithm(floor=0.1, floor_final=0.0),
     ),
     "bridge": Task(
         bridge.declare,
