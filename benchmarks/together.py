@@ -38,8 +38,8 @@ from skillweave import PPO, Array, Hierarchy, Lengths, Run, Skill, SkillweaveErr
 from skillweave.hierarchy.training import manifest
 
 FLOORS = {"floor": 0.1, "floor_final": 0.0}
-"""Of a selector over skills that are trained already: with a high floor, or one that stays, it never
-learns what it does by itself."""
+"""Of a selector over skills that are trained already: with a high floor, or with one that stays, it
+never learns what it does by itself."""
 
 
 def together(task: Task, steps: int, **how: Any) -> Hierarchy:
