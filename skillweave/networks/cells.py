@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,48 @@ KINDS = 16
 """Values of a cell that are told apart: those from here on count as the last."""
 WIDTH = 64
 """Features."""
+AT_ONCE = 16
+"""Sums whose gradient is computed at once."""
+
+
+def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
+    """``F.embedding_bag(rows, table, mode="sum")``, whose gradient is computed faster on a CPU.
+
+    Args:
+        rows: (B, K) int64, rows of the table; no row twice in one sum.
+        table: (R, W).
+
+    Returns:
+        (B, W).
+    """
+    if table.device.type == "cpu":
+        apply: Any = _SumOfRows.apply
+        found: Tensor = apply(rows, table)
+        return found
+    return F.embedding_bag(rows, table, mode="sum")
+
+
+class _SumOfRows(torch.autograd.Function):
+    """Torch's own gradient first sorts all rows; this one adds them in the order of the batch."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, table: Tensor) -> Tensor:
+        """The sums."""
+        ctx.save_for_backward(rows)
+        ctx.size = table.shape
+        return F.embedding_bag(rows, table, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor]:
+        """The gradient by the table."""
+        (rows,) = ctx.saved_tensors
+        found = grad.new_zeros(ctx.size)
+        # In parts, so that what is spread out here stays in the processor's cache.
+        spread = grad.new_empty(min(AT_ONCE, len(rows)), rows.shape[1], grad.shape[1])
+        for some, own in zip(rows.split(AT_ONCE), grad.split(AT_ONCE), strict=True):
+            each = spread[: len(own)].copy_(own[:, None])
+            found.index_add_(0, some.flatten(), each.flatten(0, 1))
+        return None, found
 
 
 class CellsEncoder:
@@ -61,5 +104,5 @@ class CellsEncoder:
         first = torch.arange(cells, device=image.device) * KINDS
         member = torch.arange(members, device=image.device) * (cells * KINDS)
         rows = kind + first + member[:, None, None]
-        total = F.embedding_bag(rows.flatten(0, 1), table.flatten(0, 1), mode="sum")
+        total = sum_of_rows(rows.flatten(0, 1), table.flatten(0, 1))
         return torch.relu(total.view(members, batch, WIDTH) + bias)

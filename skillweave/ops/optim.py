@@ -71,7 +71,7 @@ def adam_(
     step = learning_rate[:, None] * correction2 / correction1
     # eps is scaled too, so that this equals the algorithm as published.
     denominator = nu.sqrt().add_(eps * correction2)
-    params.sub_(step * mu / denominator)
+    params.sub_((step * mu).div_(denominator))
 
 
 def kl_adapted_rate(

@@ -7,7 +7,7 @@ import torch
 
 from skillweave import PPO, Network, SkillweaveError, register_encoder
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.networks.cells import KINDS, WIDTH, CellsEncoder
+from skillweave.networks.cells import AT_ONCE, KINDS, WIDTH, CellsEncoder
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
@@ -27,6 +27,26 @@ def test_features_are_those_of_a_dense_layer_on_one_hot_cells():
     want = torch.relu(one_hot @ views["0.weight"] + views["0.bias"])
     assert found.shape == (members, batch, WIDTH) == (members, batch, encoder.size)
     torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("batch", [1, AT_ONCE - 1, AT_ONCE, AT_ONCE + 1, 3 * AT_ONCE + 5])
+def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(batch):
+    encoder, members = CellsEncoder(obs_codec(GRID)), 2
+    rng = torch.Generator().manual_seed(batch)
+    weight = torch.randn(members, *encoder.shapes["0.weight"], generator=rng).requires_grad_()
+    bias = torch.randn(members, 1, WIDTH, generator=rng).requires_grad_()
+    image = torch.randint(0, 20, (members, batch, 2, 3, 3), generator=rng).to(torch.uint8)
+    one_hot = torch.nn.functional.one_hot(image.flatten(2).long().clamp(max=KINDS - 1), KINDS)
+    grad = torch.randn(members, batch, WIDTH, generator=rng)
+    found, want = (
+        torch.autograd.grad(features, (weight, bias), grad)
+        for features in (
+            encoder({"0.weight": weight, "0.bias": bias}, {"image.0": image}),
+            torch.relu(one_hot.flatten(2).float() @ weight + bias),
+        )
+    )
+    for mine, plain in zip(found, want, strict=True):
+        torch.testing.assert_close(mine, plain, rtol=1e-4, atol=1e-4)
 
 
 def test_numbers_beside_the_grid_are_features_too():
