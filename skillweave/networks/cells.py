@@ -32,7 +32,7 @@ def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
     Returns:
         (B, W).
     """
-    if table.device.type == "cpu":
+    if table.device.type == "cpu" and torch.is_grad_enabled():
         apply: Any = _SumOfRows.apply
         found: Tensor = apply(rows, table)
         return found
@@ -76,6 +76,8 @@ class CellsEncoder:
                 "none"
             )
         self._sizes = [math.prod(shape) for shape in obs.images]
+        self._first = [torch.arange(cells) * KINDS for cells in self._sizes]
+        """The row of each cell's first kind."""
         self._vector = obs.size > 0
         self.size = WIDTH * len(self._sizes) + obs.size
         self.shapes: dict[str, tuple[int, ...]] = {}
@@ -100,9 +102,10 @@ class CellsEncoder:
     def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
         members, batch, cells = *image.shape[:2], self._sizes[i]
         table, bias = views[f"{i}.weight"], views[f"{i}.bias"]
-        kind = image.reshape(members, batch, cells).long().clamp(0, KINDS - 1)
-        first = torch.arange(cells, device=image.device) * KINDS
-        member = torch.arange(members, device=image.device) * (cells * KINDS)
-        rows = kind + first + member[:, None, None]
+        kind = image.reshape(members, batch, cells).clamp(0, KINDS - 1).long()
+        rows = kind + self._first[i].to(image.device)
+        if members > 1:
+            member = torch.arange(members, device=image.device) * (cells * KINDS)
+            rows = rows + member[:, None, None]
         total = sum_of_rows(rows.flatten(0, 1), table.flatten(0, 1))
         return torch.relu(total.view(members, batch, WIDTH) + bias)
