@@ -76,8 +76,9 @@ class CellsEncoder:
                 "none"
             )
         self._sizes = [math.prod(shape) for shape in obs.images]
-        self._first = [torch.arange(cells) * KINDS for cells in self._sizes]
-        """The row of each cell's first kind."""
+        first = [torch.arange(cells) * KINDS for cells in self._sizes]
+        self._first = {torch.device("cpu"): first}
+        """By device, for each image the row of each cell's first kind."""
         self._vector = obs.size > 0
         self.size = WIDTH * len(self._sizes) + obs.size
         self.shapes: dict[str, tuple[int, ...]] = {}
@@ -99,11 +100,16 @@ class CellsEncoder:
             found.append(inputs["vector"])
         return torch.cat(found, -1)
 
+    def _on(self, device: torch.device) -> list[Tensor]:
+        if device not in self._first:
+            self._first[device] = [x.to(device) for x in self._first[torch.device("cpu")]]
+        return self._first[device]
+
     def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
         members, batch, cells = *image.shape[:2], self._sizes[i]
         table, bias = views[f"{i}.weight"], views[f"{i}.bias"]
         kind = image.reshape(members, batch, cells).clamp(0, KINDS - 1).long()
-        rows = kind + self._first[i].to(image.device)
+        rows = kind + self._on(image.device)[i]
         if members > 1:
             member = torch.arange(members, device=image.device) * (cells * KINDS)
             rows = rows + member[:, None, None]
