@@ -39,6 +39,16 @@ def few_episodes() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def usual_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who learnt together is judged by as many episodes as users have."""
+    from skillweave.hierarchy import judging
+    from skillweave.runs import kept
+
+    for module in (judging, kept):
+        monkeypatch.setattr(module, "EPISODES", 100)
+
+
 @pytest.fixture(autouse=True)
 def forget_registered() -> Iterator[None]:
     """Algorithms that a test registers are forgotten after it."""

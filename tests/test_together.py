@@ -155,6 +155,7 @@ def test_the_better_of_before_and_after_is_kept(whole):
     assert "anchor_kl" in " ".join(lines(path)[-1])
 
 
+@pytest.mark.usefixtures("usual_episodes")
 @pytest.mark.parametrize(
     ("learn", "asked", "played"),
     [
@@ -184,9 +185,10 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
     assert set(kept) == played
     assert kept[best] == max(kept.values())
     assert greedy == {asked is None and best != "sampled"}
-    assert run.evaluate(judging.EPISODES, seed=judging.SEEDS + 3).mean == kept[best]
+    assert run.evaluate(100, seed=judging.SEEDS + 3).mean == kept[best]
 
 
+@pytest.mark.usefixtures("usual_episodes")
 @pytest.mark.parametrize("better", [True, False])
 def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(tmp_path, monkeypatch, better):
     """Not by chance: one of them always plays well here."""
@@ -203,9 +205,9 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(tmp_path, mon
     assert policy.skills.greedy is better
     assert run.stage("together")["evaluation_steps"] == 30
     returns = (10.0, 5.0) if better else (5.0, 10.0)
-    words = "with greedy skills {:.1f}, with skills that sample {:.1f} (10 episodes each): kept"
+    words = "with greedy skills {:.1f}, with skills that sample {:.1f} (100 episodes each): kept"
     assert words.format(*returns) in heard.said[-1]
-    assert "2 times 10 episodes are played" in heard.said[-2]
+    assert "2 times 100 episodes are played" in heard.said[-2]
 
 
 def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch):
