@@ -1,4 +1,4 @@
-"""``make bench``: the quick ones. ``make figures`` runs all of them on all seeds (two hours)."""
+"""``make bench``: the quick ones. ``make figures`` runs all of them on all seeds (many hours)."""
 
 from __future__ import annotations
 

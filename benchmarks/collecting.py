@@ -20,6 +20,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -167,59 +168,65 @@ def together(changed: list[str], steps: int) -> tuple[float, float]:
     return selector, after
 
 
-def weighed(steps: int, rounds: int) -> dict[str, float]:
-    """Together against the selector alone: medians of the ratios within rounds."""
-    found: dict[str, list[float]] = {name: [] for name in TOGETHER}
-    for _ in range(rounds):
-        for name, changed in TOGETHER.items():
-            selector, after = together(changed, steps)
-            found[name].append(after / selector)
-            print(f"{name}: {after:,.0f} / {selector:,.0f} steps/s", flush=True)
-    return {name: round(statistics.median(ratios), 3) for name, ratios in found.items()}
-
-
 def compared(
-    measures: dict[str, Callable[[], float]], ratios: dict[str, tuple[str, str]], rounds: int
+    measure: Callable[[], dict[str, float]], ratios: dict[str, tuple[str, str]], rounds: int
 ) -> dict[str, Any]:
-    """Every measure once a round, and the median of ratios within rounds."""
+    """Steps per second by name, measured once a round, and the median of ratios within rounds."""
     found: list[dict[str, float]] = []
     for _ in range(rounds):
-        found.append({name: measure() for name, measure in measures.items()})
+        found.append(measure())
         print({k: round(v) for k, v in found[-1].items()}, flush=True)
-    speeds = {k: statistics.median(f[k] for f in found) for k in measures}
+    speeds = {k: statistics.median(f[k] for f in found) for k in found[0]}
     return {"steps per second": {k: round(v) for k, v in speeds.items()}} | {
         name: round(statistics.median(f[a] / f[b] for f in found), 3)
         for name, (a, b) in ratios.items()
     }
 
 
+def of_workers(steps: int) -> dict[str, float]:
+    return {
+        "two workers": ours(2, steps),
+        "one": ours(1, steps),
+        "Stable-Baselines3": stable_baselines(steps),
+        "environments alone": alone(steps),
+    }
+
+
+def of_calls(steps: int) -> dict[str, float]:
+    return {"1 to 64": calls(True, steps), "32": calls(False, steps)}
+
+
+def of_together(steps: int) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for name, changed in TOGETHER.items():
+        found[f"selector, {name}"], found[name] = together(changed, steps)
+    return found
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("which", nargs="*", default=["workers", "calls", "together"])
+    others = ("one", "Stable-Baselines3", "environments alone")
+    # By name: what measures a round, how many times the steps it takes, and the ratios.
+    every: dict[str, tuple[Callable[[int], dict[str, float]], int, dict[str, tuple[str, str]]]] = {
+        "workers": (of_workers, 1, {f"two workers / {k}": ("two workers", k) for k in others}),
+        "calls": (of_calls, 10, {"calls of 1 to 64 / calls of 32": ("1 to 64", "32")}),
+        "together": (
+            of_together, 10, {f"{k} / selector alone": (k, f"selector, {k}") for k in TOGETHER}
+        ),
+    }  # fmt: skip
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("which", nargs="*", default=list(every))
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=40_960)
     given = parser.parse_args()
-    steps = given.steps
-    summary: dict[str, Any] = {}
-    if "workers" in given.which:
-        measures = {
-            "two workers": lambda: ours(2, steps),
-            "one": lambda: ours(1, steps),
-            "Stable-Baselines3": lambda: stable_baselines(steps),
-            "environments alone": lambda: alone(steps),
-        }
-        ratios = {f"two workers / {k}": ("two workers", k) for k in list(measures)[1:]}
-        summary |= compared(measures, ratios, given.rounds)
-    if "calls" in given.which:
-        lengths = {
-            "1 to 64": lambda: calls(True, 10 * steps),
-            "32": lambda: calls(False, 10 * steps),
-        }
-        ratio = {"calls of 1 to 64 / calls of 32": ("1 to 64", "32")}
-        summary |= {"calls": compared(lengths, ratio, given.rounds)}
-    if "together" in given.which:
-        summary["together / selector alone"] = weighed(10 * steps, given.rounds)
-    print(json.dumps({"machine": machine()} | summary))
+    if unknown := [name for name in given.which if name not in every]:
+        parser.error(f"there is no {unknown[0]!r}: {', '.join(every)}")
+    summary: dict[str, Any] = {"machine": machine()}
+    for name in given.which:
+        measure, times, ratios = every[name]
+        summary[name] = compared(partial(measure, times * given.steps), ratios, given.rounds)
+    print(json.dumps(summary))
 
 
 if __name__ == "__main__":

@@ -121,7 +121,7 @@ def learnt_otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: 
 
 
 def one_advantage_scale(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """Advantages as they are, in units of reward, not less their mean and by their deviation.
+    """All advantages stay in units of reward: nobody divides them by their own deviation.
 
     Raises:
         SkillweaveError: skills learn from the task's advantage, too, which is always divided.

@@ -26,7 +26,7 @@ def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
     """``F.embedding_bag(rows, table, mode="sum")``, whose gradient is computed faster on a CPU.
 
     Args:
-        rows: (B, K) int64, rows of the table; no row twice in one sum.
+        rows: (B, K) int64, the rows of the table that are added.
         table: (R, W).
 
     Returns:
@@ -108,7 +108,7 @@ class CellsEncoder:
     def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
         members, batch, cells = *image.shape[:2], self._sizes[i]
         table, bias = views[f"{i}.weight"], views[f"{i}.bias"]
-        kind = image.reshape(members, batch, cells).clamp(0, KINDS - 1).long()
+        kind = image.reshape(members, batch, cells).long().clamp(0, KINDS - 1)
         rows = kind + self._on(image.device)[i]
         if members > 1:
             member = torch.arange(members, device=image.device) * (cells * KINDS)
