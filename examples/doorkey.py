@@ -115,9 +115,12 @@ def declare(
         room: MiniGrid's name of it, without version.
         engine: auto: in EnvPool, where it is installed; sync: in Python.
     """
-    # Other rooms are taken to be harder: where successes are rare at first, PPO forgets one before
-    # the next comes.
-    learner = algorithm() if room == ROOM else algorithm(sw.SelfImitationPPO)
+    # Here minibatches twice as large as the default, with a rate √2 times as high, are as good and
+    # take less time. Other rooms are taken to be harder: where successes are rare at first, PPO
+    # forgets one before the next comes.
+    here = room == ROOM
+    fast = {"batch_size": 512, "learning_rate": 1.4e-3}
+    learner = algorithm(**fast) if here else algorithm(sw.SelfImitationPPO)
     settings = {
         "call_steps": 32,
         "learn": "together",
@@ -128,12 +131,12 @@ def declare(
         # won, a cost teaches the selector to call the skill with the longest calls, and in other
         # rooms that lasts long. There is none there, at the risk of calls that end at once again
         # and again.
-        "call_cost": 0.001 if room == ROOM else 0.0,
+        "call_cost": 0.001 if here else 0.0,
         "greedy_skills": False,
         "algorithm": learner,
         "selector": learner,
     } | how
-    other = {} if room == ROOM else {"room": room}
+    other = {} if here else {"room": room}
     env = sw.EnvSpec(make, other, pool=partial(many, **other), engine=engine, workers=workers)
     return sw.Hierarchy(env, [GetKey(), OpenDoor(), Goal()], **settings)
 

@@ -7,7 +7,7 @@ import torch
 
 from skillweave import PPO, Network, SkillweaveError, register_encoder
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.networks.cells import AT_ONCE, KINDS, WIDTH, CellsEncoder
+from skillweave.networks.cells import KINDS, WIDTH, CellsEncoder
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
@@ -29,9 +29,24 @@ def test_features_are_those_of_a_dense_layer_on_one_hot_cells():
     torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("batch", [1, AT_ONCE - 1, AT_ONCE, AT_ONCE + 1, 3 * AT_ONCE + 5])
-def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(batch):
-    encoder, members = CellsEncoder(obs_codec(GRID)), 2
+@pytest.mark.parametrize("dtype", [np.int64, np.float32])
+def test_kinds_are_the_same_in_other_types_of_numbers(dtype):
+    space = gym.spaces.Box(-99, 99, (3, 3, 2), dtype)
+    encoder, bytes_ = CellsEncoder(obs_codec(space)), CellsEncoder(obs_codec(GRID))
+    rng = torch.Generator().manual_seed(0)
+    views = {k: torch.randn(1, *shape, generator=rng) for k, shape in encoder.shapes.items()}
+    kinds = torch.randint(-20, 40, (1, 5, 2, 3, 3), generator=rng)
+    found = encoder(views, {"image.0": kinds.to(torch.from_numpy(np.zeros(1, dtype)).dtype)})
+    want = bytes_(views, {"image.0": kinds.clamp(min=0).to(torch.uint8)})
+    assert torch.equal(found, want)
+
+
+@pytest.mark.parametrize("members", [1, 2])
+@pytest.mark.parametrize("batch", [1, 3, 4, 5, 13])
+def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(batch, members, monkeypatch):
+    encoder = CellsEncoder(obs_codec(GRID))
+    # Four rows at once.
+    monkeypatch.setattr("skillweave.networks.cells.AT_ONCE", 4 * members * 18 * KINDS)
     rng = torch.Generator().manual_seed(batch)
     weight = torch.randn(members, *encoder.shapes["0.weight"], generator=rng).requires_grad_()
     bias = torch.randn(members, 1, WIDTH, generator=rng).requires_grad_()
