@@ -11,22 +11,26 @@ from torch.nn import functional as F
 
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.stacked import Views, orthogonal_
+from skillweave.ops.device import Constant
 from skillweave.spaces import ObsCodec
 from skillweave.types import SkillweaveError
 
 KINDS = 16
-"""Values of a cell that are told apart: those from here on count as the last."""
+"""Kinds that are told apart, 0 to 15: larger numbers count as 15, smaller ones as 0."""
 WIDTH = 64
 """Features."""
 AT_ONCE = 2**20
-"""How many numbers of one-hot rows are held at once for a gradient: 4 MB."""
+"""Numbers in the one-hot rows that are made at once for a gradient, about."""
+FEWEST_ROWS = 32
+"""One-hot rows that are made at once at least: each time the whole gradient is read and written."""
 
 
 def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
     """The sums of rows of a table, one table for each member.
 
     Args:
-        rows: (P, B, K) int64, which rows are added; no row twice in one sum.
+        rows: (P, B, K) int64, which rows are added. The gradient is wrong where one sum has the
+            same row twice.
         table: (P, R, W).
 
     Returns:
@@ -54,16 +58,16 @@ class _SumOfRows(torch.autograd.Function):
     def forward(ctx: Any, rows: Tensor, table: Tensor) -> Tensor:
         """The sums."""
         ctx.save_for_backward(rows)
-        ctx.size = table.shape
+        ctx.shape = table.shape
         return _sums(rows, table)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor]:
         """The gradient by the table: one-hot rows, transposed, times the gradient of the sums."""
         (rows,) = ctx.saved_tensors
-        members, size, _ = ctx.size
-        found = grad.new_zeros(ctx.size)
-        part = max(1, AT_ONCE // (members * size))
+        members, size, _ = ctx.shape
+        found = grad.new_zeros(ctx.shape)
+        part = max(FEWEST_ROWS, AT_ONCE // (members * size))
         for some, own in zip(rows.split(part, 1), grad.split(part, 1), strict=True):
             one_hot = grad.new_zeros(members, some.shape[1], size).scatter_(2, some, 1.0)
             found.baddbmm_(one_hot.mT, own)
@@ -84,9 +88,8 @@ class CellsEncoder:
                 "none"
             )
         self._sizes = [math.prod(shape) for shape in obs.images]
-        first = [torch.arange(cells) * KINDS for cells in self._sizes]
-        self._first = {torch.device("cpu"): first}
-        """By device, for each image the row of each cell's first kind."""
+        # Of each image, the row of each cell's first kind.
+        self._first = [Constant(torch.arange(cells) * KINDS) for cells in self._sizes]
         self._vector = obs.size > 0
         self.size = WIDTH * len(self._sizes) + obs.size
         self.shapes: dict[str, tuple[int, ...]] = {}
@@ -108,17 +111,12 @@ class CellsEncoder:
             found.append(inputs["vector"])
         return torch.cat(found, -1)
 
-    def _on(self, device: torch.device) -> list[Tensor]:
-        if device not in self._first:
-            self._first[device] = [x.to(device) for x in self._first[torch.device("cpu")]]
-        return self._first[device]
-
     def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
         members, batch, cells = *image.shape[:2], self._sizes[i]
         cell = image.reshape(members, batch, cells)
-        if cell.dtype == torch.uint8:  # the same in one operation less
+        if cell.dtype == torch.uint8:  # never below 0, and the sum makes it int64
             kind = cell.clamp(max=KINDS - 1)
         else:
             kind = cell.long().clamp(0, KINDS - 1)
-        rows = kind + self._on(image.device)[i]
+        rows = kind + self._first[i].on(image.device)
         return torch.relu(sum_of_rows(rows, views[f"{i}.weight"]) + views[f"{i}.bias"])

@@ -7,7 +7,7 @@ import torch
 
 from skillweave import PPO, Network, SkillweaveError, register_encoder
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.networks.cells import KINDS, WIDTH, CellsEncoder
+from skillweave.networks.cells import AT_ONCE, KINDS, WIDTH, CellsEncoder, sum_of_rows
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
@@ -41,27 +41,51 @@ def test_kinds_are_the_same_in_other_types_of_numbers(dtype):
     assert torch.equal(found, want)
 
 
+@pytest.mark.parametrize("at_once", [1, AT_ONCE])
 @pytest.mark.parametrize("members", [1, 2])
 @pytest.mark.parametrize("batch", [1, 3, 4, 5, 13])
-def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(batch, members, monkeypatch):
-    encoder = CellsEncoder(obs_codec(GRID))
-    # Four rows at once.
-    monkeypatch.setattr("skillweave.networks.cells.AT_ONCE", 4 * members * 18 * KINDS)
-    rng = torch.Generator().manual_seed(batch)
-    weight = torch.randn(members, *encoder.shapes["0.weight"], generator=rng).requires_grad_()
-    bias = torch.randn(members, 1, WIDTH, generator=rng).requires_grad_()
-    image = torch.randint(0, 20, (members, batch, 2, 3, 3), generator=rng).to(torch.uint8)
-    one_hot = torch.nn.functional.one_hot(image.flatten(2).long().clamp(max=KINDS - 1), KINDS)
-    grad = torch.randn(members, batch, WIDTH, generator=rng)
+def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(
+    batch, members, at_once, monkeypatch
+):
+    # In parts of four rows, or in one.
+    monkeypatch.setattr("skillweave.networks.cells.AT_ONCE", at_once)
+    monkeypatch.setattr("skillweave.networks.cells.FEWEST_ROWS", 4)
+    grids = gym.spaces.Tuple([GRID, gym.spaces.Box(0, 255, (5, 4, 3), np.uint8)])
+    encoder, rng = CellsEncoder(obs_codec(grids)), torch.Generator().manual_seed(batch)
+    images = {
+        "image.0": torch.randint(0, 20, (members, batch, 2, 3, 3), generator=rng).to(torch.uint8),
+        "image.1": torch.randint(0, 20, (members, batch, 3, 5, 4), generator=rng).to(torch.uint8),
+    }
+    views = {
+        name: torch.randn(members, *shape, generator=rng).requires_grad_()
+        for name, shape in encoder.shapes.items()
+    }
+    dense = []
+    for i, image in enumerate(images.values()):
+        kinds = image.flatten(2).long().clamp(max=KINDS - 1)
+        one_hot = torch.nn.functional.one_hot(kinds, KINDS).flatten(2).float()
+        dense.append(torch.relu(one_hot @ views[f"{i}.weight"] + views[f"{i}.bias"]))
+    grad = torch.randn(members, batch, 2 * WIDTH, generator=rng)
     found, want = (
-        torch.autograd.grad(features, (weight, bias), grad)
-        for features in (
-            encoder({"0.weight": weight, "0.bias": bias}, {"image.0": image}),
-            torch.relu(one_hot.flatten(2).float() @ weight + bias),
-        )
+        torch.autograd.grad(features, list(views.values()), grad)
+        for features in (encoder(views, images), torch.cat(dense, -1))
     )
     for mine, plain in zip(found, want, strict=True):
         torch.testing.assert_close(mine, plain, rtol=1e-4, atol=1e-4)
+
+
+def test_a_table_that_learns_on_a_cpu_has_the_fast_gradient():
+    table = torch.zeros(1, 8, WIDTH, requires_grad=True)
+    total = sum_of_rows(torch.tensor([[[1, 6]]]), table)
+    assert type(total.grad_fn).__name__ == "_SumOfRowsBackward"
+
+
+def test_on_another_device_nothing_stays_behind():
+    encoder = CellsEncoder(obs_codec(GRID))
+    views = {k: torch.zeros(1, *v, device="meta") for k, v in encoder.shapes.items()}
+    image = torch.zeros(1, 5, 2, 3, 3, dtype=torch.uint8, device="meta")
+    found = encoder(views, {"image.0": image})
+    assert (found.device.type, found.shape) == ("meta", (1, 5, WIDTH))
 
 
 def test_numbers_beside_the_grid_are_features_too():
