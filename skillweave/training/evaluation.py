@@ -18,7 +18,7 @@ from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.skill_report import SkillReport, SkillTally, all_steps
-from skillweave.training.skill_text import idle_calls, late_calls, skill_table
+from skillweave.training.skill_text import hasty_calls, idle_calls, late_calls, skill_table
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
@@ -97,7 +97,8 @@ class Evaluation:
     def for_people(self) -> str:
         """``str()``, and for a hierarchy a table of its skills, and what looks like a mistake."""
         table = [skill_table(self.skills)] if self.skills else []
-        hints = [*idle_calls(self.skills), *late_calls(self.skills)]
+        told = (idle_calls, late_calls, hasty_calls)
+        hints = [hint for tell in told for hint in tell(self.skills)]
         return "\n".join([str(self), *table, *hints])
 
     def __str__(self) -> str:

@@ -52,6 +52,9 @@ class SkillReport:
     late: Count = field(default=0, compare=False)
     """Calls that went on to their limit after they had succeeded, of a skill that says neither
     where it stops nor how long it lasts."""
+    hasty: Count = field(default=0, compare=False)
+    """Calls that ended by themselves within two steps, without success, of a skill whose own reward
+    was below 0 in the last of them."""
 
     @property
     def length_mean(self) -> float | None:
@@ -134,10 +137,12 @@ class SkillTally:
         self._steps, self._calls = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._ended = np.zeros((count, len(Why)), np.int64)
         self._succeeded = np.zeros(count, np.int64)
-        self._late = np.zeros(count, np.int64)
+        self._late, self._hasty = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._endless = np.array(
             [self.skills is not None and is_endless(self.skills, i) for i in range(count)], bool
         )
+        declared = () if self.skills is None else self.skills.skills
+        self._pays = np.array([skill.defines("reward") for skill in declared], bool)
         self._has_succeeded = np.zeros(episodes, bool)  # by episode, the call at its last step
         # By skill before (the first row: none) and skill after.
         self._next = np.zeros((1 + count, count), np.int64)
@@ -167,6 +172,7 @@ class SkillTally:
         own = played.reward
         if self.skills is not None:
             judged = judge(self.skills, played)
+            assert played.elapsed is not None
             self._open[played.episode] = np.where(judged.why == Why.RUNNING, acting, -1)
             own = judged.reward
             ended = np.flatnonzero(judged.why != Why.RUNNING)
@@ -179,6 +185,8 @@ class SkillTally:
             before = self._has_succeeded[played.episode] & ~played.begun & self._endless[acting]
             late = before & judged.succeeded & (judged.why == Why.LIMIT)
             self._late += np.bincount(acting[late], minlength=count)
+            hasty = done & (played.elapsed <= 2) & self._pays[acting] & (own < 0)
+            self._hasty += np.bincount(acting[hasty & ~judged.succeeded], minlength=count)
             self._has_succeeded[played.episode] = judged.has_succeeded
         self._returns[played.episode, acting] += own
         for i, tally in self._below.items():
@@ -206,7 +214,7 @@ class SkillTally:
                 int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
                 float(returns[i]) if self._known(i) else None, int(self._next[0, i]),
                 dict(zip(paths, self._next[1 + i].tolist(), strict=True)), int(self._idle[i]),
-                int(self._late[i]),
+                int(self._late[i]), int(self._hasty[i]),
             )  # fmt: skip
             if i in self._below:
                 found |= self._below[i].reports()

@@ -64,6 +64,17 @@ def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
     ]
 
 
+def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """A sentence about each skill, half of whose calls are hasty, or more."""
+    return [
+        f"{report.hasty:,} of {report.calls:,} calls of {name!r} ended by its termination() within "
+        "two steps, without success, and their last reward was below 0. Where a step costs and an "
+        "end pays nothing, it is best to end at once: pay for success, or let success alone end it."
+        for name, report in skills.items()
+        if 2 * report.hasty >= report.calls > 0
+    ]
+
+
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.0%}"
 

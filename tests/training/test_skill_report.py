@@ -450,3 +450,62 @@ def test_a_plain_policy_has_no_table():
     found = evaluate(scripted(1), EnvSpec(Walk), episodes=3)
     assert (found.skills, found.to_json()["skills"]) == ({}, {})
     assert found.for_people() == str(found)
+
+
+class Fleeing(Skill):
+    """Ends at once, and each step costs."""
+
+    policy = scripted(2)
+    ends, pay, won = 1, -1.0, False
+
+    def reward(self, step):
+        return np.full(len(step.reward), self.pay)
+
+    def termination(self, step):
+        return step.elapsed >= self.ends
+
+    def success(self, step):
+        return np.full(len(step.reward), self.won)
+
+
+class Slower(Fleeing):
+    ends = 2
+
+
+class Lingering(Fleeing):
+    ends = 3
+
+
+class Paying(Fleeing):
+    pay = 0.0
+
+
+class Winning(Fleeing):
+    won = True
+
+
+@pytest.mark.parametrize("kind", [Fleeing, Slower])
+def test_a_skill_for_which_it_is_best_to_end_at_once_is_told(kind):
+    found = told(by_turns, kind, Left)[1]
+    there = found.skills[kind.__name__.lower()]
+    # The episode's end cuts the others.
+    assert there.hasty == there.ended["own"] > there.calls / 2
+    assert found.for_people().splitlines()[-1] == (
+        f"{there.hasty:,} of {there.calls:,} calls of '{kind.__name__.lower()}' ended by its "
+        "termination() within two steps, without success, and their last reward was below 0. Where "
+        "a step costs and an end pays nothing, it is best to end at once: pay for success, or let "
+        "success alone end it."
+    )
+
+
+@pytest.mark.parametrize("kind", [Lingering, Paying, Winning])
+def test_calls_that_last_or_pay_are_not_hasty(kind):
+    found = told(by_turns, kind, Left)[1]
+    assert found.skills[kind.__name__.lower()].hasty == 0
+    assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+
+
+def test_moves_that_have_no_reward_of_their_own_are_not_hasty():
+    there = told(by_turns, Move, Left)[1].skills["move"]
+    assert there.calls > 20 > 0 > there.return_sum  # the environment's
+    assert there.hasty == 0
