@@ -494,7 +494,8 @@ def test_a_skill_for_which_it_is_best_to_end_at_once_is_told(kind):
         f"{there.hasty:,} of {there.calls:,} calls of '{kind.__name__.lower()}' ended by its "
         "termination() within two steps, without success, and their last reward was below 0. Where "
         "a step costs and an end pays nothing, it is best to end at once: pay for success, or let "
-        "success alone end it."
+        "success alone end it. If it was called where its work was done, let its initiation() be "
+        "False there."
     )
 
 
