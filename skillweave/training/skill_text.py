@@ -69,8 +69,8 @@ def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
     return [
         f"{report.hasty:,} of {report.calls:,} calls of {name!r} ended by its termination() within "
         "two steps, without success, and their last reward was below 0. Where a step costs and an "
-        "end pays nothing, it is best to end at once: pay for success, or let success alone end it. "
-        "If it was called where its work was done, let its initiation() be False there."
+        "end pays nothing, it is best to end at once: pay for success, or let success alone end "
+        "it. If it was called where its work was done, let its initiation() be False there."
         for name, report in skills.items()
         if 2 * report.hasty >= report.calls > 0
     ]
