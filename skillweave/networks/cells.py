@@ -29,8 +29,8 @@ def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
     """The sums of rows of a table, one table for each member.
 
     Args:
-        rows: (P, B, K) int64, which rows are added. The gradient is wrong where one sum has the
-            same row twice.
+        rows: (P, B, K) int64, which rows are added. On a CPU the gradient is wrong where one sum
+            has the same row twice.
         table: (P, R, W).
 
     Returns:

@@ -65,15 +65,22 @@ def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
 
 
 def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """A sentence about each skill, half of whose calls are hasty, or more."""
-    return [
-        f"{report.hasty:,} of {report.calls:,} calls of {name!r} ended by its termination() within "
-        "two steps, without success, and their last reward was below 0. Where a step costs and an "
-        "end pays nothing, it is best to end at once: pay for success, or let success alone end "
-        "it. If it was called where its work was done, let its initiation() be False there."
-        for name, report in skills.items()
-        if 2 * report.hasty >= report.calls > 0
-    ]
+    """A sentence about each skill, half of whose calls are hasty, or more.
+
+    A move of one step that has a cost of its own is meant, too.
+    """
+    found = []
+    for name, report in skills.items():
+        if 2 * report.hasty >= report.calls > 0:
+            failed = "" if report.succeeded is None else ", without success"
+            found.append(
+                f"{report.hasty:,} of {report.calls:,} calls of {name!r} ended by its "
+                f"termination() within two steps{failed}, and their last reward was below 0. Where "
+                "a step costs and an end pays nothing, it is best to end at once: pay for success, "
+                "or let success alone end it. If it was called where its work was done, let its "
+                "initiation() be False there."
+            )
+    return found
 
 
 def _percent(value: float | None) -> str:

@@ -472,8 +472,23 @@ class Slower(Fleeing):
     ends = 2
 
 
+class Silent(Skill):
+    """Does not say what success is."""
+
+    policy = scripted(2)
+    reward, termination = Fleeing.reward, Fleeing.termination
+    ends, pay = 1, -1.0
+
+
 class Lingering(Fleeing):
     ends = 3
+
+
+class Sometimes(Fleeing):
+    """Ends at once in a quarter of the environments."""
+
+    def termination(self, step):
+        return step.elapsed >= np.where(step.obs[:, TAG] % 4 == 0, 1, 3)
 
 
 class Paying(Fleeing):
@@ -484,19 +499,35 @@ class Winning(Fleeing):
     won = True
 
 
-@pytest.mark.parametrize("kind", [Fleeing, Slower])
+@pytest.mark.parametrize("kind", [Fleeing, Slower, Silent])
 def test_a_skill_for_which_it_is_best_to_end_at_once_is_told(kind):
+    name = kind.__name__.lower()
     found = told(by_turns, kind, Left)[1]
-    there = found.skills[kind.__name__.lower()]
+    there = found.skills[name]
     # The episode's end cuts the others.
     assert there.hasty == there.ended["own"] > there.calls / 2
+    failed = "" if kind is Silent else ", without success"
     assert found.for_people().splitlines()[-1] == (
-        f"{there.hasty:,} of {there.calls:,} calls of '{kind.__name__.lower()}' ended by its "
-        "termination() within two steps, without success, and their last reward was below 0. Where "
-        "a step costs and an end pays nothing, it is best to end at once: pay for success, or let "
-        "success alone end it. If it was called where its work was done, let its initiation() be "
-        "False there."
+        f"{there.hasty:,} of {there.calls:,} calls of {name!r} ended by its termination() within "
+        f"two steps{failed}, and their last reward was below 0. Where a step costs and an end pays "
+        "nothing, it is best to end at once: pay for success, or let success alone end it. If it "
+        "was called where its work was done, let its initiation() be False there."
     )
+
+
+def test_less_than_half_of_the_calls_is_not_told():
+    found = told(by_turns, Sometimes, Left)[1]
+    there = found.skills["sometimes"]
+    assert 0 < 2 * there.hasty < there.calls
+    assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+
+
+def test_hasty_calls_within_a_hierarchy_are_counted():
+    class Nested(Skill):
+        policy = told(by_turns, Slower, Left)[0]
+
+    there = told(by_turns, Nested, Left)[1].skills["nested/slower"]
+    assert there.calls >= there.hasty > 0
 
 
 @pytest.mark.parametrize("kind", [Lingering, Paying, Winning])
