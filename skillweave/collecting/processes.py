@@ -173,9 +173,14 @@ class ProcessCollectors(ProcessWorkers, WorkerCollectors):
         super().__init__(workers, each, members, name)
 
 
-def _tasks(pipe: Connection) -> Iterator[tuple[str, Any]]:
-    """What the parent asks for, until it closes, or is no more."""
-    parent, first = mp.parent_process(), os.getppid()
+def _tasks(pipe: Connection, first: int) -> Iterator[tuple[str, Any]]:
+    """What the parent asks for, until it closes, or is no more.
+
+    Args:
+        pipe: where it asks.
+        first: the process whose child this one was at first.
+    """
+    parent = mp.parent_process()
     assert parent is not None
     while True:
         while not pipe.poll(LOOK):
@@ -193,6 +198,7 @@ def _work(number: int, maker: _Maker, each: int, pipe: Connection, other_end: Co
     """The life of a worker: answer (error, result) to every (what, task)."""
     import torch
 
+    first = os.getppid()  # the parent waits for our first answer; after that it may be no more
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, who then closes us
     torch.set_num_threads(1)
     other_end.close()
@@ -201,7 +207,7 @@ def _work(number: int, maker: _Maker, each: int, pipe: Connection, other_end: Co
         station = Station(maker.make, each, number)
         pipe.send((None, None))
         writer = ColumnWriter()
-        for what, task in _tasks(pipe):
+        for what, task in _tasks(pipe, first):
             answer = station.answer(what, task)
             pipe.send((None, writer.write(answer) if what == "collect" else answer))
     except (EOFError, BrokenPipeError):

@@ -178,8 +178,11 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
 
 
 PARENT = """
-import os, signal
+import os, signal, time
+from skillweave.collecting import processes
 from test_process_collectors import ProcessCollectors, stepping
+tasks = processes._tasks
+processes._tasks = lambda *about: (time.sleep(0.5), tasks(*about))[1]  # the parent is no more then
 found = ProcessCollectors(stepping(), 1, 3, 1, "Walk")
 pids = [worker.process.pid for worker in found._workers]
 os.kill(pids[-1], signal.SIGSTOP)
