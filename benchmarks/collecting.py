@@ -145,13 +145,17 @@ def calls(random_lengths: bool, steps: int) -> float:
         return float(run.info()["stages"][-1]["steps_per_second"])
 
 
-FEWER = ["update_epochs=3", "batch_size=1024"]
+FEWER = [
+    f"{who}.{setting}"
+    for who in ("algorithm", "skills.landing")
+    for setting in ("update_epochs=3", "batch_size=1024")
+]
+TASK = ["together.task_weight=10"]
 TOGETHER: dict[str, list[str]] = {
     "as in the recipe": [],
-    "and the task's advantage": ["together.task_weight=10"],
-    "three passes over minibatches of 1,024": [
-        f"{who}.{setting}" for who in ("algorithm", "skills.landing") for setting in FEWER
-    ],
+    "and the task's advantage": TASK,
+    "three passes over minibatches of 1,024": FEWER,
+    "three passes, and the task's advantage": FEWER + TASK,
 }
 """By name, what is changed in the recipe."""
 
