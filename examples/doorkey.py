@@ -12,7 +12,6 @@ door. They take more steps.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -97,16 +96,10 @@ class Goal(sw.Skill):
 
 def algorithm(kind: type[sw.PPO] = sw.PPO, **how: Any) -> sw.PPO:
     """Who learns. A cell's numbers are kinds of things, not brightnesses: ``encoder="cells"``."""
-    settings: dict[str, Any] = {
-        "num_envs": 16,
-        "n_steps": 128,
-        "update_epochs": 4,
-        "gamma": 0.99,
-        "gae_lambda": 0.95,
-        "learning_rate_schedule": "constant",
-        "network": sw.Network(hidden=(64,), encoder="cells"),
-    }
-    return kind(**settings | how)
+    return kind(
+        num_envs=16, n_steps=128, update_epochs=4, gamma=0.99, gae_lambda=0.95,
+        learning_rate_schedule="constant", network=sw.Network(hidden=(64,), encoder="cells"), **how,
+    )  # fmt: skip
 
 
 def declare(
@@ -124,14 +117,10 @@ def declare(
     """
     # Here minibatches twice as large as the default, with a rate √2 times as high, are as good and
     # take less time. Other rooms are taken to be harder: where successes are rare at first, PPO
-    # forgets one before the next comes; a rollout should have several; and to skills the few
-    # should count for more than the entropy's bonus, however small what they teach is at first.
+    # forgets one before the next comes.
     here = room == ROOM
-    if here:
-        selector = skills = algorithm(batch_size=512, learning_rate=1.4e-3)
-    else:
-        selector = algorithm(sw.SelfImitationPPO, n_steps=512)
-        skills = replace(selector, min_advantage_std=0.0)
+    fast = {"batch_size": 512, "learning_rate": 1.4e-3}
+    learner = algorithm(**fast) if here else algorithm(sw.SelfImitationPPO)
     settings = {
         "call_steps": 32,
         "learn": "together",
@@ -144,8 +133,8 @@ def declare(
         # and again.
         "call_cost": 0.001 if here else 0.0,
         "greedy_skills": False,
-        "algorithm": skills,
-        "selector": selector,
+        "algorithm": learner,
+        "selector": learner,
     } | how
     other = {} if here else {"room": room}
     env = sw.EnvSpec(make, other, pool=partial(many, **other), engine=engine, workers=workers)
