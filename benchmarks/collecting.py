@@ -7,8 +7,8 @@ with ``SubprocVecEnv`` (the same network, rollouts and epochs), and the same num
 stepped alone in two processes. ``calls``: a selector on EnvPool's LunarLander whose calls last 1 to
 64 steps at random, against the same selector with all calls of 32. ``together``: the recipe
 ``lunar-lander``, whose selector learns over skills that stay as they are, then all together: as it
-is, with the task's advantage for skills, and with fewer gradient steps. Ratios are of steps per
-second by the clock, within a round; the median round counts.
+is, with the task's advantage for skills, with fewer gradient steps, and with both. Ratios are of
+steps per second by the clock, within a round; the median round counts.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ class Suite:
         return replace(self, scale=self.scale * factor)
 
     def quick(self) -> Suite:
-        """The same with a two-hundredth of the steps: to see that all runs, not what it finds."""
+        """A two-hundredth of the steps, one episode for each score: to see that all runs."""
         return replace(self.scaled(0.005), episodes=1, evaluations=1, evaluated=1)
 
     def hierarchy(self, task: Task, skills: Policies | None) -> Hierarchy:

@@ -14,7 +14,7 @@ from benchmarks.pay.flat import Flat
 from benchmarks.together import CASES, check_case, one, without_selector
 from examples.bridge import AXE, BRIDGE, RIVER, WIDTH, WOOD, WORK, GetAxe, River, declare
 from examples.doorkey import ROOM
-from skillweave import PPO, Hierarchy, SelfImitationPPO, SkillweaveError, Step
+from skillweave import PPO, Hierarchy, SelfImitationPPO, SkillweaveError, Step, recipes
 from skillweave.hierarchy.training import manifest
 
 OF_ALL_ALIKE = ("no imitation", "limit ends", "one advantage scale")
@@ -107,9 +107,19 @@ def test_a_skills_value_ends_at_the_limit_of_its_calls() -> None:
         assert not any(same.success(step) for step in at), "it has not done its work"
 
 
+def passes(found: Hierarchy | Flat) -> list[tuple[int, int]]:
+    """Over each rollout, and rows of a minibatch, of all skills and of ``landing``."""
+    assert isinstance(found, Hierarchy)
+    who = found.algorithm, found.skill("landing").algorithm
+    return [(a.update_epochs, a.batch_size) for a in who if isinstance(a, PPO)]
+
+
 def test_the_lander_is_what_the_measured_table_says() -> None:
     found = CASES["together"](TASKS["lander"], 3_900_000)
     assert isinstance(found, Hierarchy)
+    assert passes(found) == [(3, 1024), (3, 1024)]
+    recipe = recipes.load("lunar-lander")
+    assert passes(CASES["apart"](TASKS["lander"], 3_900_000)) == passes(recipe)
     assert [s.steps for s in found.skills] == [100_000, 100_000, 600_000]
     assert (found.selector_steps, found.together_steps) == (200_000, 2_900_000)
     assert found.together.task_weight == 10
