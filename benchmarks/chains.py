@@ -11,6 +11,7 @@ import numpy as np
 
 from examples import bridge, doorkey, yard
 from skillweave import PPO, Array, Hierarchy, Run, Together, recipes
+from skillweave.cli.overrides import apply_overrides
 from skillweave.recipes import lunar_lander
 
 
@@ -76,6 +77,14 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     )
 
 
+FEWER = [
+    f"{who}.{setting}"
+    for who in ("algorithm", "skills.landing")
+    for setting in ("update_epochs=3", "batch_size=1024")
+]
+"""Fewer gradient steps than the skills of ``lunar-lander`` make: together as good, and faster."""
+
+
 def _lander(steps: int, workers: int, engine: Any = "auto", **how: Any) -> Hierarchy:
     """The recipe ``lunar-lander``, its skills apart at first, then all together.
 
@@ -87,12 +96,7 @@ def _lander(steps: int, workers: int, engine: Any = "auto", **how: Any) -> Hiera
     """
     hierarchy = recipes.load("lunar-lander")
     if how.get("learn") != "apart":
-        # Fewer gradient steps than the recipe's own skills make: together as good, and faster.
-        fewer: dict[str, Any] = {"update_epochs": 3, "batch_size": 1024}
-        hierarchy.algorithm = replace(hierarchy.algorithm, **fewer)
-        landing = hierarchy.skill("landing")
-        assert landing.algorithm is not None
-        landing.algorithm = replace(landing.algorithm, **fewer)
+        apply_overrides(hierarchy, FEWER)
     *each, selector, jointly = (steps * part // 39 for part in (1, 1, 6, 2, 29))
     for skill, own in zip(hierarchy.skills, each, strict=True):
         skill.steps = own

@@ -27,6 +27,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.chains import FEWER
 from benchmarks.common import machine
 from skillweave import PPO, EnvSpec, Hierarchy, Network, Ray, Skill, recipes, train_agent
 from skillweave.cli.overrides import apply_overrides
@@ -145,11 +146,6 @@ def calls(random_lengths: bool, steps: int) -> float:
         return float(run.info()["stages"][-1]["steps_per_second"])
 
 
-FEWER = [
-    f"{who}.{setting}"
-    for who in ("algorithm", "skills.landing")
-    for setting in ("update_epochs=3", "batch_size=1024")
-]
 TASK = ["together.task_weight=10"]
 TOGETHER: dict[str, list[str]] = {
     "as in the recipe": [],

@@ -57,7 +57,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+")
     parser.add_argument("--agents", nargs="+", choices=CHAINS, default=list(CHAINS))
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--quick", action="store_true", help="a 200th of the steps: 6 minutes")
+    parser.add_argument(
+        "--quick", action="store_true", help="one seed, a 200th of the steps: 6 minutes"
+    )
     parser.add_argument("--out", type=Path)
     parser.add_argument("--only-figures", action="store_true")
     asked = parser.parse_args(arguments)
