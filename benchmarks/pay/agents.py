@@ -115,7 +115,11 @@ class Bench:
             self._save(run, task, SINGLE, 0, started, each[best].returns, {best: 1.0})
 
     def _random(self, task: Task, skills: Policies) -> Hierarchy:
-        return by_lot(self.suite.hierarchy(task, skills), self.seed)
+        hierarchy = self.suite.hierarchy(task, skills)
+        for skill in hierarchy.skills:
+            if skill.policy is None:
+                skill.policy = skills[skill.name]
+        return by_lot(hierarchy, self.seed)
 
     def _ready(self, task: Task, agent: str, hierarchy: Hierarchy) -> Run:
         """The run of a hierarchy in which nobody learns."""

@@ -13,7 +13,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.types import Policy
 
 Policies = Mapping[str, Policy]
-"""The skills that were learnt on the first task, by name."""
+"""The skills that were learnt on the first task, and those by hand, by name."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Task:
         name: letters, digits and dashes: it names files.
         env: its environment, with its own reward.
         solved: a score from here on counts as solved.
-        starts_from: an earlier task, by name: the hierarchy's selector begins with what it was at
-            the end of that one. F3 is the same of a flat agent.
+        starts_from: an earlier task, by name: the hierarchy begins with what it was at the end of
+            that one, its skills too, where they go on learning. F3 is the same of a flat agent.
     """
 
     name: str
@@ -43,7 +43,8 @@ class Suite:
         tasks: in the order in which they are learnt.
         unit: a score is a return divided by this.
         source: the hierarchy that learns the first task, and its skills, from nothing.
-        further: the hierarchy that learns another task, given the skills.
+        further: the hierarchy that learns another task, given the skills; or without them, where
+            they go on learning (``Task.starts_from``).
         skills: those whose rewards are added for F1.
         flat: who learns without skills.
         weights: what F1 chooses from: for each skill a weight of its reward.

@@ -2,7 +2,8 @@
 
 The agent sees the 7×7 cells before it: kind, colour and state of each. Seven skills are learnt
 once, in small rooms of several kinds, each for what it can see: a key, a shut door, a ball; one is
-written by hand. A selector learns each further task, where a reward is paid at the end alone.
+written by hand. On each further task, where a reward is paid at the end alone, skills and selector
+go on together from there (``going_on``); or a selector learns it alone (``with_skills``).
 
     skillweave train keys-and-doors
 
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
+from skillweave import PPO, Array, Hierarchy, Network, Skill, Step, Together
 from skillweave.recipes._looking import LookAround
 from skillweave.recipes._rooms import (
     BALL,
@@ -264,6 +265,20 @@ def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found
+
+
+def going_on(rooms: str, **how: Any) -> Hierarchy:
+    """The hierarchy in these rooms, where skills and selector go on learning, together.
+
+    To be trained from the run in the small rooms: ``train(..., start_from=run)``.
+    """
+    again = Together(task_weight=1.0, floor=0.1, floor_final=0.0)
+    settings: dict[str, Any] = {
+        "learn": "together",
+        "together_steps": 1_500_000,
+        "together": again,
+    }
+    return declare(rooms, **(settings | how))
 
 
 hierarchy = declare()

@@ -260,6 +260,39 @@ def test_fine_tuning_begins_with_what_the_flat_agent_was_on_the_first_task(done,
     assert found[TUNED] == replace(found[FLAT], agent=TUNED)
 
 
+def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_path, monkeypatch):
+    tasks = [
+        Task("right", spec(3), 0.5),
+        Task("left", spec(-3), 0.5, "right"),
+        Task("again", spec(-3), 0.5, "left"),  # so the run of "left" is kept
+    ]
+
+    def again(task, skills):
+        return declare(task, learn="together", together_steps=192)
+
+    goes_on = replace(suite(), tasks=tasks, further=again, variants={}, fixed={})
+    ready, bench = [], Bench(goes_on, Results(tmp_path), seed=0)
+    by_lot = agents.by_lot
+
+    def noted(hierarchy, seed):
+        ready.append([s.policy for s in hierarchy.skills])
+        return by_lot(hierarchy, seed)
+
+    monkeypatch.setattr(agents, "by_lot", noted)
+    bench.run("hierarchy", ["left"])
+    (stage,) = json.loads((bench._path(tasks[1], HIERARCHY) / "run.json").read_text())["stages"]
+    source = bench._path(tasks[0], HIERARCHY)
+    learnt = {s["name"]: s for s in json.loads((source / "run.json").read_text())["stages"]}
+    begun = {name: told["sha256"] for name, told in stage["starts"].items()}
+    assert begun == {name: learnt[name]["sha256"] for name in ("right", "left", "selector")}
+    skills = bench._skills()
+    assert ready
+    for right, left in ready:
+        for policy, name in ((right, "right"), (left, "left")):
+            for k, value in policy.weights.items():
+                np.testing.assert_array_equal(value, skills[name].weights[k])
+
+
 def test_weights_are_chosen_by_score_on_a_seed_that_is_not_reported(done, monkeypatch):
     tuned = [r for r in done.all("line") if r.seed == TUNING_SEED]
     assert {r.agent for r in tuned} == {"tuning-0", "tuning-1"}
