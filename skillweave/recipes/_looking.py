@@ -10,8 +10,8 @@ from skillweave import Array, Step
 from skillweave.recipes._rooms import ACTIONS, FORWARD, LEFT, RIGHT, SPACE, ahead, free
 
 Memory = dict[str, Array]
-TURNS = 3
-"""After so many it has seen all four sides."""
+TURNS = 4
+"""It sees all four sides and goes on as it came; with one turn less it would walk in squares."""
 PACES = 5
 """After so many it looks around again."""
 ENTERING = 3
@@ -41,7 +41,7 @@ class LookAround:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Turn right until it has seen all sides; then straight on, around what is in the way."""
+        """Turn right, once around; then straight on, around what is in the way."""
         turns, paces = memory["turns"], memory["paces"]
         again = (paces >= PACES) | ((paces > 0) & ~free(ahead(obs)))
         turns, paces = np.where(again, 0, turns), np.where(again, 0, paces)

@@ -275,7 +275,7 @@ def going_on(rooms: str, **how: Any) -> Hierarchy:
     again = Together(task_weight=1.0, floor=0.1, floor_final=0.0)
     settings: dict[str, Any] = {
         "learn": "together",
-        "together_steps": 1_500_000,
+        "together_steps": 750_000,
         "together": again,
     }
     return declare(rooms, **(settings | how))

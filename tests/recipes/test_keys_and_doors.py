@@ -114,13 +114,28 @@ def test_explore_goes_in_looks_to_all_sides_goes_on_and_looks_again():
     policy = SKILLS["explore"].policy
     corner = view(WALL)
     corner[0, 4, 6] = WALL
-    seen = [*[view()] * 14, view(OPEN), *[view(WALL)] * 3, corner]
+    seen = [*[view()] * 16, view(OPEN), *[view(WALL)] * 4, corner]
     memory, did = policy.start(1), []
     for obs in seen:
         action, memory = policy.act(memory, obs)
         did.append(int(action[0]))
-    looks, goes = [world.RIGHT] * 3, [world.FORWARD]
+    looks, goes = [world.RIGHT] * 4, [world.FORWARD]
     assert did == [*goes * 3, *looks, *goes * 5, *looks, *goes, *looks, world.LEFT]
+
+
+def test_explore_looks_to_all_sides_and_then_goes_on_as_it_came():
+    policy = rooms.Explore.policy
+    memory, heading, place, seen_to = policy.start(1), 0, np.zeros(2, int), set()
+    ways = np.array([[0, 1], [1, 0], [0, -1], [-1, 0]])
+    for _ in range(3 + 4 * (4 + 5)):
+        (action,), memory = policy.act(memory, view())
+        if action == world.FORWARD:
+            place += ways[heading]
+        else:
+            heading = (heading + (1 if action == world.RIGHT else -1)) % 4
+        seen_to.add(heading)
+    assert seen_to == {0, 1, 2, 3}
+    assert place.tolist() == [0, 3 + 4 * 5]  # not in a square, where it would see the same again
 
 
 def test_a_pool_draws_rooms_for_each_agent_and_repeats_itself():
@@ -177,3 +192,9 @@ def test_skills_that_are_there_learn_nothing_more():
     found = rooms.with_skills("multi-room", ready, selector_steps=4096)
     assert found.total_steps == 4096
     assert [s.name for s in found.skills] == list(SKILLS)
+
+
+def test_skills_that_go_on_learn_with_the_selector_from_the_same_steps():
+    found = rooms.going_on("multi-room", together_steps=4096)
+    assert (found.learn, found.total_steps) == ("together", 4096)
+    assert [s.name for s in found.skills if s.policy is not None] == ["explore"]
