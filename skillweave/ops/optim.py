@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -55,9 +57,67 @@ def adam_(
         eps: keeps the division from 0.
         active: (P,) bool; members at False are left exactly as they are.
     """
+    if _can_be_fused(params, grad, mu, nu, count):
+        chosen = list(range(len(params))) if active is None else active.nonzero()[:, 0].tolist()
+        count.add_(1 if active is None else active)
+        _fused_(chosen, params, grad, mu, nu, count, learning_rate, beta1, beta2, eps)
+    else:
+        _formula_(params, grad, mu, nu, count, learning_rate, beta1, beta2, eps, active)
+
+
+def _can_be_fused(params: Tensor, grad: Tensor, mu: Tensor, nu: Tensor, count: Tensor) -> bool:
+    """Torch's operation wants one age for a tensor, and (unsaid) that it lies in one piece."""
+    if params.device.type != "cpu" or count.ndim != 1 or torch.compiler.is_compiling():
+        return False
+    return all(x[0].is_contiguous() for x in (params, grad, mu, nu))
+
+
+def _fused_(
+    members: list[int],
+    params: Tensor,
+    grad: Tensor,
+    mu: Tensor,
+    nu: Tensor,
+    count: Tensor,
+    learning_rate: Tensor,
+    beta1: float,
+    beta2: float,
+    eps: float,
+) -> None:
+    """The step of some members, ``count`` being counted: torch reads and writes all once.
+
+    Each member by itself, so that it is the same alone and among others.
+    """
+    rates, together = learning_rate.tolist(), defaultdict(list)
+    for i in members:
+        together[rates[i]].append(i)
+    steps = count.to(torch.float32).unbind()
+    rows = [x.unbind() for x in (params, grad, mu, nu)]
+    fused: Any = torch._fused_adam_
+    for rate, those in together.items():
+        own = [[x[i] for i in those] for x in (*rows, steps)]
+        fused(
+            *own[:4], [], own[4], lr=rate, beta1=beta1, beta2=beta2, weight_decay=0.0, eps=eps,
+            amsgrad=False, maximize=False,
+        )  # fmt: skip
+
+
+def _formula_(
+    params: Tensor,
+    grad: Tensor,
+    mu: Tensor,
+    nu: Tensor,
+    count: Tensor,
+    learning_rate: Tensor,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    active: Tensor | None,
+) -> None:
+    """The same where torch has no such operation, or each parameter has an age of its own."""
     if active is not None and not (active.device.type == "cpu" and bool(active.all())):
         before = [x.clone() for x in (params, mu, nu, count)]
-        adam_(params, grad, mu, nu, count, learning_rate, beta1=beta1, beta2=beta2, eps=eps)
+        _formula_(params, grad, mu, nu, count, learning_rate, beta1, beta2, eps, None)
         for now, old in zip((params, mu, nu, count), before, strict=True):
             stays = ~active.view(-1, *[1] * (now.ndim - 1))
             now.copy_(torch.where(stays, old, now))

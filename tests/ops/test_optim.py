@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skillweave.ops.moments import merge_moments
-from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
+from skillweave.ops.optim import _formula_, adam_, clip_grad_norm_, kl_adapted_rate
 
 
 def adam_state(members: int, size: int, dtype: torch.dtype = torch.float32):
@@ -47,6 +47,33 @@ def test_adam_leaves_inactive_members_exactly_as_they_are():
         assert torch.equal(now[1], old[1])
         torch.testing.assert_close(now[active], full[active])
         assert not torch.equal(now[active], old[active])
+
+
+@pytest.mark.parametrize("active", [None, [True, False, True, True]])
+def test_adam_at_once_equals_the_formula(active):
+    generator = torch.Generator().manual_seed(0)
+    chosen = None if active is None else torch.tensor(active)
+    params, rates = torch.randn(4, 37, generator=generator), torch.tensor([0.1, 0.1, 1e-3, 0.1])
+    fast, plain = [[params.clone(), *adam_state(4, 37)] for _ in range(2)]
+    fast[3][2] = plain[3][2] = 100  # one is older
+    for _ in range(30):
+        grad = torch.randn(4, 37, generator=generator) * torch.tensor([[1.0], [1e-4], [1.0], [1e3]])
+        adam_(fast[0], grad, *fast[1:], rates, active=chosen)
+        _formula_(plain[0], grad, *plain[1:], rates, 0.9, 0.999, 1e-5, chosen)
+    assert torch.equal(fast[3], plain[3])
+    for one, other in zip(fast[:3], plain[:3], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+
+
+def test_adam_moves_a_member_the_same_alone_and_among_others():
+    generator = torch.Generator().manual_seed(0)
+    all_of = [torch.randn(5, 37, generator=generator), *adam_state(5, 37)]
+    alone, rates = [x[2:3].clone() for x in all_of], torch.tensor([0.1, 0.2, 0.1, 0.1, 0.3])
+    for _ in range(10):
+        grad = torch.randn(5, 37, generator=generator)
+        adam_(alone[0], grad[2:3].clone(), *alone[1:], rates[2:3])
+        adam_(all_of[0], grad, *all_of[1:], rates)
+    assert all(torch.equal(x[2:3], own) for x, own in zip(all_of, alone, strict=True))
 
 
 def test_gradients_are_clipped_for_each_member_by_itself():
