@@ -249,7 +249,7 @@ class Bench:
         return [source, *(t for t in tasks if t is not source)]
 
     def _with_those_before(self, tasks: Sequence[Task]) -> list[Task]:
-        """The same, and the tasks that selectors start from, in the suite's order."""
+        """The same, and the tasks that hierarchies start from, in the suite's order."""
         wanted = {t.name for t in self._with_source(tasks)}
         for task in reversed(self.suite.tasks):
             if task.name in wanted and task.starts_from is not None:

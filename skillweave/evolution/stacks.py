@@ -3,7 +3,7 @@
 Between generations every member is a thing of its own; ``join`` puts members of one architecture
 into a stack, ``split`` takes them out again. Members whose hidden layers differ in width are padded
 with zeros to the widest: a unit with no weights in and none out stays at zero for ever, whatever
-the others learn, so a padded member is exactly the member alone.
+the others learn, so a padded member is the member alone, but for the last bits of its numbers.
 """
 
 from __future__ import annotations

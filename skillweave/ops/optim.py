@@ -11,6 +11,9 @@ from torch import Tensor
 
 from skillweave.shapes import Bool, Float, Int
 
+FEWEST_FUSED = 2048
+"""Parameters of a member from which on torch's own Adam takes less time than single operations."""
+
 
 def clip_grad_norm_(
     grad: Float[Tensor, "P D"], max_norm: Float[Tensor, " P"]
@@ -57,71 +60,68 @@ def adam_(
         eps: keeps the division from 0.
         active: (P,) bool; members at False are left exactly as they are.
     """
-    if _can_be_fused(params, grad, mu, nu, count):
-        chosen = list(range(len(params))) if active is None else active.nonzero()[:, 0].tolist()
-        count.add_(1 if active is None else active)
-        _fused_(chosen, params, grad, mu, nu, count, learning_rate, beta1, beta2, eps)
+    state, betas = (params, grad, mu, nu, count), (beta1, beta2)
+    if _can_be_fused(state):
+        _fused_(state, learning_rate, betas, eps, active)
     else:
-        _formula_(params, grad, mu, nu, count, learning_rate, beta1, beta2, eps, active)
+        _formula_(state, learning_rate, betas, eps, active)
 
 
-def _can_be_fused(params: Tensor, grad: Tensor, mu: Tensor, nu: Tensor, count: Tensor) -> bool:
-    """Torch's operation wants one age for a tensor, and (unsaid) that it lies in one piece."""
+State = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Parameters, their gradient, mu, nu and count, as ``adam_`` has them."""
+Betas = tuple[float, float]
+
+
+def _can_be_fused(state: State) -> bool:
+    """Torch's operation takes one age for a tensor, and does not check that it is contiguous.
+
+    It must not depend on how many members there are: one is then the same alone and among others.
+    """
+    *tensors, count = state
+    params = tensors[0]
     if params.device.type != "cpu" or count.ndim != 1 or torch.compiler.is_compiling():
         return False
-    return all(x[0].is_contiguous() for x in (params, grad, mu, nu))
+    large = params.shape[1] >= FEWEST_FUSED
+    return large and all(x[:1].is_contiguous() for x in tensors)
 
 
 def _fused_(
-    members: list[int],
-    params: Tensor,
-    grad: Tensor,
-    mu: Tensor,
-    nu: Tensor,
-    count: Tensor,
-    learning_rate: Tensor,
-    beta1: float,
-    beta2: float,
-    eps: float,
+    state: State, learning_rate: Tensor, betas: Betas, eps: float, active: Tensor | None
 ) -> None:
-    """The step of some members, ``count`` being counted: torch reads and writes all once.
-
-    Each member by itself, so that it is the same alone and among others.
-    """
-    rates, together = learning_rate.tolist(), defaultdict(list)
+    """By torch's own operation, which reads and writes everything once."""
+    *tensors, count = state
+    members = list(range(len(count))) if active is None else active.nonzero()[:, 0].tolist()
+    rates, by_rate = learning_rate.expand(len(count)).tolist(), defaultdict(list)
     for i in members:
-        together[rates[i]].append(i)
+        by_rate[rates[i]].append(i)
+    count.add_(1 if active is None else active)
     steps = count.to(torch.float32).unbind()
-    rows = [x.unbind() for x in (params, grad, mu, nu)]
+    rows = [x.unbind() for x in tensors]
     fused: Any = torch._fused_adam_
-    for rate, those in together.items():
-        own = [[x[i] for i in those] for x in (*rows, steps)]
+    for rate, those in by_rate.items():
+        params, grad, mu, nu, taken = [[x[i] for i in those] for x in (*rows, steps)]
         fused(
-            *own[:4], [], own[4], lr=rate, beta1=beta1, beta2=beta2, weight_decay=0.0, eps=eps,
-            amsgrad=False, maximize=False,
+            params, grad, mu, nu, [], taken, lr=rate, beta1=betas[0], beta2=betas[1], eps=eps,
+            weight_decay=0.0, amsgrad=False, maximize=False,
         )  # fmt: skip
+    for changed in (state[0], state[2], state[3]):  # else an old graph's gradient would be wrong
+        if not changed.is_inference():
+            torch.autograd.graph.increment_version(changed)
 
 
 def _formula_(
-    params: Tensor,
-    grad: Tensor,
-    mu: Tensor,
-    nu: Tensor,
-    count: Tensor,
-    learning_rate: Tensor,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    active: Tensor | None,
+    state: State, learning_rate: Tensor, betas: Betas, eps: float, active: Tensor | None
 ) -> None:
-    """The same where torch has no such operation, or each parameter has an age of its own."""
+    """The same by single operations: everywhere else."""
+    params, grad, mu, nu, count = state
     if active is not None and not (active.device.type == "cpu" and bool(active.all())):
         before = [x.clone() for x in (params, mu, nu, count)]
-        _formula_(params, grad, mu, nu, count, learning_rate, beta1, beta2, eps, None)
+        _formula_(state, learning_rate, betas, eps, None)
         for now, old in zip((params, mu, nu, count), before, strict=True):
             stays = ~active.view(-1, *[1] * (now.ndim - 1))
             now.copy_(torch.where(stays, old, now))
         return
+    beta1, beta2 = betas
     count.add_(1)
     age = (count[:, None] if count.ndim == 1 else count.flatten(1)).to(params.dtype)
     mu.lerp_(grad, 1.0 - beta1)

@@ -112,6 +112,7 @@ def _one_of(*kinds: int) -> Array:
     """Of each number whether it is one of these, (256,) bool: much faster than ``np.isin``."""
     found = np.zeros(256, bool)
     found[list(kinds)] = True
+    found.flags.writeable = False
     return found
 
 

@@ -1,4 +1,4 @@
-"""Keys and doors: eight skills for MiniGrid's rooms, and a selector for each task.
+"""Keys and doors: eight skills for MiniGrid's rooms, and a selector.
 
 The agent sees the 7×7 cells before it: kind, colour and state of each. Seven skills are learnt
 once, in small rooms of several kinds, each for what it can see: a key, a shut door, a ball; one is
@@ -272,13 +272,12 @@ def going_on(rooms: str, **how: Any) -> Hierarchy:
 
     To be trained from the run in the small rooms: ``train(..., start_from=run)``.
     """
-    again = Together(task_weight=1.0, floor=0.1, floor_final=0.0)
-    settings: dict[str, Any] = {
+    again: dict[str, Any] = {
         "learn": "together",
         "together_steps": 750_000,
-        "together": again,
+        "together": Together(task_weight=1.0, floor=0.1, floor_final=0.0),
     }
-    return declare(rooms, **(settings | how))
+    return declare(rooms, **(again | how))
 
 
 hierarchy = declare()

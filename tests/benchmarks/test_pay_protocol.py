@@ -286,7 +286,7 @@ def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_
     begun = {name: told["sha256"] for name, told in stage["starts"].items()}
     assert begun == {name: learnt[name]["sha256"] for name in ("right", "left", "selector")}
     skills = bench._skills()
-    assert ready
+    assert len(ready) == 2  # for chance, and for the best single skill
     for right, left in ready:
         for policy, name in ((right, "right"), (left, "left")):
             for k, value in policy.weights.items():

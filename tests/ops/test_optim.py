@@ -5,7 +5,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skillweave.ops.moments import merge_moments
-from skillweave.ops.optim import _formula_, adam_, clip_grad_norm_, kl_adapted_rate
+from skillweave.ops.optim import (
+    FEWEST_FUSED,
+    _formula_,
+    adam_,
+    clip_grad_norm_,
+    kl_adapted_rate,
+)
 
 
 def adam_state(members: int, size: int, dtype: torch.dtype = torch.float32):
@@ -49,31 +55,86 @@ def test_adam_leaves_inactive_members_exactly_as_they_are():
         assert not torch.equal(now[active], old[active])
 
 
-@pytest.mark.parametrize("active", [None, [True, False, True, True]])
-def test_adam_at_once_equals_the_formula(active):
+SIZE = FEWEST_FUSED + 5
+
+
+@pytest.fixture
+def fused(monkeypatch):
+    """How many members torch's own Adam moved, call by call."""
+    calls, own = [], torch._fused_adam_
+
+    def counted(params, *rest, **settings):
+        calls.append(len(params))
+        return own(params, *rest, **settings)
+
+    monkeypatch.setattr(torch, "_fused_adam_", counted)
+    return calls
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("active", [None, [True, False, True, True], [False] * 4])
+def test_adam_at_once_equals_the_formula(active, dtype, fused):
     generator = torch.Generator().manual_seed(0)
-    chosen = None if active is None else torch.tensor(active)
-    params, rates = torch.randn(4, 37, generator=generator), torch.tensor([0.1, 0.1, 1e-3, 0.1])
-    fast, plain = [[params.clone(), *adam_state(4, 37)] for _ in range(2)]
+    chosen, scale = (
+        None if active is None else torch.tensor(active),
+        torch.tensor([1, 1e-4, 1, 1e3]),
+    )
+    params, rates = torch.randn(4, SIZE, generator=generator), torch.tensor([0.1, 0.1, 1e-3, 0.1])
+    fast, plain = [[params.to(dtype), *adam_state(4, SIZE, dtype)] for _ in range(2)]
     fast[3][2] = plain[3][2] = 100  # one is older
     for _ in range(30):
-        grad = torch.randn(4, 37, generator=generator) * torch.tensor([[1.0], [1e-4], [1.0], [1e3]])
+        grad = (torch.randn(4, SIZE, generator=generator) * scale[:, None]).to(dtype)
         adam_(fast[0], grad, *fast[1:], rates, active=chosen)
-        _formula_(plain[0], grad, *plain[1:], rates, 0.9, 0.999, 1e-5, chosen)
+        _formula_((plain[0], grad, *plain[1:]), rates, (0.9, 0.999), 1e-5, chosen)
+    assert sum(fused) == 30 * (4 if active is None else sum(active))
     assert torch.equal(fast[3], plain[3])
     for one, other in zip(fast[:3], plain[:3], strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
-def test_adam_moves_a_member_the_same_alone_and_among_others():
+@pytest.mark.parametrize("size", [37, SIZE])
+def test_adam_moves_a_member_the_same_alone_and_among_others(size, fused):
     generator = torch.Generator().manual_seed(0)
-    all_of = [torch.randn(5, 37, generator=generator), *adam_state(5, 37)]
+    all_of = [torch.randn(5, size, generator=generator), *adam_state(5, size)]
     alone, rates = [x[2:3].clone() for x in all_of], torch.tensor([0.1, 0.2, 0.1, 0.1, 0.3])
     for _ in range(10):
-        grad = torch.randn(5, 37, generator=generator)
+        grad = torch.randn(5, size, generator=generator)
         adam_(alone[0], grad[2:3].clone(), *alone[1:], rates[2:3])
         adam_(all_of[0], grad, *all_of[1:], rates)
+    assert sum(fused) == (60 if size == SIZE else 0)
     assert all(torch.equal(x[2:3], own) for x, own in zip(all_of, alone, strict=True))
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_adam_moves_what_does_not_lie_in_one_piece_by_the_formula(which, fused):
+    generator = torch.Generator().manual_seed(0)
+    grad = torch.randn(2, SIZE, generator=generator)
+    expected = [torch.zeros(2, SIZE), grad.clone(), *adam_state(2, SIZE)]
+    given = [x.clone() for x in expected]
+    wide = torch.zeros(2, 2 * SIZE)
+    wide[:, ::2] = given[which]
+    given[which] = wide[:, ::2]
+    adam_(*expected, torch.full((2,), 0.1))
+    assert sum(fused) == 2
+    adam_(*given, torch.full((2,), 0.1))
+    assert sum(fused) == 2
+    for one, other in zip(given, expected, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("size", [5, SIZE])
+def test_a_gradient_of_a_loss_from_before_a_step_of_adam_is_refused(size):
+    params = torch.ones(1, size)
+    factor = torch.ones(1, size, requires_grad=True)
+    loss = (params * factor).sum()
+    adam_(params, torch.ones(1, size), *adam_state(1, size), torch.tensor([0.1]))
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+@pytest.mark.parametrize("size", [5, SIZE])
+def test_adam_of_no_member_does_nothing(size):
+    adam_(torch.ones(0, size), torch.ones(0, size), *adam_state(0, size), torch.ones(0))
 
 
 def test_gradients_are_clipped_for_each_member_by_itself():

@@ -134,8 +134,8 @@ def test_explore_looks_to_all_sides_and_then_goes_on_as_it_came():
         else:
             heading = (heading + (1 if action == world.RIGHT else -1)) % 4
         seen_to.add(heading)
-    assert seen_to == {0, 1, 2, 3}
-    assert place.tolist() == [0, 3 + 4 * 5]  # not in a square, where it would see the same again
+    assert seen_to == {0, 1, 2, 3}  # with three turns, too, but then it walks in a square
+    assert place.tolist() == [0, 3 + 4 * 5]
 
 
 def test_a_pool_draws_rooms_for_each_agent_and_repeats_itself():
@@ -194,7 +194,10 @@ def test_skills_that_are_there_learn_nothing_more():
     assert [s.name for s in found.skills] == list(SKILLS)
 
 
-def test_skills_that_go_on_learn_with_the_selector_from_the_same_steps():
-    found = rooms.going_on("multi-room", together_steps=4096)
-    assert (found.learn, found.total_steps) == ("together", 4096)
+def test_who_goes_on_learns_together_by_the_advantage_of_the_task_too():
+    found = rooms.going_on("multi-room")
+    assert (found.learn, found.total_steps) == ("together", 750_000)
+    how = found.together
+    assert (how.task_weight, how.floor, how.floor_final) == (1.0, 0.1, 0.0)
+    assert rooms.going_on("multi-room", together_steps=4096).total_steps == 4096
     assert [s.name for s in found.skills if s.policy is not None] == ["explore"]
