@@ -15,6 +15,11 @@ FEWEST_FUSED = 2048
 """Parameters of a member from which on torch's own Adam takes less time than single operations."""
 
 
+State = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Parameters, their gradient, mu, nu and count, as ``adam_`` has them."""
+Betas = tuple[float, float]
+
+
 def clip_grad_norm_(
     grad: Float[Tensor, "P D"], max_norm: Float[Tensor, " P"]
 ) -> Float[Tensor, " P"]:
@@ -67,11 +72,6 @@ def adam_(
         _formula_(state, learning_rate, betas, eps, active)
 
 
-State = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Parameters, their gradient, mu, nu and count, as ``adam_`` has them."""
-Betas = tuple[float, float]
-
-
 def _can_be_fused(state: State) -> bool:
     """Torch's operation takes one age for a tensor, and does not check that it is contiguous.
 
@@ -112,7 +112,7 @@ def _fused_(
 def _formula_(
     state: State, learning_rate: Tensor, betas: Betas, eps: float, active: Tensor | None
 ) -> None:
-    """The same by single operations: everywhere else."""
+    """The same step by single operations, wherever torch's own cannot be used or is slower."""
     params, grad, mu, nu, count = state
     if active is not None and not (active.device.type == "cpu" and bool(active.all())):
         before = [x.clone() for x in (params, mu, nu, count)]

@@ -75,10 +75,8 @@ def fused(monkeypatch):
 @pytest.mark.parametrize("active", [None, [True, False, True, True], [False] * 4])
 def test_adam_at_once_equals_the_formula(active, dtype, fused):
     generator = torch.Generator().manual_seed(0)
-    chosen, scale = (
-        None if active is None else torch.tensor(active),
-        torch.tensor([1, 1e-4, 1, 1e3]),
-    )
+    chosen = None if active is None else torch.tensor(active)
+    scale = torch.tensor([1, 1e-4, 1, 1e3])
     params, rates = torch.randn(4, SIZE, generator=generator), torch.tensor([0.1, 0.1, 1e-3, 0.1])
     fast, plain = [[params.to(dtype), *adam_state(4, SIZE, dtype)] for _ in range(2)]
     fast[3][2] = plain[3][2] = 100  # one is older
