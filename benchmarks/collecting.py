@@ -146,7 +146,7 @@ def calls(random_lengths: bool, steps: int) -> float:
         return float(run.info()["stages"][-1]["steps_per_second"])
 
 
-TASK = ["together.task_weight=10"]
+TASK = ["together.task_weight=100"]
 TOGETHER: dict[str, list[str]] = {
     "as in the recipe": [],
     "and the task's advantage": TASK,

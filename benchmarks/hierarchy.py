@@ -1,7 +1,10 @@
 """Figures 1 to 3 and 10: a whole hierarchy, and the flat baseline on as many steps.
 
     python -m benchmarks.hierarchy [--recipe lunar-lander] [--seeds 0 1 2 3 4] [--no-flat]
+    python -m benchmarks.hierarchy --together --no-flat
 
+With ``--together`` skills and selector of ``lunar-lander`` learn from the same steps, with the
+settings and budgets of ``chains.LANDER_TOGETHER`` and ``chains.LANDER_STEPS``.
 Every run is a process of its own, so that its peak memory is its own. Training time is the sum
 of the stages' seconds, without imports; scores are greedy over 100 episodes of Gymnasium's
 environment with seeds that training never saw.
@@ -15,17 +18,31 @@ import resource
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common import median, report, run_command, table
 
 
-def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, object]:
-    """Train and score in this process."""
+def declared(recipe: str, settings: list[str]) -> Any:
+    """A recipe's hierarchy with other settings."""
     from skillweave import recipes
     from skillweave.cli.overrides import apply_overrides
 
     hierarchy = recipes.load(recipe)
     apply_overrides(hierarchy, settings)
+    return hierarchy
+
+
+def together() -> list[str]:
+    """The settings with which the skills of ``lunar-lander`` learn together."""
+    from benchmarks.chains import LANDER_STEPS, LANDER_TOGETHER
+
+    return LANDER_TOGETHER + [f"{name}={steps}" for name, steps in LANDER_STEPS.items()]
+
+
+def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, object]:
+    """Train and score in this process."""
+    hierarchy = declared(recipe, settings)
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", seed=seed, flat=flat, quiet=True)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -58,10 +75,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--no-flat", action="store_true")
     parser.add_argument("--no-hierarchy", action="store_true")
+    parser.add_argument("--together", action="store_true")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--one", type=int)
     parser.add_argument("--flat-one", action="store_true")
     given = parser.parse_args()
+    if given.together and given.recipe != "lunar-lander":
+        parser.error("--together: its settings are those of the recipe lunar-lander")
+    if given.together:
+        given.set = together() + given.set
     if given.one is not None:
         print(json.dumps(one(given.recipe, given.one, given.flat_one, given.set)))
         return
