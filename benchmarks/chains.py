@@ -86,6 +86,9 @@ FEWER = [
 LANDER_TOGETHER = [
     *FEWER,
     "skills.landing.ent_coef=0.02",
+    "skills.landing.learning_rate=0.003",
+    "selector.learning_rate=0.002",
+    "greedy_skills=false",  # found out anew, it was so each time; and that takes time
     "learn=apart, then together",
     "together.task_weight=100",
     "together.anchor_nats=none",
@@ -97,7 +100,7 @@ LANDER_STEPS = {
     "skill_steps": 10_000,
     "skills.landing.steps": 50_000,
     "selector_steps": 50_000,
-    "together_steps": 1_350_000,
+    "together_steps": 1_200_000,
 }
 """For how long: most of it together, as the task's advantage teaches more than their rewards."""
 
