@@ -88,6 +88,8 @@ LANDER_TOGETHER = [
     "skills.landing.ent_coef=0.02",
     "skills.landing.learning_rate=0.003",
     "selector.learning_rate=0.002",
+    "selector.num_envs=256",  # fewer, longer steps of the engine: less of Python for each
+    "selector.n_steps=40",
     "greedy_skills=false",  # found out anew, it was so each time; and that takes time
     "learn=apart, then together",
     "together.task_weight=100",
@@ -100,7 +102,7 @@ LANDER_STEPS = {
     "skill_steps": 10_000,
     "skills.landing.steps": 50_000,
     "selector_steps": 50_000,
-    "together_steps": 1_200_000,
+    "together_steps": 1_500_000,
 }
 """For how long: most of it together, as the task's advantage teaches more than their rewards."""
 

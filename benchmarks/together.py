@@ -5,7 +5,7 @@
 Tasks: ``8x8`` and ``16x16``, MiniGrid's DoorKey, and ``unlock-pickup``, its room with a box behind
 the door (``examples/doorkey.py``); ``bridge``, a longer chain (``examples/bridge.py``); ``yard``,
 one with continuous actions (``examples/yard.py``); ``lander``, the recipe ``lunar-lander`` apart,
-then together, measured with ``--steps 1320000``. Every case has the same number of environment
+then together, measured with ``--steps 1620000``. Every case has the same number of environment
 steps in all; one that would be the same as another on a task is refused. Scores are 100 episodes
 with seeds that training never saw: the share that is solved by a selector that samples, or on
 ``lander`` the mean return of a greedy one. MiniGrid's rooms are scored in its own environments;
