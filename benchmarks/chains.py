@@ -77,20 +77,17 @@ def _doorkey(room: str, parts: tuple[int, ...], goal: PPO | None = None, **apart
     )
 
 
-FEWER = [
-    f"{who}.{setting}"
-    for who in ("algorithm", "skills.landing")
-    for setting in ("update_epochs=3", "batch_size=1024")
-]
-"""Fewer gradient steps than the skills of ``lunar-lander`` make: together as good, and faster."""
 LANDER_TOGETHER = [
-    *FEWER,
-    "skills.landing.ent_coef=0.02",
+    # Fewer gradient steps than the recipe's skills make, but larger ones: as good, and faster.
+    "algorithm.update_epochs=3",
+    "algorithm.batch_size=1024",
+    "skills.landing.update_epochs=3",
     "skills.landing.learning_rate=0.003",
+    "skills.landing.ent_coef=0.02",
     "selector.learning_rate=0.002",
     "selector.num_envs=256",  # fewer, longer steps of the engine: less of Python for each
     "selector.n_steps=40",
-    "greedy_skills=false",  # found out anew, it was so each time; and that takes time
+    "greedy_skills=false",  # greedy ones scored less on seeds 20 to 22
     "learn=apart, then together",
     "together.task_weight=100",
     "together.anchor_nats=none",
