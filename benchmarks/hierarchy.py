@@ -102,7 +102,8 @@ def main() -> None:
             result[f"{kind}_{key}_median"] = median(r[key] for r in rows)
             result[f"{kind}_{key}_worst"] = worst(r[key] for r in rows)
         result[kind] = rows
-    report("-".join([*kinds, given.recipe]), result)
+    how = ["together"] if given.together else []
+    report("-".join([*kinds, given.recipe, *how]), result)
 
 
 def _short(value: float) -> str:

@@ -128,6 +128,19 @@ def test_the_lander_is_what_the_measured_table_says() -> None:
     asked = hierarchy.declared("lunar-lander", hierarchy.together())
     same = replace(asked, env=found.env)  # but for how many workers step it
     assert manifest(same, seed=0, flat=False) == manifest(found, seed=0, flat=False)
+    then = CASES["then"](TASKS["lander"], steps)
+    assert isinstance(then, Hierarchy)
+    assert then.selector == found.selector, "budgets alone differ"
+
+
+def test_other_recipes_have_no_settings_to_learn_together(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["hierarchy", "--together", "--recipe", "lunar-lander-tuned"]
+    monkeypatch.setattr("sys.argv", asked)
+    with pytest.raises(SystemExit):
+        hierarchy.main()
+    assert "those of the recipe lunar-lander" in capsys.readouterr().err
 
 
 def test_who_learns_is_the_same_but_for_what_a_case_names() -> None:
@@ -262,6 +275,7 @@ def test_skills_alone_are_scored_as_the_run_plays_them(
     monkeypatch.setattr(Task, "score", score)
     found = one("together", task, 4_000, "auto", f4=True, seed=0)
     # Those of `lander` are declared to sample; for `bridge` it is found out.
-    greedy = task == "bridge" and found["kept"]["kept"] != "sampled"
+    greedy = task == "bridge"
+    assert found["kept"]["kept"] != "sampled", "else the two say the same"
     skills = CASES["together"](TASKS[task], 4_000).skills
     assert asked[1:] == [*((greedy, s.name) for s in skills), (None, None)]
