@@ -102,6 +102,12 @@ LANDER_STEPS = {
     "together_steps": 1_500_000,
 }
 """For how long: most of it together, as the task's advantage teaches more than their rewards."""
+LANDER_TOTAL = sum(LANDER_STEPS.values()) + LANDER_STEPS["skill_steps"]  # of each of two skills
+
+
+def lander_budgets(steps: int = LANDER_TOTAL) -> list[str]:
+    """Settings that share out ``steps`` as ``LANDER_STEPS`` does."""
+    return [f"{name}={steps * own // LANDER_TOTAL}" for name, own in LANDER_STEPS.items()]
 
 
 def _lander(steps: int, workers: int, engine: Any = "auto", **how: Any) -> Hierarchy:
@@ -117,9 +123,7 @@ def _lander(steps: int, workers: int, engine: Any = "auto", **how: Any) -> Hiera
     if how.get("learn") != "apart":
         apply_overrides(hierarchy, LANDER_TOGETHER)
         how["selector"] = hierarchy.selector  # `then` would bring the one that learns apart
-    usual = sum(LANDER_STEPS.values()) + LANDER_STEPS["skill_steps"]  # of each of two skills
-    for name, own in LANDER_STEPS.items():
-        apply_overrides(hierarchy, [f"{name}={steps * own // usual}"])
+    apply_overrides(hierarchy, lander_budgets(steps))
     spec = replace(hierarchy.spec, workers=workers, engine=engine)
     return replace(hierarchy, env=spec, **how)
 

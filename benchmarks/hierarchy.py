@@ -35,9 +35,9 @@ def declared(recipe: str, settings: list[str]) -> Any:
 
 def together() -> list[str]:
     """The settings with which the skills of ``lunar-lander`` learn together."""
-    from benchmarks.chains import LANDER_STEPS, LANDER_TOGETHER
+    from benchmarks.chains import LANDER_TOGETHER, lander_budgets
 
-    return LANDER_TOGETHER + [f"{name}={steps}" for name, steps in LANDER_STEPS.items()]
+    return LANDER_TOGETHER + lander_budgets()
 
 
 def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, object]:
