@@ -29,10 +29,11 @@ from skillweave.recipes._cheetah import LEG, SPEED, spec
 
 UNIT = 1000.0
 """A score is a return divided by this: the mean reward of a step."""
-ARRIVAL, HASTE = 300.0, 40.0
+ARRIVAL, HASTE = 400.0, 80.0
 """What the end of a leg is worth to a skill, and what is taken off for each metre a second at which
 it is passed. A call ends there, and its value: who were not paid for it would rather not arrive.
-Who passes a point at full speed runs on for four metres more."""
+Who passes a point at full speed, five metres a second, runs on for two metres more, so that pays
+nothing. With 300 and 40 skills hardly braked on seed 10: they finished seven rounds, not nine."""
 
 
 def moved(step: Step) -> Array:
