@@ -55,6 +55,8 @@ class Bench:
         budgets = dict(zip(self._names(), self.suite.steps(), strict=True))
         for task in self._with_those_before(tasks):
             hierarchy = self.suite.hierarchy(task, None if task is source else self._skills())
+            if task is not source:
+                self._as_learnt(hierarchy)
             start = None
             if task.starts_from is not None:
                 before = self.suite.task(task.starts_from)
@@ -64,7 +66,7 @@ class Bench:
             self._weave(task, HIERARCHY, hierarchy, budgets[task.name], keep, start)
         for task in tasks:
             for agent, declare in self.suite.variants.items():
-                hierarchy = self.suite.fitted(declare(task, self._skills()))
+                hierarchy = self._as_learnt(self.suite.fitted(declare(task, self._skills())))
                 self._weave(task, agent, hierarchy, hierarchy.total_steps)
             self._without_learning(task)
 
@@ -91,12 +93,22 @@ class Bench:
 
     def _skills(self) -> dict[str, Any]:
         """The skills that were learnt on the first task from this seed."""
-        source = self.suite.tasks[0]
-        hierarchy = self.suite.hierarchy(source, None)
-        run = hierarchy.load(self._path(source, HIERARCHY))
-        policy: Any = run.policy
-        self._builds_on(source, HIERARCHY)
+        policy = self._source_policy()
         return dict(zip(policy.labels, policy.skills.policies, strict=True))
+
+    def _as_learnt(self, hierarchy: Hierarchy) -> Hierarchy:
+        """Skills are greedy, or sample, as on the first task, if neither the suite says it nor a
+        stage in which they go on learning finds it out."""
+        if hierarchy.greedy_skills is None and hierarchy.learn == "apart":
+            hierarchy.greedy_skills = self._source_policy().skills.greedy
+        return hierarchy
+
+    def _source_policy(self) -> Any:
+        """The hierarchy that was learnt on the first task from this seed."""
+        source = self.suite.tasks[0]
+        run = self.suite.hierarchy(source, None).load(self._path(source, HIERARCHY))
+        self._builds_on(source, HIERARCHY)
+        return run.policy
 
     def _without_learning(self, task: Task) -> None:
         """F4, and the suite's fixed hierarchies."""
@@ -126,7 +138,7 @@ class Bench:
         path = self._path(task, agent)
         shutil.rmtree(path, ignore_errors=True)
         self.results.begin(path)
-        return hierarchy.train(path, seed=self.seed, quiet=True)
+        return self._as_learnt(hierarchy).train(path, seed=self.seed, quiet=True)
 
     # Flat agents
 

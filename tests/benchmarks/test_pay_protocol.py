@@ -293,6 +293,23 @@ def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_
                 np.testing.assert_array_equal(value, skills[name].weights[k])
 
 
+@pytest.mark.parametrize("greedy", [True, False])
+def test_skills_act_on_every_task_as_they_did_where_they_were_learnt(tmp_path, monkeypatch, greedy):
+    found, score = {}, Bench._score
+
+    def noted(bench, run, task, agent, *args, **how):
+        found[task.name, agent] = run.policy.skills.greedy
+        return score(bench, run, task, agent, *args, **how)
+
+    def source(task):
+        return declare(task, skill_steps=128, selector_steps=256, greedy_skills=greedy)
+
+    monkeypatch.setattr(Bench, "_score", noted)
+    Bench(replace(suite(), source=source), Results(tmp_path), seed=0).run("hierarchy")
+    assert len(found) == 8  # hierarchy, long calls, F4 and always right, on two tasks
+    assert set(found.values()) == {greedy}
+
+
 def test_weights_are_chosen_by_score_on_a_seed_that_is_not_reported(done, monkeypatch):
     tuned = [r for r in done.all("line") if r.seed == TUNING_SEED]
     assert {r.agent for r in tuned} == {"tuning-0", "tuning-1"}
