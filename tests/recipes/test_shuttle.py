@@ -99,8 +99,8 @@ def test_skills_are_paid_for_speed_less_effort_and_for_the_end_of_a_leg():
     assert shuttle.Stop().reward(going) == pytest.approx(-2.0 - 0.15, abs=1e-4)
     assert not shuttle.Forward().termination(going)
     there = step_of(1.95, 2.05, 0, 1)
-    # The prize is 300, less 40 for each of the 2 m/s.
-    assert shuttle.Forward().reward(there) == pytest.approx(1.85 + 220.0, abs=1e-2)
+    # The prize is 400, less 80 for each of the 2 m/s.
+    assert shuttle.Forward().reward(there) == pytest.approx(1.85 + 240.0, abs=1e-2)
     assert shuttle.Forward().termination(there)
 
 
