@@ -16,6 +16,13 @@ HOLD = 5
 """Steps for which the block must be there."""
 TABLE = 0.425
 """Height of a block's middle that lies on the table, in metres."""
+CAMERA = {
+    "distance": 1.2,
+    "azimuth": 132.0,
+    "elevation": -14.0,
+    "lookat": np.array([1.3, 0.75, 0.6]),
+}
+"""Nearer than Gymnasium-Robotics', so that films show block and goal."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +156,7 @@ def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> g
         max_episode_steps=50 if disturbances == CALM else 100,
         render_mode=render_mode,
         disable_env_checker=True,
+        default_camera_config=CAMERA,
     )
     return Place(arm, disturbances)
 

@@ -15,7 +15,7 @@ import numpy as np
 from skillweave.envs.checks import LONGEST_FILM
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
-from skillweave.messages import whole_number
+from skillweave.messages import shortened, whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.video_file import VideoWriter, extra
@@ -66,7 +66,8 @@ def render_policy(
     seed = whole_number(seed, "seed", 0)
     limit = LONGEST_FILM if max_steps is None else whole_number(max_steps, "max_steps", 1)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen,
+        os.environ.setdefault("MUJOCO_GL", "egl")  # and so does MuJoCo
     rng = rng or (Seeds(seed) / "render").numpy()
     env = env_spec.make(render_mode="rgb_array")
     # Observations, infos and masks are those of an evaluation.
@@ -124,8 +125,18 @@ class _Film:
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:
     """What the environment shows now, reduced to at most ``MAX_WIDTH``."""
-    frame: Any = env.render()
+    name = type(env.unwrapped).__name__
+    try:
+        frame: Any = env.render()
+    except Exception as error:
+        told = f"{type(error).__name__}: {shortened(str(error))}"
+        hint = ""
+        if "GL" in f"{type(error).__module__} {told}":
+            hint = ". On a machine without a screen MuJoCo needs MUJOCO_GL=egl, or osmesa"
+        raise SkillweaveError(
+            f"{name} cannot be filmed: its render() failed, {told}{hint}"
+        ) from error
     if not isinstance(frame, np.ndarray):
-        raise SkillweaveError(f"{env} cannot be filmed: render() gave {type(frame).__name__}")
+        raise SkillweaveError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")
     factor = -(-frame.shape[1] // MAX_WIDTH)
     return frame if factor == 1 else np.asarray(extra("PIL.Image").fromarray(frame).reduce(factor))

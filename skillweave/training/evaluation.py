@@ -103,10 +103,11 @@ class Evaluation:
 
     def __str__(self) -> str:
         j = self.to_json()
-        line = (
-            f"{j['mean']:.1f} ± {j['std']:.1f} over {j['episodes']} episodes "
-            f"(95 % CI {j['ci95'][0]:.1f} to {j['ci95'][1]:.1f}, IQM {j['iqm']:.1f})"
+        digits = 2 if max(map(abs, self.returns)) < 10 else 1  # many are shares: 0 to 1
+        mean, std, low, high, iqm = (
+            f"{value:.{digits}f}" for value in (j["mean"], j["std"], *j["ci95"], j["iqm"])
         )
+        line = f"{mean} ± {std} over {j['episodes']} episodes (95 % CI {low} to {high}, IQM {iqm})"
         if j["solved_fraction"] is not None:
             line += f", {j['solved_fraction']:.0%} at {self.threshold:g} or more"
         line += f", {j['length_mean']:.0f} steps an episode"

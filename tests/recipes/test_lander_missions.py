@@ -326,3 +326,10 @@ def test_landers_in_envpool_and_in_gymnasium_have_the_same_missions():
     assert terminated
     assert not info["success"]
     assert reward == 0.0
+
+
+def test_a_mission_has_no_threshold_of_landers_own_reward():
+    pytest.importorskip("Box2D")
+    with missions.declare().spec.make() as env:
+        assert env.spec.reward_threshold is None
+        assert env.spec.max_episode_steps == 1000

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from benchmarks.pay.shuttle import POINTS
 from skillweave import SkillweaveError, Step
 from skillweave.recipes import _cheetah as cheetah
 from skillweave.recipes import shuttle
@@ -202,3 +203,19 @@ def test_skills_see_all_but_the_leg():
     assert everything - set(shuttle.RUNNER.network.sees) == set(range(21)[cheetah.LEG])
     assert shuttle.SELECTOR.network.sees is None
     assert shuttle.declare().plain_agent().algorithm.network.sees is None
+
+
+def test_a_patrol_has_no_threshold_of_the_half_cheetahs_own_reward():
+    pytest.importorskip("mujoco")
+    with shuttle.declare().spec.make() as env:
+        assert env.spec.reward_threshold is None
+        assert env.spec.max_episode_steps == 1000
+
+
+@pytest.mark.parametrize("points", list(POINTS.values()))
+def test_all_points_of_a_patrol_are_in_the_picture(points):
+    seen = cheetah.camera(points)
+    half = seen["distance"] * np.tan(np.radians(45.0 / 2.0)) * 640 / 240  # MuJoCo's angle of view
+    low, high = seen["lookat"][0] - half, seen["lookat"][0] + half
+    assert low < min(points) - 0.5
+    assert high > max(points) + 0.5

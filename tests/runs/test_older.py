@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from skillweave import PPO, Agent, Hierarchy, Network, Skill, SkillweaveError, recipes
+from skillweave import PPO, Agent, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.cli import main
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
@@ -109,13 +109,6 @@ def test_an_unfinished_run_goes_on_from_its_checkpoint(older: Path) -> None:
     steps = [line["steps"] for line in RunDirectory.open(run.path).metrics()]
     assert steps == sorted(set(steps)), "no line twice"
     assert (older / "unfinished" / "policies" / "flat.safetensors").exists()
-
-
-@pytest.mark.parametrize("name", ["lunar-lander", "lunar-lander-tuned"])
-def test_the_shipped_weights_load(name: str) -> None:
-    pytest.importorskip("Box2D")
-    run = Hierarchy.pretrained(name)
-    assert run.policy.labels == tuple(s.name for s in recipes.load(name).skills)
 
 
 @pytest.mark.parametrize(
