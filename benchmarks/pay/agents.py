@@ -122,7 +122,8 @@ class Bench:
             started = time.perf_counter()
             run = self._ready(task, SINGLE, self._random(task, self._skills()))
             names = [s.name for s in run.hierarchy.skills]
-            each = {n: run.evaluate(self.suite.episodes, skill=n) for n in names}
+            how: Any = {"deterministic": run.policy.skills.greedy}
+            each = {n: run.evaluate(self.suite.episodes, skill=n, **how) for n in names}
             best = max(each, key=lambda name: each[name].mean)
             self._save(run, task, SINGLE, 0, started, each[best].returns, {best: 1.0})
 

@@ -156,6 +156,7 @@ def make(
         **WITH_X,
         render_mode=render_mode,
         disable_env_checker=True,
+        camera_id=-1,  # one that stands still, not the model's own, which follows
         default_camera_config=camera(points),
         width=640,
         height=240,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +16,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.messages import shortened, whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
+from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds
 from skillweave.training.play import Played, SeededEpisodes, play
@@ -65,22 +64,20 @@ def render_policy(
     episodes, every = whole_number(episodes, "episodes", 1), whole_number(every, "every", 1)
     seed = whole_number(seed, "seed", 0)
     limit = LONGEST_FILM if max_steps is None else whole_number(max_steps, "max_steps", 1)
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen,
-        os.environ.setdefault("MUJOCO_GL", "egl")  # and so does MuJoCo
     rng = rng or (Seeds(seed) / "render").numpy()
-    env = env_spec.make(render_mode="rgb_array")
-    # Observations, infos and masks are those of an evaluation.
-    engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
-    try:
-        with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
-            film = _Film(env, video, every, label)
-            whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
-            how: Any = {"deterministic": deterministic, "rng": rng}
-            for played in play(policy, whole, before_step=film.before_step, **how):
-                film.after_step(played)
-    finally:
-        engine.close()
+    with without_screen():
+        env = env_spec.make(render_mode="rgb_array")
+        # Observations, infos and masks are those of an evaluation.
+        engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
+        try:
+            with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
+                film = _Film(env, video, every, label)
+                whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
+                how: Any = {"deterministic": deterministic, "rng": rng}
+                for played in play(policy, whole, before_step=film.before_step, **how):
+                    film.after_step(played)
+        finally:
+            engine.close()
     return {"path": str(path), "frames": video.frames, "episodes": film.episodes}
 
 
@@ -129,12 +126,9 @@ def frame_of(env: gym.Env[Any, Any]) -> Array:
     try:
         frame: Any = env.render()
     except Exception as error:
-        told = f"{type(error).__name__}: {shortened(str(error))}"
-        hint = ""
-        if "GL" in f"{type(error).__module__} {told}":
-            hint = ". On a machine without a screen MuJoCo needs MUJOCO_GL=egl, or osmesa"
+        told = f"{type(error).__name__}: {shortened(str(error)).rstrip('.')}"
         raise SkillweaveError(
-            f"{name} cannot be filmed: its render() failed, {told}{hint}"
+            f"{name} cannot be filmed: its render() failed with {told}.{hint(error)}"
         ) from error
     if not isinstance(frame, np.ndarray):
         raise SkillweaveError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")

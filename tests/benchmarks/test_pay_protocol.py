@@ -20,7 +20,18 @@ from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.flat import Bonus, Flat
 from benchmarks.pay.results import CODE, Results, checksum, curve_of, of_other_code, read
 from benchmarks.pay.suite import Shaped, Suite, Task
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, SkillweaveError, Step
+from skillweave import (
+    PPO,
+    EnvSpec,
+    Evaluation,
+    Hierarchy,
+    Network,
+    Run,
+    Skill,
+    SkillweaveError,
+    Step,
+)
+from skillweave.hierarchy import judging
 
 TINY = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
 
@@ -294,20 +305,38 @@ def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_
 
 
 @pytest.mark.parametrize("greedy", [True, False])
-def test_skills_act_on_every_task_as_they_did_where_they_were_learnt(tmp_path, monkeypatch, greedy):
-    found, score = {}, Bench._score
+@pytest.mark.parametrize("found_out", [True, False])
+def test_skills_act_on_every_task_as_they_did_where_they_were_learnt(
+    tmp_path, monkeypatch, greedy, found_out
+):
+    found, alone = {}, []
+    score, evaluate = Bench._score, Run.evaluate
 
     def noted(bench, run, task, agent, *args, **how):
         found[task.name, agent] = run.policy.skills.greedy
         return score(bench, run, task, agent, *args, **how)
 
+    def asked(run, *args, skill=None, **how):
+        if skill is not None:
+            alone.append(how["deterministic"])
+        return evaluate(run, *args, skill=skill, **how)
+
     def source(task):
-        return declare(task, skill_steps=128, selector_steps=256, greedy_skills=greedy)
+        if not found_out:
+            return declare(task, skill_steps=128, selector_steps=256, greedy_skills=greedy)
+        return declare(task, learn="together", together_steps=256)
+
+    def judged(policy, *args, **how):
+        return Evaluation((float(policy.skills.greedy == greedy),), (1,), None)
 
     monkeypatch.setattr(Bench, "_score", noted)
+    monkeypatch.setattr(Run, "evaluate", asked)
+    if found_out:
+        monkeypatch.setattr(judging, "evaluate", judged)
     Bench(replace(suite(), source=source), Results(tmp_path), seed=0).run("hierarchy")
     assert len(found) == 8  # hierarchy, long calls, F4 and always right, on two tasks
     assert set(found.values()) == {greedy}
+    assert alone == [greedy] * 4  # two skills, on two tasks
 
 
 def test_weights_are_chosen_by_score_on_a_seed_that_is_not_reported(done, monkeypatch):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ import numpy as np
 
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
+from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import frame_of
 from skillweave.reporting.video_file import VideoWriter
 from skillweave.training.call_log import EpisodeLog
@@ -46,8 +45,11 @@ def make_film(spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[in
         SkillweaveError: the environment gives no frames, or does not repeat itself.
         MissingExtra: the extra 'video' is not installed.
     """
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame looks for a screen
+    with without_screen():
+        return _film(spec, episodes, chosen)
+
+
+def _film(spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[int]) -> Film:
     env = spec.make(render_mode="rgb_array")
     engine = GymnasiumEngine(lambda number: env, 1, spec.name)
     steps = sum(len(episodes[i].rewards) for i in chosen)

@@ -1,0 +1,50 @@
+"""Drawing on a machine without a screen."""
+
+from __future__ import annotations
+
+import ctypes.util
+import functools
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def without_screen() -> Iterator[None]:
+    """On Linux without a screen, environments draw without one meanwhile.
+
+    pygame is told not to look for a screen. MuJoCo is told to draw with EGL, where that is
+    installed. Not for longer than this: where EGL is missing, MuJoCo could not even be imported.
+    """
+    if sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        yield
+        return
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    draws_with_egl = "MUJOCO_GL" not in os.environ and _has_egl()
+    if draws_with_egl:
+        os.environ["MUJOCO_GL"] = "egl"
+    try:
+        yield
+    finally:
+        if draws_with_egl:
+            os.environ.pop("MUJOCO_GL", None)
+
+
+@functools.cache
+def _has_egl() -> bool:
+    """The library is installed."""
+    return ctypes.util.find_library("EGL") is not None
+
+
+def hint(error: Exception) -> str:
+    """A sentence, after a space, on what to do where OpenGL could not draw; or nothing."""
+    told = f"{type(error).__module__} {error}".lower()
+    if sys.platform != "linux" or not any(k in told for k in ("opengl", "egl", "osmesa", "glfw")):
+        return ""
+    now = os.environ.get("MUJOCO_GL")
+    return (
+        f" MuJoCo draws with OpenGL, and MUJOCO_GL is {'not set' if now is None else repr(now)}. "
+        "On a machine without a screen install EGL (MUJOCO_GL=egl; Debian: libegl1) or OSMesa "
+        "(MUJOCO_GL=osmesa; libosmesa6)"
+    )
