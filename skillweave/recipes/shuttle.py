@@ -31,9 +31,10 @@ UNIT = 1000.0
 """A score is a return divided by this: the mean reward of a step."""
 ARRIVAL, HASTE = 400.0, 80.0
 """What the end of a leg is worth to a skill, and what is taken off for each metre a second at which
-it is passed. A call ends there, and its value: who were not paid for it would rather not arrive.
-Who passes a point at full speed, five metres a second, runs on for two metres more, so that pays
-nothing. With 300 and 40 skills hardly braked on seed 10: they finished seven rounds, not nine."""
+it is passed. A call ends there, and its value: a skill that is not paid for it learns not to
+arrive. At five metres a second, about the highest speed, the half-cheetah runs on for two metres
+more, and nothing is paid (beyond, it costs). With 300 and 40 skills hardly braked on seed 10: they
+finished seven rounds, not nine."""
 
 
 def moved(step: Step) -> Array:
