@@ -60,7 +60,7 @@ def test_errors_of_opengl_have_a_hint(monkeypatch, told):
     assert screen.hint(RuntimeError("no light here")) == ""
 
 
-def test_the_half_cheetah_is_drawn_with_all_of_its_patrol_in_the_picture():
+def test_the_half_cheetah_is_drawn_by_a_camera_that_stands_still():
     pytest.importorskip("mujoco")
     if ctypes.util.find_library("EGL") is None:
         pytest.skip("no EGL here")
