@@ -122,8 +122,11 @@ class Bench:
             started = time.perf_counter()
             run = self._ready(task, SINGLE, self._random(task, self._skills()))
             names = [s.name for s in run.hierarchy.skills]
-            how: Any = {"deterministic": run.policy.skills.greedy}
-            each = {n: run.evaluate(self.suite.episodes, skill=n, **how) for n in names}
+            policy: Any = run.policy
+            greedy = policy.skills.greedy
+            each = {
+                n: run.evaluate(self.suite.episodes, skill=n, deterministic=greedy) for n in names
+            }
             best = max(each, key=lambda name: each[name].mean)
             self._save(run, task, SINGLE, 0, started, each[best].returns, {best: 1.0})
 
