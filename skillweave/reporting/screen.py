@@ -12,10 +12,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_screen() -> Iterator[None]:
-    """On Linux without a screen, environments draw without one meanwhile.
+    """On Linux without a screen, environments draw without one: in this block, or this function.
 
     pygame is told not to look for a screen. MuJoCo is told to draw with EGL, where that is
-    installed. Not for longer than this: where EGL is missing, MuJoCo could not even be imported.
+    installed; this is taken back at the end, as the user may wish to draw with something else.
     """
     if sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         yield

@@ -29,6 +29,7 @@ HOLD = 1.0  # seconds that the last frame of an episode stands
 Label = Callable[[Memory], tuple[str, RGB]] | None
 
 
+@without_screen()
 def render_policy(
     env_spec: EnvSpec,
     policy: Policy,
@@ -65,19 +66,18 @@ def render_policy(
     seed = whole_number(seed, "seed", 0)
     limit = LONGEST_FILM if max_steps is None else whole_number(max_steps, "max_steps", 1)
     rng = rng or (Seeds(seed) / "render").numpy()
-    with without_screen():
-        env = env_spec.make(render_mode="rgb_array")
-        # Observations, infos and masks are those of an evaluation.
-        engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
-        try:
-            with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
-                film = _Film(env, video, every, label)
-                whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
-                how: Any = {"deterministic": deterministic, "rng": rng}
-                for played in play(policy, whole, before_step=film.before_step, **how):
-                    film.after_step(played)
-        finally:
-            engine.close()
+    env = env_spec.make(render_mode="rgb_array")
+    # Observations, infos and masks are those of an evaluation.
+    engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
+    try:
+        with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
+            film = _Film(env, video, every, label)
+            whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
+            how: Any = {"deterministic": deterministic, "rng": rng}
+            for played in play(policy, whole, before_step=film.before_step, **how):
+                film.after_step(played)
+    finally:
+        engine.close()
     return {"path": str(path), "frames": video.frames, "episodes": film.episodes}
 
 

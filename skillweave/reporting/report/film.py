@@ -38,6 +38,7 @@ class Film:
     """By an episode's number, its first frame; it shows the start."""
 
 
+@without_screen()
 def make_film(spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[int]) -> Film:
     """Play the chosen episodes again from their seeds, with the same actions, and film them.
 
@@ -45,11 +46,6 @@ def make_film(spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[in
         SkillweaveError: the environment gives no frames, or does not repeat itself.
         MissingExtra: the extra 'video' is not installed.
     """
-    with without_screen():
-        return _film(spec, episodes, chosen)
-
-
-def _film(spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[int]) -> Film:
     env = spec.make(render_mode="rgb_array")
     engine = GymnasiumEngine(lambda number: env, 1, spec.name)
     steps = sum(len(episodes[i].rewards) for i in chosen)
