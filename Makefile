@@ -8,7 +8,8 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
 SEED ?= 0
-# Recipes whose weights are shipped (those of keys-and-doors would be 10 MB).
+# Recipes whose weights are shipped (those of keys-and-doors would be 10 MB), as two cores make them: on
+# as many, pick-and-place's are the same, as one process for each core steps its environments.
 WITH_WEIGHTS := lunar-lander lunar-lander-tuned lander-missions mazes shuttle pick-and-place
 # One process for each core, and one more, as some tests wait for other processes; a process that
 # has no tests left takes some of another's.
