@@ -35,7 +35,7 @@ def few_episodes() -> Iterator[None]:
     assert kept.EPISODES == judging.EPISODES == 100, "so it is documented"
     with pytest.MonkeyPatch.context() as patch:
         for module in (judging, kept):
-            patch.setattr(module, "EPISODES", 10)
+            patch.setattr(module, "EPISODES", 4)
         yield
 
 

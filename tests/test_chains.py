@@ -45,7 +45,7 @@ def chain(*skills, **how):
 
 def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monkeypatch):
     monkeypatch.setattr(skill_rows, "PATIENCE", 60)
-    hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart")
+    hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart", skill_steps=600)
     says = (
         r"'beyond': initiation\(\) held nowhere in 60 steps of calling 'get_key', so .*"
         r"observation was \[.*before it in skills"

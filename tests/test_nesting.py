@@ -44,8 +44,8 @@ class Right(Skill):
 
 
 def options(**how):
-    told = {"env": CARTPOLE, "algorithm": ON, "selector": ON, "skill_steps": 300}
-    return told | {"selector_steps": 300, "together_steps": 900, "cut_every": 150} | how
+    told = {"env": CARTPOLE, "algorithm": ON, "selector": ON, "skill_steps": 150}
+    return told | {"selector_steps": 150, "together_steps": 450, "cut_every": 75} | how
 
 
 def inside(*skills, **how):
@@ -124,7 +124,7 @@ def in_parts():
 
 
 BUSY = {"call_steps": Lengths(1, ..., 8), "interrupt": True}
-SHORT = {"skill_steps": 100, "selector_steps": 100, "together_steps": 300}
+SHORT = {"skill_steps": 50, "selector_steps": 50, "together_steps": 150}
 MODES = Automaton({"low": ["balance", "right"], "high": "right"}, {
     ("low", "high"): lambda step: step.next_obs[:, 2] > 0.02,
     ("high", "low"): lambda step: step.next_obs[:, 2] < 0,
@@ -141,7 +141,7 @@ KINDS = {
     "its own ends apart": lambda: declare(careful(interrupt=True)),
     "a ready selector": lambda: declare(inside(selector=ready), learn="together"),
     "inside, then": lambda: declare(
-        inside(learn="apart, then together", skill_steps=100, selector_steps=100)
+        inside(learn="apart, then together", skill_steps=50, selector_steps=50)
     ),
     "inside, then, in some places": lambda: declare(
         inside(Balance(), learn="apart, then together", together_steps=200)
@@ -157,7 +157,7 @@ KINDS = {
         reflexes=[Reflex(far, 1)],
     ),
     "guides, start calls": lambda: declare(
-        inside(guide=MODES, start_calls=2), skill_steps=100, selector_steps=100
+        inside(guide=MODES, start_calls=2), skill_steps=50, selector_steps=50
     ),
     "then, inside and outside": lambda: declare(
         inside(learn="apart, then together", **SHORT), learn="apart, then together", **SHORT
@@ -215,7 +215,7 @@ def test_all_learn_at_every_level_in_one_stream(whole, kind):
     assert {k.rpartition("/")[2] for k in deep} >= {"selector", "balance", "right"}
     for name in deep:
         assert any(k.startswith(f"{name}.") for k in told), f"{name} has learnt nothing"
-    assert 900 <= entry["steps"] <= 900 + 64
+    assert 450 <= entry["steps"] <= 450 + 32
 
 
 def test_selectors_at_all_levels_stay_near_their_guides(whole):
@@ -379,10 +379,10 @@ def test_a_hierarchy_of_a_run_can_be_a_skill_beside_one_that_is_trained(tmp_path
 
 def test_budgets_of_all_levels_count_and_are_scaled():
     found = declare()
-    assert found.total_steps == (300 + 300 + 300) + 300 + 300
+    assert found.total_steps == (150 + 150 + 150) + 150 + 150
     found.scale(2.0)
-    assert found.total_steps == 3000
-    assert declare(learn="together").total_steps == 900
+    assert found.total_steps == 1500
+    assert declare(learn="together").total_steps == 450
 
 
 class Forever(Skill):

@@ -55,9 +55,9 @@ class Balance(Skill):
     def termination(self, step):
         return np.abs(step.next_obs[:, 0]) > 0.5
 
-small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=Network(hidden=(8,)))
+small = PPO(num_envs=8, n_steps=4, batch_size=16, update_epochs=2, network=Network(hidden=(8,)))
 moving = PPO(
-    num_envs=4, n_steps=8, batch_size=32, update_epochs=1, network=Network((6,)), overlap=False,
+    num_envs=8, n_steps=4, batch_size=32, update_epochs=1, network=Network((6,)), overlap=False,
     normalize_obs=True, learning_rate_schedule="kl", target_kl=0.01, critic=Network(hidden=(5, 5)),
 )
 Left.algorithm = moving
@@ -68,9 +68,9 @@ hierarchy = Hierarchy(
     reflexes=[Reflex(lambda obs: obs[:, 2] > 0.05, action=1, name="catch")],
     algorithm=small,
     selector=small,
-    skill_steps=600,
-    selector_steps=1500,
-    cut_every=150,
+    skill_steps=300,
+    selector_steps=750,
+    cut_every=75,
     greedy_skills=False,
 )
 '''
@@ -135,7 +135,7 @@ def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
     assert {r["stage"] for r in found} == {"left", "balance", "selector"}
     for stage in ("left", "balance", "selector"):
         steps = [r["steps"] for r in found if r["stage"] == stage]
-        assert len({s // 150 for s in steps}) >= 4, "too few clean cuts"
+        assert len({s // 75 for s in steps}) >= 4, "too few clean cuts"
     one, two = [r["learning_rate"] for r in found if r["stage"] == "left"][:2]
     assert one != two
 
@@ -144,7 +144,7 @@ def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("tick", [1, 7, 19, 21, 24, 30, 33])
+@pytest.mark.parametrize("tick", [1, 7, 10, 12, 15, 21, 24])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
     tmp_path: Path, reference: Reference, engine: str, tick: int
 ) -> None:
@@ -165,7 +165,7 @@ def test_a_run_stopped_again_and_again_ends_as_if_it_had_not_been(
         run = RunDirectory.open(path)
         try:
             # As many ticks as reach the next clean cut, but not the one after it.
-            training.train(recipes.load(str(recipe)), run, (StopAt(7),))
+            training.train(recipes.load(str(recipe)), run, (StopAt(4),))
             break
         except Stopped:
             stops += 1
@@ -246,8 +246,8 @@ def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Refe
 
 
 SETTINGS = [  # a run that lost any of them would end otherwise
-    ["reflexes_in_training=false", "skills.left.gamma=0.9", "cut_every=250", "selector_steps=700"],
-    ["greedy_skills=true", "call_steps=9", "skills.left.steps=400", "selector.learning_rate=0.01"],
+    ["reflexes_in_training=false", "skills.left.gamma=0.9", "cut_every=125", "selector_steps=350"],
+    ["greedy_skills=true", "call_steps=9", "skills.left.steps=200", "selector.learning_rate=0.01"],
     ["start_calls=2", "search_steps=12"],
     ["start_calls=2", "episode_calls=3"],
 ]
@@ -314,12 +314,12 @@ def stage_of(name: str, save_buffer: bool = True) -> Stage:
 
         return Scene("Echo", space, acts, collector)
 
-    return Stage("echo", "agent", config, 1300, scene)
+    return Stage("echo", "agent", config, 650, scene)
 
 
 def echo_run(path: Path, stage: Stage) -> RunDirectory:
     manifest = {
-        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 250, "skills": [],
+        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 125, "skills": [],
         "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "stages": [stage.entry()],
     }  # fmt: skip
     return RunDirectory.create(path, manifest)
@@ -339,14 +339,14 @@ def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
     stage = stage_of(name)
     train_echo(echo_run(tmp_path / "whole", stage), stage)
     run = echo_run(tmp_path / "run", stage)
-    for stop in (3, 4):  # a tick at each cut, every 250 steps
+    for stop in (3, 4):  # a tick at each cut, every 125 steps
         with pytest.raises(Stopped):
             train_echo(run, stage, StopAt(stop))
         run = RunDirectory.open(run.path)
         assert (run.path / "checkpoint.safetensors").exists()
     train_echo(run, stage)
     assert policies(run.path) == policies(tmp_path / "whole")
-    assert [r["steps"] for r in lines(run.path)] == [252, 500, 752, 1000, 1252, 1300]
+    assert [r["steps"] for r in lines(run.path)] == [128, 252, 376, 500, 628, 652]
     assert_metrics_fit(run.path, tmp_path / "whole")
 
 
@@ -368,7 +368,7 @@ def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
     assert RunDirectory.open(run.path).finished
     mine, theirs = policies(run.path), policies(tmp_path / "whole")
     assert mine["echo.safetensors"][1] != theirs["echo.safetensors"][1]
-    assert [r["steps"] for r in lines(run.path)] == [252, 500, 752, 1000, 1252, 1300]
+    assert [r["steps"] for r in lines(run.path)] == [128, 252, 376, 500, 628, 652]
 
 
 def test_a_hierarchy_that_learns_from_replay_ends_as_if_it_had_not_been_stopped(
@@ -423,9 +423,9 @@ LEARNERS = {
 
 
 FEWER_STEPS = {
-    "skill_steps=600": "skill_steps=300",
-    "selector_steps=1500": "selector_steps=600",
-    "cut_every=150": "cut_every=75",
+    "skill_steps=300": "skill_steps=200",
+    "selector_steps=750": "selector_steps=400",
+    "cut_every=75": "cut_every=50",
 }
 
 
@@ -487,7 +487,7 @@ def test_a_run_of_any_learner_stopped_again_and_again_ends_as_if_it_had_not_been
     run = new_run(recipes.load(recipe), tmp_path / "run")
     while True:
         try:
-            training.train(recipes.load(recipe), run, (Killer(8),))
+            training.train(recipes.load(recipe), run, (Killer(6),))
             break
         except Stopped:
             stops += 1
@@ -518,7 +518,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("interrupted")
     recipe = write_recipe(folder)
     command = [sys.executable, "-m", "skillweave", "train", str(recipe), "-o", str(folder / "run")]
-    command += ["--seed", "3", "--set", "skill_steps=6000", "--evaluate", "0"]
+    command += ["--seed", "3", "--set", "skills.left.steps=3000", "--evaluate", "0"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -551,7 +551,7 @@ def test_a_run_stopped_by_ctrl_c_ends_as_if_it_had_not_been(
     common = ["--quiet", "--evaluate", "0"]
     assert main(["resume", str(run), "--recipe", recipe, *common]) == 0
     whole = str(tmp_path / "whole")
-    more = ["--set", "skill_steps=6000", "--seed", "3"]
+    more = ["--set", "skills.left.steps=3000", "--seed", "3"]
     assert main(["train", recipe, "-o", whole, *more, *common]) == 0
     assert_same(run, tmp_path / "whole")
 

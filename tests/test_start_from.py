@@ -57,8 +57,8 @@ class Other(Skill):
 
 def declare(learn="apart", rate=None, skills=(Left, Other, Push), **how):
     settings = {
-        "call_steps": 5, "skill_steps": 600, "selector_steps": 600, "together_steps": 1_200,
-        "algorithm": ON, "selector": ON, "cut_every": 200, "greedy_skills": False,
+        "call_steps": 5, "skill_steps": 300, "selector_steps": 300, "together_steps": 600,
+        "algorithm": ON, "selector": ON, "cut_every": 100, "greedy_skills": False,
     }  # fmt: skip
     env = how.pop("env", "CartPole-v1")
     found = Hierarchy(env, [s() for s in skills], learn=learn, **settings | how)
@@ -155,7 +155,7 @@ def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_
     assert set(moments) == {"obs_mean", "obs_var"}
     run = declare().train(tmp_path / "run", seed=6, quiet=True, start_from=source)
     (told,) = [s["starts"] for s in run.info()["stages"] if s["name"] == "left"]
-    assert told["left"]["steps"] == 640  # of the source's stage: ten rollouts
+    assert told["left"]["steps"] == 320  # of the source's stage: ten rollouts
     config = PPO(num_envs=4, n_steps=16, network=SMALL, learning_rate=STILL)
     Agent("CartPole-v1", config, 6_400).train(tmp_path / "a", quiet=True)
     Agent("CartPole-v1", config, 64).train(tmp_path / "b", quiet=True, start_from=tmp_path / "a")
@@ -399,7 +399,7 @@ def test_the_command_takes_a_run(source, tmp_path, capsys):
     assert "start from" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "run")]) == 0
     run = json.loads((source / "run.json").read_text())["id"]
-    assert f"left starts from run {run}, after 640 steps there" in capsys.readouterr().out
+    assert f"left starts from run {run}, after 320 steps there" in capsys.readouterr().out
     assert_near(weights_of(tmp_path / "run")["selector"], weights_of(source)["selector"])
     assert main(["train", str(recipe), "--start-from", str(tmp_path / "no"), *out]) == 1
     assert "holds no run" in capsys.readouterr().err

@@ -50,10 +50,10 @@ def declare(*skills, **how):
         "algorithm": ON,
         "selector": ON,
         "learn": "together",
-        "together_steps": 900,
-        "skill_steps": 300,
-        "selector_steps": 300,
-        "cut_every": 150,
+        "together_steps": 450,
+        "skill_steps": 150,
+        "selector_steps": 150,
+        "cut_every": 75,
     }
     return Hierarchy(**options | how)
 
@@ -84,7 +84,7 @@ KINDS = {
     "then": lambda: declare(
         learn="apart, then together", together=Together(anchor_nats=0.001), greedy_skills=True
     ),
-    "interrupt apart": lambda: declare(learn="apart", interrupt=True, selector_steps=900),
+    "interrupt apart": lambda: declare(learn="apart", interrupt=True, selector_steps=450),
 }
 
 
@@ -112,7 +112,7 @@ def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
         assert f"{name}.samples" in told
     (entry,) = RunDirectory.open(path).manifest["stages"]
     assert entry["learns"] == ["selector", "left", "balance", "skill_critic"]
-    assert 900 <= entry["steps"] <= 900 + 64, "a stage ends within one rollout of its budget"
+    assert 450 <= entry["steps"] <= 450 + 32, "a stage ends within one rollout of its budget"
 
 
 def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch):
@@ -334,11 +334,11 @@ class Right(Skill):
 
 def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
     """What a flat agent would learn from: the value of a state is that of its episode."""
-    alone = declare(Right(), call_steps=1, together_steps=6_000, together=Together(floor=0.0))
+    alone = declare(Right(), call_steps=1, together_steps=3_000, together=Together(floor=0.0))
     path = tmp_path / "run"
     alone.train(path, seed=0, quiet=True)
     found = lines(path)[-1]
-    assert found["right.samples"] == 64
+    assert found["right.samples"] == 32
     assert (found["right.usage"], found["selector.call_length"]) == (1.0, 1.0)
     assert found["length"] > 15
 
@@ -371,8 +371,8 @@ def test_lengths_double_where_dots_stand():
 
 
 def test_a_skill_that_would_never_learn_is_told(tmp_path):
-    with pytest.raises(SkillweaveError, match="budget is 30 steps, but 'other' begins to learn"):
-        declare(Left(), Other(), together_steps=30).train(tmp_path / "run", quiet=True)
+    with pytest.raises(SkillweaveError, match="budget is 15 steps, but 'other' begins to learn"):
+        declare(Left(), Other(), together_steps=15).train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 
 

@@ -11,6 +11,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.envs.engine import checksums
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.options import OptionsEnv
@@ -117,6 +118,22 @@ def test_steps_do_not_write_to_observations_of_before(engine):
     second = e.step(np.zeros(3, np.int64)).next_obs
     assert np.array_equal(first, kept)
     assert not np.array_equal(first, second)
+
+
+def test_checksums_are_of_the_parts_and_not_of_the_bytes_between_them():
+    # Whoever copies rows copies these bytes or not: a run that goes on would begin all anew.
+    inner = Dict(on=Discrete(2), far=Box(-1, 1, (2,), np.float64))
+    dtype = obs_dtype(Dict(near=Box(-1, 1, (1,), np.float32), inner=inner))
+    zeros, ones = (np.full(dtype.itemsize * 3, byte, np.uint8).view(dtype) for byte in (0, 255))
+    for name in dtype.names:
+        ones[name] = zeros[name]
+    assert zeros.tobytes() != ones.tobytes()
+    np.testing.assert_array_equal(checksums(zeros), checksums(ones))
+    for change in ("near", "on", "far"):
+        other = zeros.copy()
+        part = other if change == "near" else other["inner"]
+        part[change][1] += 1
+        assert (checksums(other) != checksums(zeros)).tolist() == [False, True, False]
 
 
 def test_envpool_takes_no_observations_of_parts():

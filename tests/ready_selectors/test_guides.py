@@ -97,10 +97,10 @@ def declare(*skills, **how):
         "call_steps": 4,
         "algorithm": ON,
         "selector": ON,
-        "skill_steps": 300,
+        "skill_steps": 150,
         "selector_steps": 400,
-        "together_steps": 900,
-        "cut_every": 150,
+        "together_steps": 450,
+        "cut_every": 75,
         "greedy_skills": True,  # chance is another one with another number of environments
     }
     return Hierarchy(**options | how)
@@ -113,7 +113,7 @@ KINDS = {
     "function": lambda: declare(selector=by_rule, learn="together", algorithm=OFF),
     "tree, then": lambda: declare(selector=TREE, learn="apart, then together"),
     "restricted": lambda: declare(guide=AUTOMATON, learn="together"),
-    "restricted, from replay": lambda: declare(guide=AUTOMATON, selector=OFF, selector_steps=900),
+    "restricted, from replay": lambda: declare(guide=AUTOMATON, selector=OFF, selector_steps=450),
     "near a tree": lambda: declare(guide=TREE, guide_restricts=False, guide_nats=0.05),
     "near and restricted, then": lambda: declare(
         guide=AUTOMATON, guide_nats=0.1, learn="apart, then together", call_steps=Lengths(1, 4)
