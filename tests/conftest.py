@@ -1,5 +1,6 @@
 """One torch thread, the same examples of hypothesis in each run, shapes checked."""
 
+import gc
 import importlib.util
 import os
 import signal
@@ -24,6 +25,16 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
 
     # Before anything else imports these: `from … import gae` then finds what is checked.
     check_shapes("returns", "losses", "distributions", "optim")
+
+
+def pytest_collection_finish() -> None:
+    """All tests are known: what they are made of is kept, and not searched for garbage any more.
+
+    It is a great many objects, and was searched again and again as tests made their own.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -92,7 +92,7 @@ def on_device(algorithm: Any, mode: FakeTensorMode) -> Any:
 @pytest.mark.parametrize("name", ON)
 def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
     config, seen, space = ON[name]
-    algorithm = make_algorithm(replace(config, batch_size=4), seen, space)
+    algorithm = make_algorithm(replace(config, batch_size=6, update_epochs=2), seen, space)
     # Only here may a host wait; the number of ends of a rollout, say.
     monkeypatch.setattr(rollouts, "on_host", lambda *counts: [3 for _ in counts])
     lead, width = (P, T, B), algorithm.head.width
@@ -120,7 +120,7 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
 
 def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_cpu(monkeypatch):
     config, seen, space = ON["discrete"]
-    algorithm = make_algorithm(replace(config, batch_size=4), seen, space)
+    algorithm = make_algorithm(replace(config, batch_size=6, update_epochs=2), seen, space)
     monkeypatch.setattr(rollouts, "on_host", lambda *counts: [3 for _ in counts])
     lead, width = (P, T, B), algorithm.head.width
     batch = Rollout(
