@@ -16,11 +16,11 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.training.stage import assign_workers
 
 SMALL = Network(hidden=(8,))
-ON = PPO(num_envs=8, n_steps=4, batch_size=32, update_epochs=2, network=SMALL)
+ON = PPO(num_envs=4, n_steps=8, batch_size=16, update_epochs=2, network=SMALL)
 OFF = DQN(
-    num_envs=8, batch_size=16, learning_starts=20, buffer_size=2_000, train_freq=1, network=SMALL
+    num_envs=4, batch_size=16, learning_starts=20, buffer_size=2_000, train_freq=2, network=SMALL
 )
-MEMORY = PPO(num_envs=8, n_steps=4, batch_size=32, network=Network(hidden=(8,), rnn=RNN("gru", 6)))
+MEMORY = PPO(num_envs=4, n_steps=8, batch_size=16, network=Network(hidden=(8,), rnn=RNN("gru", 6)))
 
 
 class Left(Skill):

@@ -200,11 +200,11 @@ class GymnasiumEngine:
 
 def checksums(obs: Array) -> Array:
     """A number for each row of observations (n, *obs_shape), (n,) int64; equal rows, equal ones."""
-    found = np.zeros(len(obs), np.int64)
+    found = [0] * len(obs)
     for part in _parts(obs):
         rows = (np.ascontiguousarray(row).tobytes() for row in part)
-        found[:] = [zlib.crc32(row, before) for row, before in zip(rows, found, strict=True)]
-    return found
+        found = [zlib.crc32(row, before) for row, before in zip(rows, found, strict=True)]
+    return np.array(found, np.int64)
 
 
 def _parts(obs: Array) -> list[Array]:

@@ -86,7 +86,7 @@ def pack(space: gym.Space[Any], batched: Any) -> Array:
     """
     if parts(space) is None or isinstance(batched, np.ndarray):
         return np.asarray(batched)
-    # Zeros, as the bytes between aligned parts are written to files, too.
+    # Zeros: the bytes between parts are written to files, which should be the same each time.
     packed = np.zeros(_lead(space, batched), obs_dtype(space))
     _fill(space, packed, batched)
     return packed
