@@ -14,8 +14,8 @@ WITH_WEIGHTS := lunar-lander lunar-lander-tuned lander-missions mazes shuttle pi
 # One process for each core, and one more, as some tests wait for other processes; a process that
 # has no tests left takes some of another's.
 CORES := $(BIN)/python -c 'import os; a = getattr(os, "sched_getaffinity", None); print(len(a(0)) if a else os.cpu_count())'
-# Compiled modules are kept even where the shell says that they are not to be: tests start hundreds
-# of processes that import the same ones.
+# Compiled modules are kept even where the shell says that they are not to be: tests start many
+# processes that import the same ones.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $$(($$($(CORES)) + 1)) --dist worksteal
 
 .PHONY: demo test check docs torture bench figures weights smoke clean

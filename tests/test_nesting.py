@@ -189,6 +189,7 @@ def whole(tmp_path_factory):
 STOPS = dict.fromkeys(KINDS, (3, 4))
 # After (3, 4) ticks these are at the start of a stage, where there is no checkpoint yet.
 STOPS |= {"inside, then": (11, 4), "then, inside and outside": (11, 10)}
+STOPS["a ready selector"] = (3, 9)  # after 4 its episodes are still the first ones
 LATER = [("apart", (15, 11)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
 
 
