@@ -32,8 +32,8 @@ from typing import Any
 from benchmarks.chains import TASKS, Task
 from benchmarks.common import cases_asked, median, report, table, workers
 from benchmarks.pay.agents import by_lot
-from benchmarks.pay.flat import Flat, with_bonus
-from benchmarks.pay.suite import Shaped
+from benchmarks.pay.flat import Flat
+from benchmarks.pay.suite import Seldom, Shaped
 from skillweave import PPO, Array, Hierarchy, Lengths, Run, Skill, SkillweaveError, Step
 from skillweave.hierarchy.training import manifest
 
@@ -170,7 +170,7 @@ def flat(task: Task, steps: int, weight: float = 0.0, bonus: float = 0.0, **how:
         weights = {skill.name: weight for skill in hierarchy.skills}
         agent.learns = Shaped(list(hierarchy.skills), weights, task_weight=1.0)
     if bonus:
-        agent.learns_in = with_bonus(hierarchy.spec, task.cells, bonus)
+        agent.learns = Seldom(task.cells, bonus)
     return agent
 
 

@@ -7,10 +7,11 @@ Suites: shuttle, pick-and-place, lander-missions, mazes, keys-and-doors. A resul
 folder is not made again, and a training that was killed goes on where it stood, so the same command
 finishes what it began. Results of other code than today's are named under the table.
 
-Agents, each with at least the hierarchy's steps, what learnt its skills included: F0 flat; F1 flat,
-on the task's reward and the weighted sum of the skills' rewards (weights chosen on seed 100); F2
-flat with a bonus for states that were seldom seen; F3 flat, fine-tuned from the first task; F4
-random skills, and the best single skill.
+Agents, all with the hierarchy's steps, what learnt its skills included: F0 flat; F1 flat, on the
+task's reward and the weighted sum of the skills' rewards (weights chosen on seed 100); F2 flat with
+a bonus for states that were seldom seen; F3 flat, fine-tuned from the first task; F4 random skills,
+and the best single skill. F1 and F2 learn the first task of each suite, and the lander's tour; and
+any task that is named.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 from benchmarks.pay.agents import CHAINS
 from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.jobs import SUITES, run_all, suite_of
-from benchmarks.pay.results import Results, of_other_code
+from benchmarks.pay.results import Results, hours, of_other_code
 from skillweave.types import SkillweaveError
 
 
@@ -77,14 +78,17 @@ def main(arguments: list[str] | None = None) -> None:
             for chain in asked.agents
         ]
         run_all(jobs, asked.processes)
+    spent = 0.0
     for name in suites:
         suite = suite_of(name, asked.quick)
-        results = reported(Results(out).all(name), seeds)
+        results = reported(every := Results(out).all(name), seeds)
+        spent += hours(every)
         if results:
             print(f"\n{name}\n{make_table(suite, results)}")
             if told := of_other_code(results):
                 print(told)
             print(*draw(suite, results, out), sep="\n", flush=True)
+    print(f"\nall results of these suites took {spent:.1f} hours of one process")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -26,12 +27,15 @@ class Task:
         solved: a score from here on counts as solved.
         starts_from: an earlier task, by name: the hierarchy begins with what it was at the end of
             that one, its skills too, where they go on learning. F3 is the same of a flat agent.
+        alone: whether F0 to F2 have here all that the hierarchy takes for this task alone: what
+            learnt its skills, too.
     """
 
     name: str
     env: EnvSpec
     solved: float
     starts_from: str | None = None
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,6 @@ class Suite:
         bonus: what a first visit of a cell is worth to F2, in units of the task's reward.
         variants: hierarchies that learn a selector over the same skills in another way, by name.
         fixed: hierarchies in which nothing more is learnt, by name: ready selectors, mostly.
-        flat_steps: what a flat agent gets for each further task; None: an equal share of all steps
-            of the hierarchy, and never fewer than the hierarchy has there.
         episodes: how many are played for a score.
         greedy: whether agents act greedily then, or sample.
         evaluations: points of a curve.
@@ -74,7 +76,6 @@ class Suite:
     bonus: float = 1.0
     variants: Mapping[str, Callable[[Task, Policies], Hierarchy]] = field(default_factory=dict)
     fixed: Mapping[str, Callable[[Task, Policies], Hierarchy]] = field(default_factory=dict)
-    flat_steps: int | None = None
     episodes: int = 50
     greedy: bool = True
     evaluations: int = 12
@@ -116,10 +117,15 @@ class Suite:
         return [self.hierarchy(first, None).total_steps, *further]
 
     def steps_flat(self) -> list[int]:
-        """What a flat agent gets for each task: at least as much as the hierarchy."""
+        """What a flat agent gets for each task: as much as the hierarchy, or more (``alone``)."""
         own = self.steps()
-        share = round(self.flat_steps * self.scale) if self.flat_steps else sum(own) // len(own)
-        return [own[0], *(max(n, share) for n in own[1:])]
+        more = [own[0] if t.alone else 0 for t in self.tasks[1:]]
+        return [own[0], *(n + m for n, m in zip(own[1:], more, strict=True))]
+
+    @property
+    def headlines(self) -> list[Task]:
+        """Where F1 and F2 learn: the first task, and those that flat agents learn alone."""
+        return [t for t in self.tasks if t is self.tasks[0] or t.alone]
 
 
 class Shaped(Skill):
@@ -135,6 +141,32 @@ class Shaped(Skill):
         own = [self.weights[s.name] * s.reward(step) for s in self.skills if s.name in self.weights]
         total: Array = np.sum([self.task_weight * step.reward, *own], axis=0)
         return total
+
+
+class Seldom(Skill):
+    """F2: the task's own reward, and ``size / √n`` for the n-th visit of a cell.
+
+    Bellemare et al. 2016 and Tang et al. 2017 ("#Exploration"): counts of cells in place of states.
+    A training that was stopped counts anew.
+
+    Args:
+        cells: observations (n, ...) to whole numbers (n, k).
+        size: of the bonus for a first visit, in units of the task's reward.
+    """
+
+    def __init__(self, cells: Callable[[Array], Array], size: float) -> None:
+        self._cells, self._size = cells, size
+        self._counts: Counter[bytes] = Counter()
+
+    def reward(self, step: Step) -> Array:
+        """With the bonus for where each step leads."""
+        visits = np.empty(len(step.reward))
+        for i, cell in enumerate(self._cells(step.next_obs).astype(np.int64)):
+            key = cell.tobytes()
+            self._counts[key] += 1
+            visits[i] = self._counts[key]
+        found: Array = step.reward + self._size / np.sqrt(visits)
+        return found
 
 
 def _nobody(obs: Array) -> Array:

@@ -13,12 +13,15 @@ import torch
 from skillweave.types import SkillweaveError
 
 
-def compiled(function: Callable[..., Any], setting: str) -> Callable[..., Any]:
+def compiled(
+    function: Callable[..., Any], setting: str, *, sizes_vary: bool = False
+) -> Callable[..., Any]:
     """``function``, compiled by its first call; its arguments' shapes must not change much.
 
     Args:
         function: tensor operations, which may differentiate within; nothing else.
         setting: what asks for it, named in errors.
+        sizes_vary: where a size changes it is compiled once more, for any size there.
 
     Raises:
         SkillweaveError: this torch cannot, or (by the first call) finds no C++ compiler.
@@ -31,7 +34,11 @@ def compiled(function: Callable[..., Any], setting: str) -> Callable[..., Any]:
             "torch 2.13 or newer, or leave it at False"
         )
     # One algorithm's programs do not count against another's limit.
-    how: Any = {"fullgraph": True, "dynamic": False, "isolate_recompiles": True}
+    how: Any = {
+        "fullgraph": True,
+        "dynamic": None if sizes_vary else False,
+        "isolate_recompiles": True,
+    }
     program = torch.compile(function, **how)
 
     def call(*args: Any) -> Any:

@@ -105,6 +105,8 @@ class PPO(OnPolicy):
     """Continuous actions go through tanh, else they are clipped to the bounds."""
     critic: Network | None = None
     """The critic's network; None: as the actor's."""
+    compile: bool = False
+    """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,6 +125,7 @@ class PPO(OnPolicy):
         one_of(self, "learning_rate_schedule", ("constant", "linear", "kl"))
         if self.network.rnn is not None:
             check(self, "critic", self.critic is None, "None where network.rnn is set")
+            check(self, "compile", not self.compile, "False where network.rnn is set")
         rollout = self.num_envs * self.n_steps
         most = max(rollout, PPO.batch_size)  # a small rollout alone is no mistake
         says = f"at most {most}; a rollout has num_envs·n_steps ({rollout}) samples"

@@ -1,13 +1,14 @@
 """PPO (Schulman et al. 2017) for P members at once; a single agent is P = 1.
 
-Read down the page: State, init, act, value, update, loss; then ``ppo_samples``. The settings are
-``config.PPO``. What acted may be an update old: the objective is the decoupled one of Hilton, Cobbe
-& Schulman 2022.
+Read down the page: State, init, act, value, update, learn, loss; then ``ppo_samples``. The settings
+are ``config.PPO``. What acted may be an update old: the objective is the decoupled one of Hilton,
+Cobbe & Schulman 2022.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
+from skillweave.algorithms.compiled import compiled
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.ppo_samples import Terms, floor_now, samples_of
@@ -149,32 +151,67 @@ class PPOAlgorithm(Algorithm):
         cfg = self.config
         now = Terms.of(cfg, state, batch)
         samples, metrics = samples_of(self, state, batch, now)
-        leaves, rate = self.layout.leaves(state.params), now.rate
-        limit = None if cfg.learning_rate_schedule == "kl" else cfg.target_kl
-        count = samples.count
-        active, all_learn = count > 0, limit is None and samples.valid is None
+        rate, count, limited = now.rate, samples.count, self._kl_limit is not None
         names = REPORT if now.anchor is None else (*REPORT, "anchor_kl")
         taken, sums = torch.zeros_like(rate), rate.new_zeros(len(names), len(rate))
+        # A compiled step makes its leaves itself; others share these.
+        leaves = None if cfg.compile else self.layout.leaves(state.params)
+        learn = self._compiled if cfg.compile else self.learn
+        active, all_learn = count > 0, not limited and samples.valid is None
         for minibatch in minibatches(samples, rng, cfg.update_epochs, cfg.batch_size):
-            loss, report = self.loss(leaves, state, minibatch, now)
-            grad = self.layout.gradient(loss, leaves)
-            report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
+            found, learns = learn(state, leaves, minibatch, now, None if all_learn else active)
             taken = taken + active
-            sums.addcmul_(torch.stack([report[k] for k in names]), active.float())
-            if limit is not None:
-                # As in Stable-Baselines3: a member stops before the step that oversteps.
-                active = active & (report["kl"] <= 1.5 * limit)
-                if all_false(active):
-                    break
-            adam_(
-                state.params, grad, state.mu, state.nu, state.count, rate,
-                eps=cfg.adam_eps, active=None if all_learn else active,
-            )  # fmt: skip
+            sums.addcmul_(torch.stack([found[k] for k in names]), active.float())
+            active = active if learns is None else learns
+            if limited and all_false(active):
+                break
         metrics |= dict(zip(names, sums / taken.clamp_min(1.0), strict=True))
         if cfg.learning_rate_schedule == "kl":
             target = torch.full_like(rate, cfg.target_kl or 0.0)
             state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)
         return state, Report(metrics | {"learning_rate": rate, "samples": count})
+
+    @property
+    def _kl_limit(self) -> float | None:
+        """The KL beyond which a member learns no more from this rollout; None: there is none."""
+        cfg = self.config
+        if cfg.target_kl is None or cfg.learning_rate_schedule == "kl":
+            return None
+        return 1.5 * float(cfg.target_kl)  # as in Stable-Baselines3
+
+    @functools.cached_property
+    def _compiled(self) -> Callable[..., Any]:
+        # Skills that learn together have as many rows as they acted in: each time others.
+        return compiled(self.learn, f"{type(self.config).__name__}.compile", sizes_vary=True)
+
+    def learn(
+        self,
+        state: State,
+        leaves: Views | None,
+        batch: Samples,
+        now: Terms,
+        active: Tensor | None,
+    ) -> tuple[dict[str, Tensor], Tensor | None]:
+        """One gradient step, in place: nothing but tensor operations, so that it can be compiled.
+
+        Args:
+            leaves: of ``state.params``; None: they are made here.
+            active: (P,) bool, members that learn; None: all, always.
+
+        Returns:
+            Metrics (P,), and who has learnt: a member stops before a step that oversteps the KL.
+        """
+        leaves = self.layout.leaves(state.params) if leaves is None else leaves
+        loss, report = self.loss(leaves, state, batch, now)
+        grad = self.layout.gradient(loss, leaves)
+        report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
+        if active is not None and self._kl_limit is not None:
+            active = active & (report["kl"] <= self._kl_limit)
+        adam_(
+            state.params, grad, state.mu, state.nu, state.count, now.rate,
+            eps=self.config.adam_eps, active=active,
+        )  # fmt: skip
+        return report, active
 
     def loss(
         self, views: Views, state: State, batch: Samples, now: Terms

@@ -202,8 +202,11 @@ class RoomPool:
         n = len(ids)
         found, reward = np.empty((n, *SPACE.shape), np.uint8), np.empty(n, np.float32)
         terminated, truncated = np.empty(n, bool), np.empty(n, bool)
-        for pool, rows in self._by_room(ids):
-            obs, *told, _ = pool.step(action[rows], ids[rows])
+        asked = self._by_room(ids)
+        for pool, rows in asked:
+            pool.send(action[rows], ids[rows])
+        for pool, rows in asked:  # all of them step meanwhile, none waits for another
+            obs, *told, _ = pool.recv()
             found[rows] = obs["image"]
             reward[rows], terminated[rows], truncated[rows] = told
         return found, (reward > 0).astype(np.float32), terminated, truncated, {}

@@ -134,19 +134,19 @@ class Map:
         import torch
 
         seen = inputs["vector"]
-        parts = [self._points(seen[..., where]) for where in (PLACE, GOAL)]
         speed, way = seen[..., SPEED], seen[..., GOAL] - seen[..., PLACE]
-        return torch.cat([*parts, 0.2 * speed, 0.2 * way], -1)
+        points = self._points(torch.stack([seen[..., PLACE], seen[..., GOAL]], -2))
+        return torch.cat([points, 0.2 * speed, 0.2 * way], -1)
 
-    def _points(self, place: Any) -> Any:
-        """Places (P, B, 2) to what the points say of them."""
+    def _points(self, places: Any) -> Any:
+        """Two places (P, B, 2, 2) to what the points say of them, one after the other."""
         import torch
 
         east, north = (
-            torch.relu(1.0 - (place[..., i, None] - torch.arange(-n, n + 1)).abs())
+            torch.relu(1.0 - (places[..., i, None] - torch.arange(-n, n + 1)).abs())
             for i, n in enumerate((self.east, self.north))
         )
-        return (east[..., :, None] * north[..., None, :]).flatten(-2)
+        return (east[..., :, None] * north[..., None, :]).flatten(-3)
 
 
 register_encoder("motion in a maze", Motion)

@@ -58,14 +58,19 @@ class WovenAgents(OneAgent):
         self.node = self.first.removesuffix(SELECTOR)
         configs = {self.first: self.stage.config} if self.first in entry["learns"] else {}
         configs |= {name: config_from_json(own) for name, own in entry["algorithms"].items()}
-        self.algorithms: dict[str, Algorithm] = {
-            name: make_algorithm(
-                self._as_grown(name, config),
-                scene.observation_space,
-                scene.chooses_from(self._below(name)),
+        self.algorithms: dict[str, Algorithm] = {}
+        for name, config in configs.items():
+            grown, acts = self._as_grown(name, config), scene.chooses_from(self._below(name))
+            self.algorithms[name] = self._made(grown, acts) or make_algorithm(
+                grown, scene.observation_space, acts
             )
-            for name, config in configs.items()
-        }
+
+    def _made(self, config: Any, action_space: Any) -> Algorithm | None:
+        """One that is there already: it holds nothing learnt, and need not be compiled again."""
+        for other in self.algorithms.values():
+            if other.config == config and other.action_space == action_space:
+                return other
+        return None
 
     def _below(self, path: str) -> str:
         """A path as it is in the hierarchy that this stage is of."""

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import DQN, SAC, TD3, Network, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.experience import Sample
+from skillweave.experience import Rollout, Sample
 from skillweave.seeding import Seeds
 
 P, B = 2, 16
@@ -75,6 +75,82 @@ def test_compiled_steps_equal_plain_ones(
     for field in fields(states[0]):
         plain, fused = (getattr(s, field.name) for s in states)
         torch.testing.assert_close(fused, plain, rtol=1e-4, atol=1e-6, msg=field.name)
+
+
+def rollout(space: gym.Space[Any], seed: int) -> Rollout:
+    """Steps of 8 rows in 4 environments; with gaps, more of them in the second member."""
+    g = torch.Generator().manual_seed(seed)
+    lead, discrete = (P, 8, 4), isinstance(space, gym.spaces.Discrete)
+    last = torch.rand(lead, generator=g) < 0.2
+    last[:, -1] = True
+    obs, ends = (torch.randn(*lead, 3, generator=g) for _ in range(2))
+    mask = torch.ones(*lead, 3, dtype=torch.bool)
+    mask[:, ::2, :, 0] = False
+    act = torch.randint(1, 3, lead, generator=g) if discrete else torch.randn(*lead, 2, generator=g)
+    valid = torch.rand(lead, generator=g) < torch.tensor([0.9, 0.6])[:, None, None]
+    return Rollout(
+        obs=obs,
+        action=act,
+        reward=torch.randn(lead, generator=g),
+        discount=0.9 * (torch.rand(lead, generator=g) < 0.9),
+        next_obs=torch.where(last[..., None], ends, obs.roll(-1, dims=1)),
+        last=last,
+        head=torch.randn(*lead, 3 if discrete else 2, generator=g),
+        log_std=None if discrete else torch.zeros(P, 1, 1, 2),
+        obs_mask=mask if discrete else None,
+        valid=valid,
+        progress=0.1,
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "backend"),
+    [
+        pytest.param(PPO, {}, "inductor", marks=needs_compiler),
+        (PPO, {"target_kl": 0.002}, "aot_eager"),
+        (PPO, {"learning_rate_schedule": "kl", "target_kl": 0.01}, "aot_eager"),
+        (SelfImitationPPO, {"clip_value": 0.2, "imitation_rows": 64}, "aot_eager"),
+    ],
+    ids=["ppo", "kl-limit", "kl-rate", "self-imitation"],
+)
+@pytest.mark.parametrize("space", [gym.spaces.Discrete(3), gym.spaces.Box(-1.0, 1.0, (2,))])
+def test_compiled_steps_of_rollouts_equal_plain_ones(
+    kind: Any,
+    settings: dict[str, Any],
+    backend: str,
+    space: gym.Space[Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
+    states, reports = [], []
+    for compile in (False, True):
+        config = kind(**SMALL, **settings, num_envs=4, n_steps=8, batch_size=16, compile=compile)
+        algorithm: Any = make_algorithm(config, OBS, space)
+        state = algorithm.init([Seeds(m) for m in range(P)])
+        for u in range(3):  # each with other numbers of rows
+            generators = [(Seeds(u) / m).torch() for m in range(P)]
+            _, report = algorithm.update(state, rollout(space, u), generators)
+            reports.append(report.metrics)
+        states.append(state)
+    for field in fields(states[0]):
+        plain, fused = (getattr(s, field.name) for s in states)
+        torch.testing.assert_close(fused, plain, rtol=1e-3, atol=1e-5, msg=field.name)
+    for own, other in zip(reports[:3], reports[3:], strict=True):
+        assert own.keys() == other.keys()
+        for name in own:
+            torch.testing.assert_close(other[name], own[name], rtol=1e-2, atol=1e-4, msg=name)
+
+
+def test_a_member_stops_where_it_oversteps_the_kl_compiled_or_not() -> None:
+    """After one large step the next would be beyond the limit: the count of steps tells."""
+    space = gym.spaces.Discrete(3)
+    settings = {"learning_rate": 0.1, "target_kl": 1e-4, "num_envs": 4, "n_steps": 8}
+    config = PPO(**SMALL, **settings, batch_size=16, update_epochs=5)
+    algorithm: Any = make_algorithm(config, OBS, space)
+    state = algorithm.init([Seeds(m) for m in range(P)])
+    algorithm.update(state, rollout(space, 0), [Seeds(m).torch() for m in range(P)])
+    assert (state.count >= 1).all()
+    assert (state.count < 5).all()
 
 
 def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,9 +17,17 @@ from benchmarks.pay import __main__ as command
 from benchmarks.pay import agents
 from benchmarks.pay.agents import CHAINS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_SEED, Bench
 from benchmarks.pay.figures import draw, make_table, reported
-from benchmarks.pay.flat import Bonus, Flat
-from benchmarks.pay.results import CODE, Results, checksum, curve_of, of_other_code, read
-from benchmarks.pay.suite import Shaped, Suite, Task
+from benchmarks.pay.flat import Flat
+from benchmarks.pay.results import (
+    CODE,
+    Results,
+    checksum,
+    curve_of,
+    hours,
+    of_other_code,
+    read,
+)
+from benchmarks.pay.suite import Seldom, Shaped, Suite, Task
 from skillweave import (
     PPO,
     EnvSpec,
@@ -126,7 +134,7 @@ def spec(goal):
 def done(tmp_path_factory):
     results = Results(tmp_path_factory.mktemp("pay"))
     for chain in CHAINS:
-        Bench(suite(), results, seed=0).run(chain)
+        Bench(suite(), results, seed=0).run(chain, ["right", "left"])
     return results
 
 
@@ -145,12 +153,31 @@ def test_every_agent_has_a_result_on_every_task(done):
 
 
 def test_budgets_are_equal_or_in_favour_of_the_flat_agents():
-    # 128 for each of two skills and 256 for the selector, then 192: 704 in all, 352 for each task.
+    # 128 for each of two skills and 256 for the selector, then 192.
     assert suite().steps() == [512, 192]
-    assert suite().steps_flat() == [512, 352]
-    assert replace(suite(), flat_steps=100).steps_flat() == [512, 192]
+    assert suite().steps_flat() == [512, 192]
     assert suite().scaled(0.5).steps() == [256, 96]
-    assert suite().scaled(0.5).steps_flat() == [256, 176]
+    assert suite().scaled(0.5).steps_flat() == [256, 96]
+    alone = replace(suite(), tasks=[suite().tasks[0], replace(suite().tasks[1], alone=True)])
+    assert alone.steps_flat() == [512, 704]
+    assert [t.name for t in suite().headlines] == ["right"]
+    assert alone.headlines == alone.tasks
+
+
+def test_what_flat_agents_learn_alone_is_fine_tuned_in_the_hierarchys_steps(tmp_path):
+    alone = replace(suite(), tasks=[suite().tasks[0], replace(suite().tasks[1], alone=True)])
+    Bench(alone, Results(tmp_path), seed=0).run("flat")
+    budgets = {r.agent: r.budget for r in Results(tmp_path).all("line") if r.task == "left"}
+    assert budgets == {FLAT: 704, TUNED: 192}
+
+
+@pytest.mark.parametrize("chain", ["shaped", "bonus"])
+def test_f1_and_f2_learn_the_first_task_and_those_that_are_named(tmp_path, chain):
+    results = Results(tmp_path)
+    Bench(suite(), results, seed=0).run(chain)
+    assert {r.task for r in results.all("line")} == {"right"}
+    Bench(suite(), results, seed=0).run(chain, ["left"])
+    assert {r.task for r in results.all("line")} == {"right", "left"}
 
 
 def test_steps_are_counted_as_they_were_made(done):
@@ -336,7 +363,7 @@ def test_skills_act_on_every_task_as_they_did_where_they_were_learnt(
     Bench(replace(suite(), source=source), Results(tmp_path), seed=0).run("hierarchy")
     assert len(found) == 8  # hierarchy, long calls, F4 and always right, on two tasks
     assert set(found.values()) == {greedy}
-    assert alone == [greedy] * 4  # two skills, on two tasks
+    assert alone == [greedy] * 6  # on two tasks: two skills, and the better one again
 
 
 def test_weights_are_chosen_by_score_on_a_seed_that_is_not_reported(done, monkeypatch):
@@ -368,12 +395,37 @@ def test_rewards_of_skills_are_added_by_weight():
 
 
 def test_the_bonus_falls_with_the_visits_of_all_environments():
-    counts = Counter()
-    envs = [Bonus(Line(), lambda obs: obs.astype(int), 3.0, counts) for _ in range(2)]
-    for env in envs:
-        env.reset()
-    rewards = [env.step(1)[1] for env in envs] + [envs[0].step(1)[1]]
-    np.testing.assert_allclose(rewards, [3.0, 3.0 / np.sqrt(2), 3.0])
+    no, one = np.zeros(3, bool), np.ones(3, np.int64)
+    after, reward = np.array([[1.0], [1.2], [2.0]]), np.array([0.0, 1.0, 0.0])
+    step = Step(np.zeros((3, 1)), one, after, reward, no, no, no, one, {})
+    seldom = Seldom(lambda obs: obs.astype(int), 3.0)
+    second, third, fourth = (3.0 / np.sqrt(n) for n in (2, 3, 4))
+    np.testing.assert_allclose(seldom.reward(step), [3.0, 1.0 + second, 3.0])
+    np.testing.assert_allclose(seldom.reward(step), [third, 1.0 + fourth, second])
+
+
+def test_which_skill_is_best_is_found_out_in_other_episodes_than_those_of_its_score(
+    tmp_path, monkeypatch
+):
+    asked, evaluate = [], Run.evaluate
+
+    def noted(run, episodes, *, seed=0, skill=None, **how):
+        if skill is not None:
+            asked.append((skill, episodes, seed))
+        return evaluate(run, episodes, seed=seed, skill=skill, **how)
+
+    monkeypatch.setattr(Run, "evaluate", noted)
+    few = replace(suite(), evaluated=2)
+    Bench(few, Results(tmp_path), seed=0).run("hierarchy", ["right"])
+    *tried, final = asked
+    assert tried == [("right", 2, TUNING_SEED), ("left", 2, TUNING_SEED)]
+    assert final[1:] == (4, 0)
+
+
+def test_the_hours_of_results_count_f3_on_the_first_task_once(done):
+    found = reported(done.all("line"), [0])
+    own = [r for r in found if (r.task, r.agent) != ("right", TUNED)]
+    assert hours(found) == pytest.approx(sum(r.seconds for r in own) / 3600.0)
 
 
 def test_figures_and_the_table_are_made_from_the_files(done, tmp_path):
