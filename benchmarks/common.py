@@ -7,7 +7,6 @@ import functools
 import json
 import os
 import platform
-import shutil
 import signal
 import statistics
 import subprocess
@@ -61,11 +60,6 @@ def run_command(
     if check and child.returncode:
         raise subprocess.CalledProcessError(child.returncode, command, out, error)
     return subprocess.CompletedProcess(command, child.returncode, out, error)
-
-
-def has_compiler() -> bool:
-    """Whether there is a C++ compiler, which ``compile=True`` needs."""
-    return bool(shutil.which("g++") or shutil.which("clang"))
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common import has_compiler
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Seldom, Shaped, Suite, Task
@@ -25,8 +24,8 @@ CHAINS = ("hierarchy", "flat", "shaped", "bonus")
 TUNING_SEED = 100
 """Weights of F1 are chosen on this one, which is never reported."""
 LONG = 900_000
-"""Flat agents with more steps compile their gradient steps, where there is a C++ compiler. It takes
-up to half a minute, and saves about a minute in a million steps."""
+"""Flat agents with more steps compile their gradient steps, where they can. That takes up to half a
+minute, and saves about a minute in a million steps."""
 
 
 class Bench:
@@ -200,7 +199,7 @@ class Bench:
         budget = budget or self._flat_budgets()[task.name]
         learner: Any = self.suite.flat
         if budget > LONG:
-            learner = replace(learner, compile=has_compiler())
+            learner = replace(learner, compile="auto")
         return Flat(
             task.env, learner, budget,
             eval_every=max(1, budget // self.suite.evaluations), eval_episodes=self.suite.evaluated,

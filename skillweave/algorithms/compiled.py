@@ -14,21 +14,29 @@ from skillweave.types import SkillweaveError
 
 
 def compiled(
-    function: Callable[..., Any], setting: str, *, sizes_vary: bool = False
+    function: Callable[..., Any],
+    config: Any,
+    *,
+    sizes_vary: bool = False,
 ) -> Callable[..., Any]:
     """``function``, compiled by its first call; its arguments' shapes must not change much.
 
     Args:
         function: tensor operations, which may differentiate within; nothing else.
-        setting: what asks for it, named in errors.
+        config: whose ``compile`` asks for it: True; or "auto", then it is left as it is where it
+            cannot be compiled.
         sizes_vary: where a size changes it is compiled once more, for any size there.
 
     Raises:
         SkillweaveError: this torch cannot, or (by the first call) finds no C++ compiler.
     """
-    from torch._dynamo import config, exc
+    from torch._dynamo import config as dynamo
+    from torch._dynamo import exc
 
-    if not hasattr(config, "trace_autograd_ops"):
+    setting, auto = f"{type(config).__name__}.compile", config.compile == "auto"
+    if not hasattr(dynamo, "trace_autograd_ops"):
+        if auto:
+            return function
         raise SkillweaveError(
             f"{setting}: torch {torch.__version__} cannot compile a gradient step; install "
             "torch 2.13 or newer, or leave it at False"
@@ -42,15 +50,19 @@ def compiled(
     program = torch.compile(function, **how)
 
     def call(*args: Any) -> Any:
+        nonlocal program
         # Without this it refuses torch.autograd.grad; it changes nothing for others.
-        with config.patch(trace_autograd_ops=True):
+        with dynamo.patch(trace_autograd_ops=True):
             try:
                 return program(*args)
             except exc.BackendCompilerFailed as error:
-                reason = str(error).splitlines()[0]
-                raise SkillweaveError(
-                    f"{setting}: the gradient step could not be compiled ({reason}); install a "
-                    "C++ compiler (g++ or clang), or leave it at False"
-                ) from error
+                if not auto:
+                    reason = str(error).splitlines()[0]
+                    raise SkillweaveError(
+                        f"{setting}: the gradient step could not be compiled ({reason}); install "
+                        "a C++ compiler (g++ or clang), or leave it at False"
+                    ) from error
+        program = function  # nothing has been changed yet: compiling comes before the first step
+        return program(*args)
 
     return call

@@ -74,6 +74,12 @@ def flags(config: Any) -> None:
             check(config, f.name, isinstance(getattr(config, f.name), bool), "True or False")
 
 
+def compiles(config: Any) -> None:
+    """Raise where ``compile`` is something else than yes, no or auto."""
+    ok = isinstance(config.compile, bool) or config.compile == "auto"
+    check(config, "compile", ok, "True, False or auto")
+
+
 def check_networks(config: Any) -> None:
     """Raise where ``network`` or ``critic`` is no architecture."""
     check(config, "network", isinstance(config.network, Network), "a Network()")

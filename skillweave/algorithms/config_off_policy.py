@@ -12,6 +12,7 @@ from skillweave.algorithms.config_checks import (
     INFINITY,
     check,
     check_networks,
+    compiles,
     flags,
     number,
     one_of,
@@ -81,14 +82,16 @@ class OffPolicy:
     """Steps of the longest bout; shorter ones are as likely."""
     threads: int = 1
     """Torch threads while learning."""
-    compile: bool = False
-    """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute."""
+    compile: bool | Literal["auto"] = False
+    """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
+    auto: where that is possible. Weights differ in their last bits."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Where learning runs; auto: on a GPU where there is one. Acting runs on the CPU."""
 
     def __post_init__(self) -> None:
         check_networks(self)
         flags(self)
+        compiles(self)
         check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
         whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
         whole(self, "bout_steps")

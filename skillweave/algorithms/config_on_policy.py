@@ -9,6 +9,7 @@ from typing import Literal
 from skillweave.algorithms.config_checks import (
     check,
     check_networks,
+    compiles,
     flags,
     number,
     one_of,
@@ -105,11 +106,13 @@ class PPO(OnPolicy):
     """Continuous actions go through tanh, else they are clipped to the bounds."""
     critic: Network | None = None
     """The critic's network; None: as the actor's."""
-    compile: bool = False
-    """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute."""
+    compile: bool | Literal["auto"] = False
+    """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
+    auto: where that is possible. Weights differ in their last bits."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        compiles(self)
         whole(self, "batch_size", "update_epochs")
         number(self, "gae_lambda", high=1.0)
         positive(self, "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")

@@ -65,7 +65,7 @@ class OffPolicyAlgorithm(Algorithm):
 
     @functools.cached_property
     def _compiled(self) -> Callable[..., Any]:
-        return compiled(self.learn, f"{type(self.config).__name__}.compile")
+        return compiled(self.learn, self.config)
 
     def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
         """The random numbers that ``learn`` needs, from one generator per member."""

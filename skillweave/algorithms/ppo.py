@@ -182,7 +182,7 @@ class PPOAlgorithm(Algorithm):
     @functools.cached_property
     def _compiled(self) -> Callable[..., Any]:
         # Skills that learn together have as many rows as they acted in: each time others.
-        return compiled(self.learn, f"{type(self.config).__name__}.compile", sizes_vary=True)
+        return compiled(self.learn, self.config, sizes_vary=True)
 
     def learn(
         self,

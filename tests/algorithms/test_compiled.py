@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
+from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.experience import Rollout, Sample
 from skillweave.seeding import Seeds
@@ -164,21 +164,39 @@ def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     assert hasattr(config, "trace_autograd_ops")
     monkeypatch.setattr("torch._dynamo.config", Old())
     with pytest.raises(SkillweaveError, match=r"DQN\.compile.*2\.13"):
-        compiled.compiled(lambda: None, "DQN.compile")
+        compiled.compiled(lambda: None, DQN(compile=True))
+    assert compiled.compiled(lambda: 3, DQN(compile="auto"))() == 3
 
 
-def test_no_compiler_says_so(tmp_path: Path) -> None:
+def test_no_compiler_says_so_but_where_it_is_tried(tmp_path: Path) -> None:
     code = """
 import torch
-from skillweave import SkillweaveError
+from skillweave import PPO, SAC, SkillweaveError
 from skillweave.algorithms.compiled import compiled
 try:
-    compiled(lambda x: x.sin().cos(), "SAC.compile")(torch.randn(3))
+    compiled(lambda x: x.sin().cos(), SAC(compile=True))(torch.randn(3))
 except SkillweaveError as error:
     print(error)
+tried, x = compiled(lambda x: x.sin().cos(), PPO(compile="auto")), torch.ones(3)
+print(*(torch.equal(tried(x), x.sin().cos()) for _ in range(2)))
 """
     nowhere = {"CXX": "/nowhere/g++", "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
     said = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | nowhere, capture_output=True, text=True
     )
-    assert re.match(r"SAC\.compile: .*install a C\+\+ compiler", said.stdout), said
+    first, second = said.stdout.splitlines()
+    assert re.match(r"SAC\.compile: .*install a C\+\+ compiler", first), said
+    assert second == "True True", said
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"compile": 1}, r"PPO\.compile is 1; it must be True, False or auto"),
+        ({"compile": "always"}, r"PPO\.compile is 'always'; it must be True, False or auto"),
+        ({"compile": True, "network": Network(rnn=RNN())}, "False where network.rnn is set"),
+    ],
+)
+def test_a_wrong_setting_says_what_it_must_be(wrong: dict[str, Any], says: str) -> None:
+    with pytest.raises(SkillweaveError, match=says):
+        PPO(**wrong)
