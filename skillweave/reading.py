@@ -183,7 +183,12 @@ def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
     if origin in (Union, UnionType):
         if data is None and NoneType in inner:
             return None
-        (one,) = (k for k in inner if k is not NoneType)
+        one, *words = (k for k in inner if k is not NoneType)
+        if words and not isinstance(data, bool):  # yes, no, or one of some words
+            asked = get_args(words[0])
+            if not isinstance(data, str) or data not in asked:
+                raise _wrong(data, f"true, false or {', '.join(asked)}", file, path)
+            return data
         return fit(one, data, file, path)
     if origin is Literal:
         if not isinstance(data, str) or data not in inner:

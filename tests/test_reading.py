@@ -191,3 +191,16 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
         file.truncate(10**12)
     with pytest.raises(SkillweaveError, match=r"1,000,000,000,000 bytes.*at most 100"):
         read_file(tmp_path / "x", 100)
+
+
+@pytest.mark.parametrize("kind", [PPO, DQN])
+@pytest.mark.parametrize("compile", [True, False, "auto"])
+def test_a_setting_that_is_yes_no_or_a_word_comes_back_from_json(kind: Any, compile: Any) -> None:
+    again: Any = config_from_json(config_to_json(kind(compile=compile)))
+    assert again.compile is compile or again.compile == compile == "auto"
+
+
+@pytest.mark.parametrize("wrong", [1, "always", None, [True]])
+def test_a_setting_that_is_neither_yes_nor_no_nor_its_word_is_named(wrong: Any) -> None:
+    with pytest.raises(SkillweaveError, match=r"compile is .*; it must be true, false or auto"):
+        config_from_json(config_to_json(PPO()) | {"compile": wrong})
