@@ -106,7 +106,6 @@ RUNNER = PPO(
     gae_lambda=0.92,
     ent_coef=0.0,
     network=replace(RELU, sees=tuple(range(LEG.start))),
-    compile="auto",  # learning takes more of a training than the half-cheetah
 )
 """Who learns a skill. It does not see the leg of the patrol, so that it serves patrols whose legs
 are others: with the leg, ``backward`` knows only legs in which the source task runs backwards."""
