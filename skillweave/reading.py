@@ -183,13 +183,15 @@ def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
     if origin in (Union, UnionType):
         if data is None and NoneType in inner:
             return None
-        one, *words = (k for k in inner if k is not NoneType)
-        if words and not isinstance(data, bool):  # yes, no, or one of some words
-            asked = get_args(words[0])
-            if not isinstance(data, str) or data not in asked:
-                raise _wrong(data, f"true, false or {', '.join(asked)}", file, path)
-            return data
-        return fit(one, data, file, path)
+        options = [k for k in inner if k is not NoneType]
+        if len(options) == 1:
+            return fit(options[0], data, file, path)
+        words = get_args(options[1])
+        if options[0] is not bool or get_origin(options[1]) is not Literal:
+            raise TypeError(f"no schema: {kind!r}")
+        if not isinstance(data, bool) and not (isinstance(data, str) and data in words):
+            raise _wrong(data, f"true, false or {', '.join(words)}", file, path)
+        return data
     if origin is Literal:
         if not isinstance(data, str) or data not in inner:
             raise _wrong(data, f"one of {', '.join(inner)}", file, path)

@@ -133,7 +133,8 @@ class Bench:
                 return run.evaluate(episodes, seed=seed, skill=name, deterministic=greedy)
 
             # Which one is best is found out in other episodes than those of its score.
-            best = max(names, key=lambda n: alone(n, self.suite.evaluated, TUNING_SEED).mean)
+            few = max(1, self.suite.episodes // 2)
+            best = max(names, key=lambda n: alone(n, few, TUNING_SEED).mean)
             returns = alone(best, self.suite.episodes, 0).returns
             self._save(run, task, SINGLE, 0, started, returns, {best: 1.0})
 
@@ -154,14 +155,17 @@ class Bench:
     # Flat agents
 
     def _flat(self, tasks: Sequence[Task]) -> None:
-        source, budgets = self.suite.tasks[0], self._flat_budgets()
-        for task in self._with_source(tasks):
-            self._learn(self._agent(task), task, FLAT, keep=task is source)
+        source, budgets = self.suite.tasks[0], self._budgets()
+        for task in self._with_those_before(tasks):
+            if task is source:
+                self._learn(self._agent(task), task, FLAT, keep=True)
+            else:
+                agent = self._agent(task, budgets[task.name])
+                agent.starts_from = self._before(task)
+                self._learn(agent, task, TUNED, keep=self.suite.goes_on(task))
         for task in tasks:
             if task is not source:
-                agent = self._agent(task, self._budgets()[task.name])
-                agent.starts_from = self._source_agent()
-                self._learn(agent, task, TUNED)
+                self._learn(self._agent(task), task, FLAT)
             elif not self._found(task, TUNED, budgets[task.name]):
                 found = self.results.find(
                     self.suite.name, task.name, FLAT, self.seed, budgets[task.name]
@@ -206,19 +210,22 @@ class Bench:
         )  # fmt: skip
 
     def _learn(self, agent: Flat, task: Task, name: str, keep: bool = False) -> Result:
-        budget = agent.steps
-        if found := self._found(task, name, budget):
+        budget, path, started = agent.steps, self._path(task, name), time.perf_counter()
+        found = self._found(task, name, budget)
+        if found and (path.exists() or not keep):
             return found
-        path, started = self._path(task, name), time.perf_counter()
         self.results.begin(path)
         return self._score(
             agent.run(path, self.seed), task, name, budget, started, keep, ("agent",)
         )
 
-    def _source_agent(self) -> Path:
+    def _before(self, task: Task) -> Path:
+        """The run of the flat agent with which F3 begins a further task."""
         source = self.suite.tasks[0]
-        self._builds_on(source, FLAT)
-        path: Path = self._path(source, FLAT)
+        before = source if task.starts_from is None else self.suite.task(task.starts_from)
+        name = FLAT if before is source else TUNED
+        self._builds_on(before, name)
+        path: Path = self._path(before, name)
         return path
 
     # What all share
@@ -240,7 +247,9 @@ class Bench:
         scores = [float(r) / self.suite.unit for r in returns]
         curve = curve_of(run.path, self.suite.unit, stages) if stages else []
         spent = sum(int(s["steps"]) for s in run.info()["stages"])
-        score, seconds = float(np.mean(scores)), time.perf_counter() - started
+        # Of a training that was stopped, what came before, too.
+        trained = sum(float(s["seconds"]) for s in run.info()["stages"])
+        score, seconds = float(np.mean(scores)), max(time.perf_counter() - started, trained)
         begun = self.results.begun_by(run.path)
         code = CODE if begun == CODE and not self._on_older else ""
         result = Result(
@@ -272,14 +281,9 @@ class Bench:
     def _flat_budgets(self) -> dict[str, int]:
         return dict(zip(self._names(), self.suite.steps_flat(), strict=True))
 
-    def _with_source(self, tasks: Sequence[Task]) -> list[Task]:
-        """These tasks, and before them the one on which skills are learnt."""
-        source = self.suite.tasks[0]
-        return [source, *(t for t in tasks if t is not source)]
-
     def _with_those_before(self, tasks: Sequence[Task]) -> list[Task]:
-        """The same, and the tasks that hierarchies start from, in the suite's order."""
-        wanted = {t.name for t in self._with_source(tasks)}
+        """These tasks, the first, and those that others start from, in the suite's order."""
+        wanted = {self.suite.tasks[0].name, *(t.name for t in tasks)}
         for task in reversed(self.suite.tasks):
             if task.name in wanted and task.starts_from is not None:
                 wanted.add(task.starts_from)

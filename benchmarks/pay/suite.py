@@ -26,7 +26,8 @@ class Task:
         env: its environment, with its own reward.
         solved: a score from here on counts as solved.
         starts_from: an earlier task, by name: the hierarchy begins with what it was at the end of
-            that one, its skills too, where they go on learning. F3 is the same of a flat agent.
+            that one, its skills too, where they go on learning; F3 with what it was there itself.
+            None: F3 begins with the first task.
         alone: whether F0 to F2 have here all that the hierarchy takes for this task alone: what
             learnt its skills, too.
     """

@@ -5,6 +5,7 @@ LeanRL (Meta 2024) showed what this brings; here the backward pass and Adam are 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -12,57 +13,76 @@ import torch
 
 from skillweave.types import SkillweaveError
 
+PROGRAMS = 64
+"""The most programs of one gradient step: for other sizes, for rows with gaps, with an anchor."""
 
-def compiled(
-    function: Callable[..., Any],
-    config: Any,
-    *,
-    sizes_vary: bool = False,
-) -> Callable[..., Any]:
-    """``function``, compiled by its first call; its arguments' shapes must not change much.
+
+class Compiled:
+    """A function that is compiled by its first call; its arguments' shapes must not change much.
 
     Args:
         function: tensor operations, which may differentiate within; nothing else.
-        config: whose ``compile`` asks for it: True; or "auto", then it is left as it is where it
-            cannot be compiled.
+        config: whose ``compile`` asks for it: True; or "auto", then it is left as it is, with a
+            warning, where it cannot be compiled.
         sizes_vary: where a size changes it is compiled once more, for any size there.
 
     Raises:
-        SkillweaveError: this torch cannot, or (by the first call) finds no C++ compiler.
+        SkillweaveError: this torch cannot; or by a call: there is no C++ compiler, or something in
+            it cannot be compiled.
     """
-    from torch._dynamo import config as dynamo
-    from torch._dynamo import exc
 
-    setting, auto = f"{type(config).__name__}.compile", config.compile == "auto"
-    if not hasattr(dynamo, "trace_autograd_ops"):
-        if auto:
-            return function
-        raise SkillweaveError(
-            f"{setting}: torch {torch.__version__} cannot compile a gradient step; install "
-            "torch 2.13 or newer, or leave it at False"
-        )
-    # One algorithm's programs do not count against another's limit.
-    how: Any = {
-        "fullgraph": True,
-        "dynamic": None if sizes_vary else False,
-        "isolate_recompiles": True,
-    }
-    program = torch.compile(function, **how)
+    def __init__(
+        self, function: Callable[..., Any], config: Any, *, sizes_vary: bool = False
+    ) -> None:
+        from torch._dynamo import config as dynamo
 
-    def call(*args: Any) -> Any:
-        nonlocal program
-        # Without this it refuses torch.autograd.grad; it changes nothing for others.
-        with dynamo.patch(trace_autograd_ops=True):
+        self._function, self._sizes_vary = function, sizes_vary
+        self._setting = f"{type(config).__name__}.compile"
+        self._auto = config.compile == "auto"
+        self._program: Callable[..., Any] | None = None
+        if hasattr(dynamo, "trace_autograd_ops"):
+            return
+        if not self._auto:
+            raise SkillweaveError(
+                f"{self._setting}: torch {torch.__version__} cannot compile a gradient step; "
+                "install torch 2.13 or newer, or leave it at False"
+            )
+        self._program = function
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is sent to another process, which compiles anew."""
+        return vars(self) | {"_program": None}
+
+    def __call__(self, *args: Any) -> Any:
+        """What the function returns."""
+        from torch._dynamo import config as dynamo
+        from torch._dynamo import exc
+
+        if self._program is self._function:
+            return self._function(*args)
+        if self._program is None:
+            # One algorithm's programs do not count against another's limit.
+            how: Any = {"fullgraph": True, "isolate_recompiles": True}
+            dynamic = None if self._sizes_vary else False
+            self._program = torch.compile(self._function, dynamic=dynamic, **how)
+        # Without the first it refuses torch.autograd.grad; it changes nothing for others.
+        with dynamo.patch(trace_autograd_ops=True, recompile_limit=PROGRAMS):
             try:
-                return program(*args)
-            except exc.BackendCompilerFailed as error:
-                if not auto:
-                    reason = str(error).splitlines()[0]
-                    raise SkillweaveError(
-                        f"{setting}: the gradient step could not be compiled ({reason}); install "
-                        "a C++ compiler (g++ or clang), or leave it at False"
-                    ) from error
-        program = function  # nothing has been changed yet: compiling comes before the first step
-        return program(*args)
+                return self._program(*args)
+            except (exc.TorchDynamoException, exc.FailOnRecompileLimitHit) as error:
+                says = self._said(error)
+                if not self._auto:
+                    raise SkillweaveError(f"{says}, or leave it at False") from error
+        warnings.warn(f"{says}. Until then it goes on without", stacklevel=2)
+        self._program = self._function
+        return self._function(*args)  # nothing is changed yet: compiling comes before the step
 
-    return call
+    def _said(self, error: Exception) -> str:
+        """Why it could not be compiled, and what helps."""
+        from torch._dynamo import exc
+
+        reason = str(error).strip().splitlines()[0]
+        found = f"{self._setting}: the gradient step could not be compiled ({reason})"
+        if isinstance(error, exc.BackendCompilerFailed):
+            return f"{found}; install a C++ compiler (g++ or clang)"
+        return f"{found}; use an encoder that torch.compile can read"

@@ -84,7 +84,8 @@ class OffPolicy:
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
-    auto: where that is possible. Weights differ in their last bits."""
+    auto: where that is possible. Weights differ in their last bits, also of a run that was stopped
+    and goes on."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Where learning runs; auto: on a GPU where there is one. Acting runs on the CPU."""
 

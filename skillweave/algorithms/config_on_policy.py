@@ -108,7 +108,8 @@ class PPO(OnPolicy):
     """The critic's network; None: as the actor's."""
     compile: bool | Literal["auto"] = False
     """Gradient steps are compiled (``torch.compile``): about twice as fast, after half a minute;
-    auto: where that is possible. Weights differ in their last bits."""
+    auto: where that is possible. Weights differ in their last bits, also of a run that was stopped
+    and goes on."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,7 +129,7 @@ class PPO(OnPolicy):
         one_of(self, "learning_rate_schedule", ("constant", "linear", "kl"))
         if self.network.rnn is not None:
             check(self, "critic", self.critic is None, "None where network.rnn is set")
-            check(self, "compile", not self.compile, "False where network.rnn is set")
+            check(self, "compile", self.compile is not True, "False where network.rnn is set")
         rollout = self.num_envs * self.n_steps
         most = max(rollout, PPO.batch_size)  # a small rollout alone is no mistake
         says = f"at most {most}; a rollout has num_envs·n_steps ({rollout}) samples"

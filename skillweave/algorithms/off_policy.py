@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import AgentState, Algorithm
-from skillweave.algorithms.compiled import compiled
+from skillweave.algorithms.compiled import Compiled
 from skillweave.experience import Report, Sample
 from skillweave.networks.stacked import Views
 from skillweave.ops.distributions import mask_logits
@@ -64,8 +64,8 @@ class OffPolicyAlgorithm(Algorithm):
         return state, Report(metrics, error)
 
     @functools.cached_property
-    def _compiled(self) -> Callable[..., Any]:
-        return compiled(self.learn, self.config)
+    def _compiled(self) -> Compiled:
+        return Compiled(self.learn, self.config)
 
     def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
         """The random numbers that ``learn`` needs, from one generator per member."""

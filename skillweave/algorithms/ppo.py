@@ -8,7 +8,7 @@ Cobbe & Schulman 2022.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
-from skillweave.algorithms.compiled import compiled
+from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.ppo_samples import Terms, floor_now, samples_of
@@ -154,9 +154,10 @@ class PPOAlgorithm(Algorithm):
         rate, count, limited = now.rate, samples.count, self._kl_limit is not None
         names = REPORT if now.anchor is None else (*REPORT, "anchor_kl")
         taken, sums = torch.zeros_like(rate), rate.new_zeros(len(names), len(rate))
+        compiles = cfg.compile and not self.memory_size
         # A compiled step makes its leaves itself; others share these.
-        leaves = None if cfg.compile else self.layout.leaves(state.params)
-        learn = self._compiled if cfg.compile else self.learn
+        leaves = None if compiles else self.layout.leaves(state.params)
+        learn = self._compiled if compiles else self.learn
         active, all_learn = count > 0, not limited and samples.valid is None
         for minibatch in minibatches(samples, rng, cfg.update_epochs, cfg.batch_size):
             found, learns = learn(state, leaves, minibatch, now, None if all_learn else active)
@@ -180,9 +181,9 @@ class PPOAlgorithm(Algorithm):
         return 1.5 * float(cfg.target_kl)  # as in Stable-Baselines3
 
     @functools.cached_property
-    def _compiled(self) -> Callable[..., Any]:
+    def _compiled(self) -> Compiled:
         # Skills that learn together have as many rows as they acted in: each time others.
-        return compiled(self.learn, self.config, sizes_vary=True)
+        return Compiled(self.learn, self.config, sizes_vary=True)
 
     def learn(
         self,

@@ -13,6 +13,7 @@ from skillweave.algorithms.config import PPO, SkillCritic
 from skillweave.algorithms.rollouts import Cells, Samples, values_after
 from skillweave.experience import Anchor, Rollout
 from skillweave.networks.stacked import take_rows
+from skillweave.ops.losses import likelihood_ratio
 from skillweave.ops.moments import explained_variance, normalise
 from skillweave.ops.returns import gae
 
@@ -90,7 +91,7 @@ def samples_of(
         inputs={} if memory is not None else inputs,
         action=action,
         log_prob=log_prob,
-        importance=(log_prob - _acted(agent, rollout, cells, mask, action)).exp(),
+        importance=likelihood_ratio(log_prob, _acted(agent, rollout, cells, mask, action)),
         advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), own),
         anchor=_anchor(agent, now, rollout, cells),
         target=(returns - mean) / scale,

@@ -13,6 +13,20 @@ from torch import Tensor
 from skillweave.ops.moments import masked_mean
 from skillweave.shapes import Float
 
+LARGEST_LOG_RATIO = 20.0
+"""Ratios of probabilities are at most e to this: where a policy has hardly any deviation left, an
+action of an older one can be so unlikely that the ratio is not finite."""
+
+
+def likelihood_ratio(
+    log_prob: Float[Tensor, "P B"], other: Float[Tensor, "P B"]
+) -> Float[Tensor, "P B"]:
+    """The probability of actions ÷ that by another policy, at most e²⁰; log-probabilities (P, B).
+
+    Beyond, it has no gradient.
+    """
+    return torch.exp((log_prob - other).clamp_max(LARGEST_LOG_RATIO))
+
 
 def ppo_policy_loss(
     log_prob: Float[Tensor, "P B"],
@@ -36,7 +50,7 @@ def ppo_policy_loss(
     Returns:
         (P,).
     """
-    ratio = torch.exp(log_prob - old_log_prob)
+    ratio = likelihood_ratio(log_prob, old_log_prob)
     eps = clip_coef[:, None]
     clipped = torch.clamp(ratio, 1.0 - eps, 1.0 + eps)
     gain = torch.minimum(ratio * advantage, clipped * advantage)
@@ -81,7 +95,7 @@ def approximate_kl(
     Schulman 2020, "Approximating KL divergence". ``weight`` and ``valid`` as of
     ``ppo_policy_loss``: samples of another policy count as often as the old one would draw them.
     """
-    log_ratio = log_prob - old_log_prob
+    log_ratio = (log_prob - old_log_prob).clamp_max(LARGEST_LOG_RATIO)
     kl = torch.expm1(log_ratio) - log_ratio
     return masked_mean(kl if weight is None else weight * kl, valid)
 

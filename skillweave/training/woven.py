@@ -66,7 +66,10 @@ class WovenAgents(OneAgent):
             )
 
     def _made(self, config: Any, action_space: Any) -> Algorithm | None:
-        """One that is there already: it holds nothing learnt, and need not be compiled again."""
+        """One that is there already: it need not be compiled again.
+
+        An algorithm holds nothing that is learnt, so several learners may have the same one.
+        """
         for other in self.algorithms.values():
             if other.config == config and other.action_space == action_space:
                 return other

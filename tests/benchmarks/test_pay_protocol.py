@@ -287,8 +287,8 @@ def test_who_was_killed_goes_on_and_comes_to_the_same(done, tmp_path, monkeypatc
 
 def test_fine_tuning_begins_with_what_the_flat_agent_was_on_the_first_task(done, tmp_path):
     bench = Bench(suite(), done, seed=0)
-    source = bench._source_agent()
     task = suite().tasks[1]
+    source = bench._before(task)
     agent = Flat(task.env, replace(TINY, learning_rate=1e-12), 64, starts_from=source)
     run = agent.run(tmp_path / "run", seed=0)
     for name, value in agent.load(source).policy.weights.items():
@@ -415,11 +415,33 @@ def test_which_skill_is_best_is_found_out_in_other_episodes_than_those_of_its_sc
         return evaluate(run, episodes, seed=seed, skill=skill, **how)
 
     monkeypatch.setattr(Run, "evaluate", noted)
-    few = replace(suite(), evaluated=2)
-    Bench(few, Results(tmp_path), seed=0).run("hierarchy", ["right"])
+    Bench(suite(), Results(tmp_path), seed=0).run("hierarchy", ["right"])
     *tried, final = asked
     assert tried == [("right", 2, TUNING_SEED), ("left", 2, TUNING_SEED)]
     assert final[1:] == (4, 0)
+
+
+def test_long_trainings_of_flat_agents_are_compiled_where_that_is_possible(tmp_path, monkeypatch):
+    bench = Bench(suite(), Results(tmp_path), seed=0)
+    asked = [bench._agent(suite().tasks[0]).algorithm.compile]
+    monkeypatch.setattr(agents, "LONG", 500)
+    asked += [bench._agent(task).algorithm.compile for task in suite().tasks]
+    assert asked == [False, "auto", False]
+
+
+def test_f3_follows_the_hierarchy_from_task_to_task(tmp_path):
+    after = [
+        Task("right", spec(3), 0.5),
+        Task("left", spec(-3), 0.5),
+        Task("again", spec(-3), 0.5, "left"),
+    ]
+    bench = Bench(replace(suite(), tasks=after), Results(tmp_path), seed=0)
+    bench.run("flat", ["again"])
+    found = {(r.task, r.agent) for r in Results(tmp_path).all("line")}
+    assert found == {("right", FLAT), ("left", TUNED), ("again", TUNED), ("again", FLAT)}
+    assert bench._before(after[2]) == bench._path(after[1], TUNED)
+    assert bench._before(after[1]) == bench._path(after[0], FLAT)
+    assert bench._path(after[1], TUNED).exists()
 
 
 def test_the_hours_of_results_count_f3_on_the_first_task_once(done):

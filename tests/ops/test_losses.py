@@ -8,6 +8,7 @@ from skillweave.ops.losses import (
     categorical_projection,
     critic_loss,
     expected_soft_value,
+    likelihood_ratio,
     ppo_policy_loss,
     td_loss,
     value_loss,
@@ -173,3 +174,20 @@ def test_the_soft_value_by_hand():
     found = expected_soft_value(p.log(), q, torch.tensor([[0.5]]))
     entropy = -(0.25 * math.log(0.25) + 0.75 * math.log(0.75))
     assert found.item() == pytest.approx(7.0 + 0.5 * entropy)
+
+
+def test_ratios_that_are_not_finite_are_held_at_a_large_number():
+    log_prob = torch.tensor([[200.0, -200.0, 200.0]], requires_grad=True)
+    old, advantage = torch.zeros(1, 3), torch.tensor([[-1.0, 1.0, 1.0]])
+    weight = likelihood_ratio(torch.tensor([[1.0, 1e5, 1.0]]), torch.zeros(1, 3))
+    loss = ppo_policy_loss(log_prob, old, advantage, torch.tensor([0.2]), weight)
+    loss.sum().backward()
+    # −(−e¹·e²⁰ + e²⁰·e⁻²⁰⁰ + e¹·1.2) / 3.
+    assert loss.item() == pytest.approx(math.e * (math.exp(20.0) - 1.2) / 3, rel=1e-5)
+    assert log_prob.grad.isfinite().all()
+    assert approximate_kl(log_prob, old, weight).isfinite().all()
+
+
+def test_smaller_ratios_are_exact():
+    log_prob = torch.tensor([[-3.0, 0.0, 19.0]])
+    assert torch.equal(likelihood_ratio(log_prob, torch.zeros(1, 3)), log_prob.exp())
