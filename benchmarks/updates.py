@@ -1,4 +1,5 @@
-"""One PPO update of P members in a stack against the same updates one by one, in the same run."""
+"""One PPO update of P members in a stack against the same updates one by one; and compiled against
+plain (``compile=True``, after it was compiled). All in the same run."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def rollout(members: int, samples: int) -> Rollout:
     )
 
 
-def seconds(members: int, samples: int, repeats: int) -> float:
+def seconds(members: int, samples: int, repeats: int, compile: bool = False) -> float:
     space = gym.spaces.Box(-np.inf, np.inf, (8,))
     config = PPO(
         num_envs=1,
@@ -42,6 +43,7 @@ def seconds(members: int, samples: int, repeats: int) -> float:
         batch_size=samples,
         update_epochs=4,
         network=Network(activation="relu"),
+        compile=compile,
     )
     algorithm = PPOAlgorithm(config, space, gym.spaces.Discrete(4))
     seeds = [Seeds(0) / m for m in range(members)]
@@ -65,7 +67,14 @@ def main() -> None:
             rows.append([members, samples, f"{1e3 * together:.2f}", f"{ratio:.2f}"])
     header = ["members", "samples", "ms a stacked update", "÷ one by one"]
     print(table(header, rows))
-    report("updates", {"rows": rows})
+    compiled = []
+    for samples in (64, 256, 1024):
+        plain, fused = (seconds(1, samples, 40, compile) for compile in (False, True))
+        compiled.append(
+            [samples, f"{1e3 * plain:.2f}", f"{1e3 * fused:.2f}", f"{fused / plain:.2f}"]
+        )
+    print(table(["samples", "ms an update", "ms compiled", "÷ plain"], compiled))
+    report("updates", {"rows": rows, "compiled": compiled})
 
 
 if __name__ == "__main__":
