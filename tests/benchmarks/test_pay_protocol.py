@@ -369,6 +369,7 @@ def test_skills_act_on_every_task_as_they_did_where_they_were_learnt(
 def test_weights_are_chosen_by_score_on_a_seed_that_is_not_reported(done, monkeypatch):
     tuned = [r for r in done.all("line") if r.seed == TUNING_SEED]
     assert {r.agent for r in tuned} == {"tuning-0", "tuning-1"}
+    assert {r.budget for r in tuned} == {512 // 3}
     assert not [r for r in reported(done.all("line"), [0, TUNING_SEED]) if r in tuned]
     best = max(tuned, key=lambda r: r.score).agent
     number = int(best.removeprefix("tuning-"))
