@@ -39,6 +39,8 @@ RANGES: list[tuple[type, str, object, str]] = [
         "learning_rate", "max_grad_norm", "adam_eps", "update_ratio") for bad in (0.0, INF, NAN)),
     (OffPolicy, "device", "tpu", "one of cpu, cuda, auto"),
     (PPO, "device", "tpu", "one of cpu, cuda, auto"),
+    *((kind, "compile", bad, "True, False or auto")
+      for kind in (OffPolicy, PPO) for bad in (1, "always")),
     (OffPolicy, "buffer_size", 0, "at least 1"),
     *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN, SAC)),
     (TD3, "buffer_size", 31, r"at least 32 \(num_envs·\(n_step\+1\)\)"),
