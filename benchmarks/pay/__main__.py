@@ -10,7 +10,7 @@ finishes what it began. Results of other code than today's are named under the t
 Agents, all with as many steps on a task as the hierarchy has there, on the first with those that
 learn its skills, and on the lander's tour with those, too: F0 flat; F1 flat, on the
 task's reward and the weighted sum of the skills' rewards (weights chosen on seed 100); F2 flat with
-a bonus for states that were seldom seen; F3 flat, fine-tuned from the first task; F4 random skills,
+a bonus for states that were seldom seen; F3 flat, fine-tuned from earlier tasks; F4 random skills,
 and the best single skill. F1 and F2 learn the first task of each suite, and the lander's tour; and
 any task that is named.
 """

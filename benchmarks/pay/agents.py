@@ -16,6 +16,7 @@ from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Seldom, Shaped, Suite, Task
 from skillweave import Array, Hierarchy, Lengths, Skill
 from skillweave.api.run import Run
+from skillweave.runs.directory import RunDirectory
 
 HIERARCHY, RANDOM, SINGLE = "hierarchy", "F4-random-skills", "F4-best-skill"
 FLAT, SHAPED, BONUS, TUNED = "F0-flat", "F1-skill-rewards", "F2-bonus", "F3-fine-tuned"
@@ -26,8 +27,8 @@ TUNING_SEED = 100
 TUNING_SHARE = 3
 """They are chosen after this part of the first task's steps: a third."""
 LONG = 900_000
-"""Flat agents with more steps compile their gradient steps, where they can. That takes up to half a
-minute, and saves about a minute in a million steps."""
+"""Flat agents with more steps compile their gradient steps, where they can. That takes half a
+minute or more, and saves about a minute in a million steps."""
 
 
 class Bench:
@@ -86,7 +87,7 @@ class Bench:
         start_from: Path | None = None,
     ) -> None:
         path, started = self._path(task, agent), time.perf_counter()
-        if self._found(task, agent, budget) and (path.exists() or not keep):
+        if self._found(task, agent, budget, keep):
             return
         self.results.begin(path)
         hierarchy.eval_every = max(1, budget // self.suite.evaluations)
@@ -158,13 +159,7 @@ class Bench:
 
     def _flat(self, tasks: Sequence[Task]) -> None:
         source, budgets = self.suite.tasks[0], self._budgets()
-        for task in self._with_those_before(tasks):
-            if task is source:
-                self._learn(self._agent(task), task, FLAT, keep=True)
-            else:
-                agent = self._agent(task, budgets[task.name])
-                agent.starts_from = self._before(task)
-                self._learn(agent, task, TUNED, keep=self.suite.goes_on(task))
+        self._learn(self._agent(source), source, FLAT, keep=True)
         for task in tasks:
             if task is not source:
                 self._learn(self._agent(task), task, FLAT)
@@ -174,6 +169,10 @@ class Bench:
                 )
                 assert found is not None
                 self.results.save(replace(found, agent=TUNED))
+        for task in self._with_those_before(tasks)[1:]:
+            agent = self._agent(task, budgets[task.name])
+            agent.starts_from = self._before(task)
+            self._learn(agent, task, TUNED, keep=self.suite.goes_on(task))
 
     def _shaped(self, tasks: Sequence[Task]) -> None:
         weights = self.tuned_weights()
@@ -217,8 +216,7 @@ class Bench:
 
     def _learn(self, agent: Flat, task: Task, name: str, keep: bool = False) -> Result:
         budget, path, started = agent.steps, self._path(task, name), time.perf_counter()
-        found = self._found(task, name, budget)
-        if found and (path.exists() or not keep):
+        if found := self._found(task, name, budget, keep):
             return found
         self.results.begin(path)
         return self._score(
@@ -267,8 +265,10 @@ class Bench:
             shutil.rmtree(run.path, ignore_errors=True)
         return result
 
-    def _found(self, task: Task, agent: str, budget: int) -> Result | None:
-        return self.results.find(self.suite.name, task.name, agent, self.seed, budget)
+    def _found(self, task: Task, agent: str, budget: int, keep: bool = False) -> Result | None:
+        """A result that is there; not where others need its run, and that is not at its end."""
+        found = self.results.find(self.suite.name, task.name, agent, self.seed, budget)
+        return None if keep and not is_over(self._path(task, agent)) else found
 
     def _builds_on(self, task: Task, agent: str) -> None:
         """What follows needs this result, so it is of other code if this one is."""
@@ -294,6 +294,13 @@ class Bench:
             if task.name in wanted and task.starts_from is not None:
                 wanted.add(task.starts_from)
         return [t for t in self.suite.tasks if t.name in wanted]
+
+
+def is_over(path: Path) -> bool:
+    """Whether there is a run, and all its stages are done."""
+    if not path.exists():
+        return False
+    return all(s["status"] == "done" for s in RunDirectory.open(path).manifest["stages"])
 
 
 def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:

@@ -22,8 +22,8 @@ class Compiled:
 
     Args:
         function: tensor operations, which may differentiate within; nothing else.
-        config: whose ``compile`` asks for it: True; or "auto", then it is left as it is, with a
-            warning, where it cannot be compiled.
+        config: whose ``compile`` asks for it: True; or "auto", then it is left as it is where it
+            cannot be compiled.
         sizes_vary: where a size changes it is compiled once more, for any size there.
 
     Raises:
@@ -51,7 +51,8 @@ class Compiled:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is sent to another process, which compiles anew."""
-        return vars(self) | {"_program": None}
+        plain = self._program is self._function  # it could not be compiled here
+        return vars(self) | {"_program": self._function if plain else None}
 
     def __call__(self, *args: Any) -> Any:
         """What the function returns."""
@@ -70,19 +71,22 @@ class Compiled:
             try:
                 return self._program(*args)
             except (exc.TorchDynamoException, exc.FailOnRecompileLimitHit) as error:
-                says = self._said(error)
+                reason = str(error).strip().splitlines()[0]
+                says = f"{self._setting}: the gradient step could not be compiled ({reason})"
                 if not self._auto:
-                    raise SkillweaveError(f"{says}, or leave it at False") from error
-        warnings.warn(f"{says}. Until then it goes on without", stacklevel=2)
+                    advice = f"{_advice(error)}leave it at False"
+                    raise SkillweaveError(f"{says}; {advice}") from error
+        warnings.warn(f"{says}. Gradient steps are not compiled", stacklevel=2)
         self._program = self._function
         return self._function(*args)  # nothing is changed yet: compiling comes before the step
 
-    def _said(self, error: Exception) -> str:
-        """Why it could not be compiled, and what helps."""
-        from torch._dynamo import exc
 
-        reason = str(error).strip().splitlines()[0]
-        found = f"{self._setting}: the gradient step could not be compiled ({reason})"
-        if isinstance(error, exc.BackendCompilerFailed):
-            return f"{found}; install a C++ compiler (g++ or clang)"
-        return f"{found}; use an encoder that torch.compile can read"
+def _advice(error: Exception) -> str:
+    """What helps, as the beginning of a sentence; or nothing."""
+    from torch._dynamo import exc
+
+    if isinstance(error, exc.BackendCompilerFailed):
+        return "install a C++ compiler (g++ or clang), or "
+    if isinstance(error, exc.Unsupported | exc.UserError):
+        return "use an encoder that torch.compile can read, or "
+    return ""

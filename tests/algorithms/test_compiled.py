@@ -230,8 +230,10 @@ def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried() -> None:
     with pytest.raises(SkillweaveError, match=f"{says}.*or leave it at False"):
         learn(algorithm, state)
     algorithm, state = small_ppo(network=network, compile="auto")
-    with pytest.warns(UserWarning, match="Until then it goes on without"):
+    with pytest.warns(UserWarning, match="Gradient steps are not compiled"):
         learn(algorithm, state)
+    again = unpacked(packed(algorithm, "it"))  # and it is not tried again elsewhere
+    assert again._compiled._program is again._compiled._function
     plain, expected = small_ppo(network=network)
     learn(plain, expected)
     torch.testing.assert_close(state.params, expected.params, rtol=0.0, atol=0.0)

@@ -430,6 +430,23 @@ def test_long_trainings_of_flat_agents_are_compiled_where_that_is_possible(tmp_p
     assert asked == [False, "auto", False]
 
 
+def test_where_a_run_is_needed_its_result_does_not_count_before_it_is_over(tmp_path):
+    bench = Bench(suite(), Results(tmp_path), seed=0)
+    bench.run("flat", ["right"])
+    first = suite().tasks[0]
+    assert bench._found(first, FLAT, 512, keep=True) is not None
+    told = bench._path(first, FLAT) / "run.json"
+    told.write_text(told.read_text().replace('"status": "done"', '"status": "training"'))
+    assert bench._found(first, FLAT, 512, keep=True) is None
+    shutil.rmtree(bench._path(first, FLAT))
+    assert bench._found(first, FLAT, 512) is not None
+    assert bench._found(first, FLAT, 512, keep=True) is None
+    bench.run("flat", ["left"])
+    assert {(r.task, r.agent) for r in Results(tmp_path).all("line")} == {
+        ("right", FLAT), ("right", TUNED), ("left", FLAT), ("left", TUNED),
+    }  # fmt: skip
+
+
 def test_f3_follows_the_hierarchy_from_task_to_task(tmp_path):
     after = [
         Task("right", spec(3), 0.5),
