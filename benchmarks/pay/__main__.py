@@ -7,12 +7,12 @@ Suites: shuttle, pick-and-place, lander-missions, mazes, keys-and-doors. A resul
 folder is not made again, and a training that was killed goes on where it stood, so the same command
 finishes what it began. Results of other code than today's are named under the table.
 
-Agents, all with as many steps on a task as the hierarchy has there, on the first with those that
-learn its skills, and on the lander's tour with those, too: F0 flat; F1 flat, on the
-task's reward and the weighted sum of the skills' rewards (weights chosen on seed 100); F2 flat with
-a bonus for states that were seldom seen; F3 flat, fine-tuned from earlier tasks; F4 random skills,
-and the best single skill. F1 and F2 learn the first task of each suite, and the lander's tour; and
-any task that is named.
+Agents: F0 flat; F1 flat, on the task's reward and the weighted sum of the skills' rewards (weights
+chosen on seed 100); F2 flat with a bonus for states that were seldom seen; F3 flat, fine-tuned from
+earlier tasks; F4 random skills, and the best single skill. Each has as many steps on a task as the
+hierarchy has there. On the first task these are also the steps that learn the skills; F0 to F2 have
+those on the lander's tour, too. F1 and F2 learn the first task of each suite, the lander's tour,
+and any task that is named.
 """
 
 from __future__ import annotations

@@ -164,9 +164,7 @@ class Bench:
             if task is not source:
                 self._learn(self._agent(task), task, FLAT)
             elif not self._found(task, TUNED, budgets[task.name]):
-                found = self.results.find(
-                    self.suite.name, task.name, FLAT, self.seed, budgets[task.name]
-                )
+                found = self._found(task, FLAT, budgets[task.name])
                 assert found is not None
                 self.results.save(replace(found, agent=TUNED))
         for task in self._with_those_before(tasks)[1:]:
