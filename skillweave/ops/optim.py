@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skillweave.ops.device import all_false
 from skillweave.shapes import Bool, Float, Int
 
 FEWEST_FUSED = 2048
@@ -114,7 +115,7 @@ def _formula_(
 ) -> None:
     """The same step by single operations, wherever torch's own cannot be used or is slower."""
     params, grad, mu, nu, count = state
-    if active is not None and not _all_true(active):
+    if active is not None and (torch.compiler.is_compiling() or not all_false(~active)):
         before = [x.clone() for x in (params, mu, nu, count)]
         _formula_(state, learning_rate, betas, eps, None)
         for now, old in zip((params, mu, nu, count), before, strict=True):
@@ -132,11 +133,6 @@ def _formula_(
     # eps is scaled too, so that this equals the algorithm as published.
     denominator = nu.sqrt().add_(eps * correction2)
     params.sub_((step * mu).div_(denominator))
-
-
-def _all_true(flags: Tensor) -> bool:
-    """Whether all are known to be True: a GPU is not waited for, and a compiler cannot know."""
-    return flags.device.type == "cpu" and not torch.compiler.is_compiling() and bool(flags.all())
 
 
 def kl_adapted_rate(
