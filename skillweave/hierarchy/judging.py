@@ -1,4 +1,7 @@
-"""Which hierarchy a run ends with, of those that it could: found out by episodes of all of them."""
+"""Which hierarchy a run ends with, of those that it could: found out by episodes of all of them.
+
+They are played where it was trained: in EnvPool, where that has the environment.
+"""
 
 from __future__ import annotations
 
@@ -42,9 +45,9 @@ def judged(
             found["before"] = assembled(earlier, _inside(before, nodes))
         for listener in listeners:
             listener.message(f"{entry['name']}: {len(found)} times {EPISODES} episodes are played")
-        seed = SEEDS + int(run.manifest["seed"])
+        seed, spec = SEEDS + int(run.manifest["seed"]), declaration.spec
         scores = {
-            name: evaluate(policy, declaration.spec, episodes=EPISODES, seed=seed)
+            name: evaluate(policy, spec, episodes=EPISODES, seed=seed, engine=spec.engine)
             for name, policy in found.items()
         }
         means = {name: score.mean for name, score in scores.items()}

@@ -1,4 +1,4 @@
-"""Evaluation: whole episodes on Gymnasium's own environment, each from a seed of its own."""
+"""Evaluation: whole episodes, on Gymnasium's own environment, each from a seed of its own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
-from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.envs.envpool_engine import EnvPoolEngine
+from skillweave.envs.make import EngineName, EnvSpec, make_engine
 from skillweave.messages import whole_number
 from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
@@ -23,6 +24,8 @@ from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
+POOL_SEEDS = 2**30
+"""EnvPool takes seeds below twice this; those of its environments follow that of the pool."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,7 @@ def evaluate(
     num_envs: int = 100,
     max_steps: int | None = None,
     watch: Callable[[Played], None] | None = None,
+    engine: EngineName = "sync",
 ) -> Evaluation:
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
@@ -156,6 +160,8 @@ def evaluate(
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
             as many as the environment's own time limit, or ``LONGEST_EPISODE``.
         watch: is shown every step that is played.
+        engine: "sync": Gymnasium's own environments; "auto": EnvPool's, where it has them, each for
+            one episode. That is faster, and the episodes are other ones.
 
     Returns:
         Returns, lengths, and what each skill did.
@@ -166,30 +172,31 @@ def evaluate(
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = min(whole_number(num_envs, "num_envs", 1), episodes)
-    spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
+    spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
     reference = spec.make()
     try:
         limit = limit or time_limit(reference) or LONGEST_EPISODE
         threshold = reference.spec.reward_threshold if reference.spec else None
     finally:
         reference.close()
-    engine = make_engine(replaced(spec, engine="sync"), n)
+    envs = make_engine(spec, n if engine == "sync" else episodes)
     try:
-        spaces = engine.observation_space, engine.action_space
+        spaces = envs.observation_space, envs.action_space
         if isinstance(policy, Foreign):
             policy = policy.bind(*spaces, "the policy")
         _check_spaces(policy, *spaces, spec.name)
-        engine.reset(0)
+        envs.reset(0)
         seeds = episode_seeds(seed, episodes)
+        in_pool = isinstance(envs, EnvPoolEngine)  # single environments take no seed there
         moments = play(
             policy,
-            SeededEpisodes(engine, seeds, limit),
+            SeededEpisodes(envs, seeds[0] % POOL_SEEDS if in_pool else seeds, limit),
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
         return replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
     finally:
-        engine.close()
+        envs.close()
 
 
 def episode_seeds(seed: int, episodes: int) -> list[int]:

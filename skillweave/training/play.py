@@ -99,16 +99,27 @@ def play(
 
 
 class SeededEpisodes:
-    """Whole episodes in an engine, each from a seed of its own."""
+    """Whole episodes in an engine.
 
-    def __init__(self, engine: Engine, seeds: Sequence[int], max_steps: int) -> None:
+    Args:
+        seeds: one of each episode; or one for all: each environment plays one episode then, and all
+            begin at once.
+        max_steps: an episode that nothing has ended by then is cut.
+    """
+
+    def __init__(self, engine: Engine, seeds: Sequence[int] | int, max_steps: int) -> None:
         self.engine, self.num_envs = engine, engine.num_envs
-        self._seeds, self._max_steps = seeds, max_steps
-        self.rows = np.arange(min(self.num_envs, len(seeds)))
+        self._seeds, self._max_steps = [] if isinstance(seeds, int) else seeds, max_steps
         self._episode = np.arange(self.num_envs)
-        self._upcoming = len(self.rows)
         self._elapsed = np.zeros(self.num_envs, np.int64)
-        self.obs = np.array(engine.reset_some(self.rows, list(seeds[: self._upcoming])))
+        if isinstance(seeds, int):
+            self.rows, self._upcoming = np.arange(self.num_envs), 0
+            first = engine.reset(seeds)
+        else:
+            self.rows = np.arange(min(self.num_envs, len(seeds)))
+            self._upcoming = len(self.rows)
+            first = engine.reset_some(self.rows, list(seeds[: self._upcoming]))
+        self.obs = np.array(first)
 
     def mask(self) -> Array | None:
         """(k, A) bool, the actions allowed now, or None."""
