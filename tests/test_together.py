@@ -36,9 +36,11 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
+from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.adoption import told_differences
 from skillweave.hierarchy import judging, training
 from skillweave.runs.directory import RunDirectory
+from skillweave.training import woven
 from skillweave.training.stage_log import START, StageLog, success_rate
 
 
@@ -129,6 +131,34 @@ def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch)
     assert_same(tmp_path / "processes", tmp_path / "here")
 
 
+def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they_did_not(
+    tmp_path, monkeypatch
+):
+    made = []
+
+    def noted(config, *spaces):
+        made.append(config)
+        return make_algorithm(config, *spaces)
+
+    monkeypatch.setattr(woven, "make_algorithm", noted)
+    slow = replace(ON, learning_rate=1e-4)
+
+    class Slow(Left):
+        algorithm = slow
+
+    def train(name):
+        made.clear()
+        hierarchy = declare(Left(), Balance(), Slow())
+        hierarchy.train(tmp_path / name, seed=3, quiet=True)
+        return [config.learning_rate for config in made]
+
+    rates = [ON.learning_rate, slow.learning_rate]
+    assert sorted(train("shared")) == sorted([*rates, ON.learning_rate]), "the selector's is apart"
+    monkeypatch.setattr(woven.WovenAgents, "_made", lambda *told: None)
+    assert len(train("apart")) == 4
+    assert_same(tmp_path / "shared", tmp_path / "apart")
+
+
 def test_skills_that_grew_in_a_population_go_on_as_they_are(tmp_path):
     always = Mutations(none=0, hyperparameters=0, parameters=0, activation=0, architecture=1)
     grows = Evolution(population=4, generations=4, episodes=2, mutations=always)
@@ -193,15 +223,17 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
 def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(tmp_path, monkeypatch, better):
     """Not by chance: one of them always plays well here."""
 
-    def played(policy, spec, **how):
+    def played(policy, spec, *, engine, **how):
+        assert engine == spec.engine == "auto", "they are played where it was trained"
         mean = 10.0 if policy.skills.greedy is better else 5.0
         return SimpleNamespace(mean=mean, lengths=(7, 8))
 
     monkeypatch.setattr(judging, "evaluate", played)
     heard = Heard()
-    run = new_run(declare(), tmp_path / "run")
+    hierarchy = declare(env=EnvSpec("CartPole-v1"))
+    run = new_run(hierarchy, tmp_path / "run")
     with closing(run):
-        policy = training.train(declare(), run, (heard,))
+        policy = training.train(hierarchy, run, (heard,))
     assert policy.skills.greedy is better
     assert run.stage("together")["evaluation_steps"] == 30
     returns = (10.0, 5.0) if better else (5.0, 10.0)

@@ -132,13 +132,14 @@ class Bench:
             policy: Any = run.policy
             greedy = policy.skills.greedy
 
-            def alone(name: str, episodes: int, seed: int) -> Any:
-                return run.evaluate(episodes, seed=seed, skill=name, deterministic=greedy)
+            def alone(name: str, episodes: int, **how: Any) -> Any:
+                return run.evaluate(episodes, skill=name, deterministic=greedy, **how)
 
-            # Which one is best is found out in other episodes than those of its score.
+            # Which one is best is found out in other episodes than those of its score, in EnvPool
+            # where that has them.
             few = max(1, self.suite.episodes // 2)
-            best = max(names, key=lambda n: alone(n, few, TUNING_SEED).mean)
-            returns = alone(best, self.suite.episodes, 0).returns
+            best = max(names, key=lambda n: alone(n, few, seed=TUNING_SEED, engine="auto").mean)
+            returns = alone(best, self.suite.episodes).returns
             self._save(run, task, SINGLE, 0, started, returns, {best: 1.0})
 
     def _random(self, task: Task, skills: Policies) -> Hierarchy:

@@ -105,9 +105,12 @@ class Suite:
         return self.fitted(self.source(task) if skills is None else self.further(task, skills))
 
     def fitted(self, found: Hierarchy) -> Hierarchy:
-        """A hierarchy with the suite's budgets."""
+        """A hierarchy with the suite's budgets.
+
+        Runs go side by side, so one has several processes only where its recipe says so.
+        """
         found.scale(self.scale)
-        found.env = replace(found.spec, workers=1)  # runs go side by side
+        found.env = replace(found.spec, workers=found.spec.workers or 1)
         return found
 
     def steps(self) -> list[int]:

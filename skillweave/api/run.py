@@ -9,6 +9,7 @@ import numpy as np
 
 from skillweave.api.labels import labels_of
 from skillweave.api.player import Player
+from skillweave.envs.make import EngineName
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
@@ -61,6 +62,7 @@ class Run:
         skill: str | None = None,
         max_steps: int | None = None,
         save: bool = False,
+        engine: EngineName = "sync",
     ) -> Evaluation:
         """Score it on Gymnasium's environment.
 
@@ -75,17 +77,22 @@ class Run:
             max_steps: an episode that nothing has ended by then is cut, and the result says so;
                 None: the environment's own time limit, or 100,000 steps.
             save: keep the result in the run's directory, where ``info`` finds it; it takes the
-                place of the one before. Of the whole policy only.
+                place of the one before. Of the whole policy, and on Gymnasium's environment, only.
+            engine: "auto": where it was trained, which is faster where that was in EnvPool, but has
+                other episodes.
 
         Returns:
             Returns, lengths, and what each skill did.
 
         Raises:
             SkillweaveError: there is no such skill; or it was asked to save the evaluation of one
-                skill alone, or in a run of ``from_hub``.
+                skill alone, of another engine, or in a run of ``from_hub``.
         """
-        if save and skill is not None:
-            raise SkillweaveError("save keeps an evaluation of the whole policy: leave out skill")
+        if save and (skill is not None or engine != "sync"):
+            raise SkillweaveError(
+                "save keeps an evaluation of the whole policy on Gymnasium's environment: leave "
+                "out skill and engine"
+            )
         if save:
             must_be_own(self.path)  # said before anything is played
         found = evaluate(
@@ -95,6 +102,7 @@ class Run:
             seed=seed,
             deterministic=deterministic,
             max_steps=max_steps,
+            engine=engine,
         )
         if save:
             save_evaluation(RunDirectory.open(self.path), found, seed, deterministic)

@@ -16,7 +16,7 @@ from skillweave.spaces import ObsCodec
 from skillweave.types import SkillweaveError
 
 KINDS = 16
-"""Kinds that are told apart, 0 to 15: larger numbers count as 15, smaller ones as 0."""
+"""Kinds that are told apart at most, 0 to 15: larger numbers count as 15, smaller ones as 0."""
 WIDTH = 64
 """Features."""
 AT_ONCE = 2**20
@@ -77,8 +77,8 @@ class _SumOfRows(torch.autograd.Function):
 class CellsEncoder:
     """Each value of each cell has a learnt vector; features are the ReLU of their sum.
 
-    This is a dense layer on the one-hot cells, without the zeros. Numbers beside the images are
-    features as they are.
+    This is a dense layer on the one-hot cells, without the zeros. Where the space says that a value
+    is never above 5, it has six vectors. Numbers beside the images are features as they are.
     """
 
     def __init__(self, obs: ObsCodec) -> None:
@@ -88,35 +88,51 @@ class CellsEncoder:
                 "none"
             )
         self._sizes = [math.prod(shape) for shape in obs.images]
-        # Of each image, the row of each cell's first kind.
-        self._first = [Constant(torch.arange(cells) * KINDS) for cells in self._sizes]
+        kinds = [_kinds(obs.highest(i)) for i in range(len(obs.images))]
+        self._last = [Constant(own - 1) for own in kinds]
+        # Of each value, the row of its first kind; and in a table in which all have KINDS.
+        self._first = [Constant(own.cumsum(0) - own) for own in kinds]
+        self._rows = [_rows_of(own) for own in kinds]
         self._vector = obs.size > 0
-        self.size = WIDTH * len(self._sizes) + obs.size
+        self.size = WIDTH * len(kinds) + obs.size
         self.shapes: dict[str, tuple[int, ...]] = {}
-        for i, cells in enumerate(self._sizes):
-            self.shapes |= {f"{i}.weight": (cells * KINDS, WIDTH), f"{i}.bias": (1, WIDTH)}
+        for i, rows in enumerate(self._rows):
+            self.shapes |= {f"{i}.weight": (len(rows), WIDTH), f"{i}.bias": (1, WIDTH)}
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
-        """Orthogonal vectors, gain √2, biases zero."""
-        for name, view in views.items():
-            if name.endswith("weight"):
-                orthogonal_(view, math.sqrt(2.0), generators)
-            else:
-                view.zero_()
+        """Orthogonal vectors, gain √2, biases zero.
+
+        They are drawn for all KINDS: a vector does not depend on how many kinds there are.
+        """
+        for i, (rows, cells) in enumerate(zip(self._rows, self._sizes, strict=True)):
+            views[f"{i}.bias"].zero_()
+            view = views[f"{i}.weight"]
+            every = torch.empty(len(view), cells * KINDS, WIDTH)
+            orthogonal_(every, math.sqrt(2.0), generators)
+            view.copy_(every[:, rows])
 
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
         """Images (P, B, …) of whole numbers to features (P, B, F)."""
-        found = [self._image(views, i, inputs[f"image.{i}"]) for i in range(len(self._sizes))]
+        found = [self._image(views, i, inputs[f"image.{i}"]) for i in range(len(self._rows))]
         if self._vector:
             found.append(inputs["vector"])
         return torch.cat(found, -1)
 
     def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
-        members, batch, cells = *image.shape[:2], self._sizes[i]
-        cell = image.reshape(members, batch, cells)
-        if cell.dtype == torch.uint8:  # never below 0, and the sum makes it int64
-            kind = cell.clamp(max=KINDS - 1)
-        else:
-            kind = cell.long().clamp(0, KINDS - 1)
+        cell, last = image.flatten(2), self._last[i].on(image.device)
+        if cell.dtype != torch.uint8:  # may be below 0
+            cell = cell.long().clamp(min=0)
+        kind = torch.minimum(cell, last)
         rows = kind + self._first[i].on(image.device)
         return torch.relu(sum_of_rows(rows, views[f"{i}.weight"]) + views[f"{i}.bias"])
+
+
+def _kinds(highest: Tensor) -> Tensor:
+    """How many kinds each value of a cell has, for the highest numbers (C, H, W), (K,) int64."""
+    return highest.flatten().clamp(0, KINDS - 1).long() + 1
+
+
+def _rows_of(kinds: Tensor) -> Tensor:
+    """Rows of a table with KINDS for each value (K·KINDS, …), without those that there are not."""
+    exists = torch.arange(KINDS) < kinds[:, None]
+    return exists.flatten().nonzero().flatten()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -83,6 +83,7 @@ class _Leaf:
     choices: tuple[int, ...] = ()  # of each entry, where it is to be one-hot
     start: tuple[int, ...] = ()  # first choice of each entry
     image: ImageLayout | None = None
+    high: Array | None = field(default=None, compare=False)  # of an image: the highest numbers
 
     @cached_property
     def size(self) -> int:
@@ -158,6 +159,13 @@ class ObsCodec:
                 if not bool(((flat >= 0) & (flat < torch.tensor(leaf.choices))).all()):
                     raise ValueError("an observation holds a choice that does not exist")
 
+    def highest(self, i: int) -> Tensor:
+        """The highest number that each pixel of image ``i`` may have, (C, H, W), in its dtype."""
+        leaf = [leaf for leaf in self.leaves if leaf.image is not None][i]
+        assert leaf.image is not None
+        assert leaf.high is not None
+        return leaf.image.read(torch.from_numpy(leaf.high), torch.Size())
+
     def pixels(self, image: Tensor, i: int) -> Tensor:
         """Image ``i`` as a network takes it: float32, integers scaled to [0, 1]."""
         peak = self.peaks[i]
@@ -201,6 +209,7 @@ def _leaves(space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None) -> 
     if offset is not None:
         place = slice(offset, offset + int(np.prod(shape)) * dtype.itemsize)
     choices, start = _choices(space)
+    image = image_layout(space)
     yield _Leaf(
         shape,
         place,
@@ -208,7 +217,8 @@ def _leaves(space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None) -> 
         isinstance(space, gym.spaces.Box),
         choices,
         start,
-        image_layout(space),
+        image,
+        None if image is None else space.high,  # type: ignore[attr-defined]
     )
 
 

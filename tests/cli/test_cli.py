@@ -469,8 +469,9 @@ def test_a_python_user_may_keep_an_evaluation_too(trained: Trained, tmp_path: Pa
     assert "evaluation" not in loaded.info()
     found = loaded.evaluate(2, save=True)
     assert loaded.info()["evaluation"].items() >= found.to_json().items()
-    with pytest.raises(SkillweaveError, match="leave out skill"):
-        loaded.evaluate(2, skill="left", save=True)
+    for how in ({"skill": "left"}, {"engine": "auto"}):
+        with pytest.raises(SkillweaveError, match="leave out skill and engine"):
+            loaded.evaluate(2, save=True, **how)
 
 
 def test_info_of_a_recipe_shows_settings_that_can_be_set(

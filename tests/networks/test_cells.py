@@ -29,6 +29,54 @@ def test_features_are_those_of_a_dense_layer_on_one_hot_cells():
     torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-4)
 
 
+HIGHEST = np.array([[[1, 4]], [[0, 9]], [[2, 99]]])  # more than 15 count as 15
+"""Of each value of three cells, in one column."""
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])
+def test_each_value_has_as_many_vectors_as_its_space_has_kinds(dtype):
+    """They are those of a table for sixteen kinds of all values, and learn the same."""
+    few = gym.spaces.Box(0, HIGHEST.astype(dtype), dtype=dtype)
+    many = gym.spaces.Box(0, 99, HIGHEST.shape, dtype)
+    encoders = [CellsEncoder(obs_codec(space)) for space in (few, many)]
+    kinds = HIGHEST[:, 0].T.flatten().clip(max=15) + 1  # channels first
+    assert [e.shapes["0.weight"] for e in encoders] == [(kinds.sum(), WIDTH), (6 * KINDS, WIDTH)]
+    there = np.flatnonzero(np.arange(KINDS) < kinds[:, None])
+
+    fresh = [{k: torch.ones(2, *v) for k, v in encoder.shapes.items()} for encoder in encoders]
+    for encoder, views in zip(encoders, fresh, strict=True):
+        encoder.init_(views, [torch.Generator().manual_seed(i) for i in range(2)])
+        assert not views["0.bias"].any()
+    assert torch.equal(fresh[0]["0.weight"], fresh[1]["0.weight"][:, there])
+
+    image = torch.randint(0, 99, (2, 7, 2, 3, 1), generator=torch.Generator().manual_seed(0))
+    image = image.minimum(torch.from_numpy(HIGHEST).permute(2, 0, 1)).to(
+        torch.from_numpy(np.empty(0, dtype)).dtype
+    )
+    for views in fresh:
+        for view in views.values():
+            view.requires_grad_()
+    features = [
+        encoder(views, {"image.0": image}) for encoder, views in zip(encoders, fresh, strict=True)
+    ]
+    torch.testing.assert_close(*features)
+    gradients = [
+        torch.autograd.grad(found.square().sum(), views["0.weight"])[0]
+        for found, views in zip(features, fresh, strict=True)
+    ]
+    torch.testing.assert_close(gradients[0], gradients[1][:, there])
+    assert gradients[1].any()
+
+
+def test_a_number_above_the_highest_counts_as_the_highest():
+    encoder = CellsEncoder(obs_codec(gym.spaces.Box(0, 3, (3, 3, 2), np.uint8)))
+    views = {k: torch.randn(1, *shape) for k, shape in encoder.shapes.items()}
+    images = [torch.full((1, 1, 2, 3, 3), kind, dtype=torch.uint8) for kind in (3, 4, 255)]
+    found = [encoder(views, {"image.0": image}) for image in images]
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+
+
 @pytest.mark.parametrize("dtype", [np.int64, np.float32])
 def test_kinds_are_the_same_in_other_types_of_numbers(dtype):
     space = gym.spaces.Box(-99, 99, (3, 3, 2), dtype)

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from skillweave import SkillweaveError, Step
+from skillweave import SkillweaveError, Step, envpool
 from skillweave.recipes import _rooms as world
 from skillweave.recipes import keys_and_doors as rooms
 
@@ -153,6 +153,34 @@ def test_a_pool_draws_rooms_for_each_agent_and_repeats_itself():
     np.testing.assert_array_equal(*played)
     doors = (played[0][..., 0] == world.DOOR).any(axis=(1, 3, 4))  # Empty has none
     assert all(set(agent) == {False, True} for agent in doors.T)
+
+
+def test_a_step_is_what_each_agents_room_makes_of_it():
+    pytest.importorskip("envpool")
+    names, n, rng = ("DoorKey-5x5", "Empty-5x5"), 8, np.random.default_rng(0)
+    pool, ids = world.RoomPool(names, n, 1, seed=3), np.arange(n, dtype=np.int32)
+    alone = [envpool(f"MiniGrid-{name}-v0", n, 1, 3 + k) for k, name in enumerate(names)]
+    obs, _ = pool.reset(ids)
+    room = pool._room.copy()
+    assert set(room) == {0, 1}
+    for k, own in enumerate(alone):
+        np.testing.assert_array_equal(own.reset(ids[room == k])[0]["image"], obs[room == k])
+    seen, done = set(), False
+    for _ in range(60):
+        action = rng.choice([world.LEFT, world.FORWARD], len(ids)).astype(np.int32)
+        obs, reward, terminated, truncated, _ = pool.step(action, ids)
+        for k, own in enumerate(alone):
+            mine = room[ids] == k
+            if mine.any():
+                wants, pays, *ends, _ = own.step(action[mine], ids[mine])
+                np.testing.assert_array_equal(obs[mine], wants["image"])
+                np.testing.assert_array_equal(reward[mine], pays > 0)
+                np.testing.assert_array_equal([terminated[mine], truncated[mine]], ends)
+        seen |= {row.tobytes() for row in obs}
+        done |= bool(reward.any())
+        ids = ids[~(terminated | truncated)]
+    assert done
+    assert len(seen) > 30
 
 
 def test_a_task_pays_one_however_long_it_took():

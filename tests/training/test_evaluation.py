@@ -11,7 +11,7 @@ import torch
 from gymnasium.spaces import Box, Discrete
 
 import skillweave.training.evaluation as evaluation_module
-from skillweave import PPO, EnvSpec, Evaluation, Skill, SkillweaveError, evaluate
+from skillweave import PPO, EnvSpec, Evaluation, Skill, SkillweaveError, envpool, evaluate
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.calls import SkillSet
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -89,6 +89,37 @@ def test_the_result_does_not_depend_on_how_many_environments_stand_side_by_side(
     assert all(r == results[0] for r in results)
     assert len(results[0].returns) == len(results[0].lengths) == 17
     assert len(set(results[0].lengths)) > 3
+
+
+@pytest.mark.parametrize("seed", [0, 10**12 - 1])
+def test_in_a_pool_each_environment_plays_one_episode(seed):
+    pytest.importorskip("envpool")
+    n = 9
+    policy, spec = agent("CartPole-v1"), EnvSpec("CartPole-v1")
+    found = evaluate(policy, spec, episodes=n, seed=seed, num_envs=4, engine="auto")
+    again = evaluate(policy, spec, episodes=n, seed=seed, engine="envpool")
+    assert found == again, "it takes as many environments as there are episodes"
+
+    pool = envpool("CartPole-v1", n, 1, FIRST_SEED * (seed + 1) % 2**30)
+    obs, _ = pool.reset()
+    lengths, open_ = np.zeros(n, int), np.ones(n, bool)
+    while open_.any():
+        action, _ = policy.act({}, obs)
+        obs, _, terminated, truncated, _ = pool.step(action.astype(np.int32))
+        lengths += open_
+        open_ &= ~(terminated | truncated)
+    assert list(found.lengths) == lengths.tolist() == list(found.returns)
+    assert len(set(lengths)) > 3, "episodes are alike: the seed says nothing"
+    assert evaluate(policy, spec, episodes=n, seed=seed + 1, engine="auto") != found
+
+
+def test_where_there_is_no_pool_the_engine_makes_no_difference():
+    wrapped = EnvSpec("CartPole-v1", wrappers=(gym.wrappers.RecordEpisodeStatistics,))
+    policy = agent("CartPole-v1")
+    found = [evaluate(policy, wrapped, episodes=8, engine=e) for e in ("sync", "auto")]
+    assert found[0] == found[1]
+    with pytest.raises(SkillweaveError, match="no engine 'fast'"):
+        evaluate(policy, wrapped, engine="fast")
 
 
 def test_no_episode_begins_that_nobody_asked_for():
