@@ -219,18 +219,34 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
 
 
 @pytest.mark.usefixtures("usual_episodes")
+def test_it_is_found_out_in_the_pool_where_it_was_trained_in_one(tmp_path):
+    pytest.importorskip("envpool")
+    hierarchy = declare(env=EnvSpec("CartPole-v1", workers=1))
+    run = hierarchy.train(tmp_path / "run", seed=3, quiet=True)
+    kept = run.info()["stages"][-1]["kept"]
+    how = {"seed": judging.SEEDS + 3, "deterministic": True}
+    assert run.evaluate(100, **how, engine="auto").mean == kept[kept["kept"]]
+    assert run.evaluate(100, **how).mean != kept[kept["kept"]]
+
+
+@pytest.mark.usefixtures("usual_episodes")
+@pytest.mark.parametrize("engine", ["auto", "sync"])
 @pytest.mark.parametrize("better", [True, False])
-def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(tmp_path, monkeypatch, better):
+def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
+    tmp_path, monkeypatch, better, engine
+):
     """Not by chance: one of them always plays well here."""
 
+    wanted = engine
+
     def played(policy, spec, *, engine, **how):
-        assert engine == spec.engine == "auto", "they are played where it was trained"
+        assert engine == spec.engine == wanted, "they are played where it was trained"
         mean = 10.0 if policy.skills.greedy is better else 5.0
         return SimpleNamespace(mean=mean, lengths=(7, 8))
 
     monkeypatch.setattr(judging, "evaluate", played)
     heard = Heard()
-    hierarchy = declare(env=EnvSpec("CartPole-v1"))
+    hierarchy = declare(env=EnvSpec("CartPole-v1", engine=engine))
     run = new_run(hierarchy, tmp_path / "run")
     with closing(run):
         policy = training.train(hierarchy, run, (heard,))

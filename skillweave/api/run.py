@@ -64,35 +64,28 @@ class Run:
         save: bool = False,
         engine: EngineName = "sync",
     ) -> Evaluation:
-        """Score it on Gymnasium's environment.
+        """Score it in whole episodes.
 
         Args:
             episodes: whole episodes.
             seed: picks them.
             deterministic: act greedily, else sample. Of a hierarchy it is about the selector;
                 ``greedy_skills`` is about its skills.
-            skill: score this skill alone, as if the selector always chose it: the hierarchy's
-                reflexes are in force, also where the skill was trained without them
-                (``reflexes_in_training=False``).
-            max_steps: an episode that nothing has ended by then is cut, and the result says so;
-                None: the environment's own time limit, or 100,000 steps.
-            save: keep the result in the run's directory, where ``info`` finds it; it takes the
-                place of the one before. Of the whole policy, and on Gymnasium's environment, only.
-            engine: "auto": where it was trained, which is faster where that was in EnvPool, but has
-                other episodes.
+            skill: score this skill alone, as if the selector always chose it. The hierarchy's
+                reflexes are in force, with ``reflexes_in_training=False``, too.
+            max_steps: an episode that nothing has ended by then is cut; None: as ``evaluate``.
+            save: keep the result in the run's directory, where ``info`` finds it, instead of the
+                one before. Not with ``skill`` or another engine.
+            engine: sync: Gymnasium's environment; envpool, auto: see ``evaluate``.
 
         Returns:
             Returns, lengths, and what each skill did.
 
         Raises:
-            SkillweaveError: there is no such skill; or it was asked to save the evaluation of one
-                skill alone, of another engine, or in a run of ``from_hub``.
+            SkillweaveError: no such skill or engine; or ``save`` where it cannot be.
         """
         if save and (skill is not None or engine != "sync"):
-            raise SkillweaveError(
-                "save keeps an evaluation of the whole policy on Gymnasium's environment: leave "
-                "out skill and engine"
-            )
+            raise SkillweaveError("save keeps a whole policy's score: leave out skill and engine")
         if save:
             must_be_own(self.path)  # said before anything is played
         found = evaluate(

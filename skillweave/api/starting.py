@@ -67,7 +67,7 @@ def _check_start(
     elif not same_space(before.action_space, algorithm.action_space):
         what = "its actions are others here"
     elif _networks(before) != _networks(algorithm) or not same_shapes(before, algorithm):
-        what = "it has other networks here (network, critic or normalize_obs)"
+        what = "it has other networks here (network, critic, normalize_obs, or kinds of cells)"
     if what:
         raise SkillweaveError(
             f"start_from: {name!r} cannot begin with what it learnt in {where}: {what}"

@@ -48,11 +48,13 @@ class EnvSpec:
         engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
             environment as Gymnasium defines it, else sync.
         pool: makes the same environments side by side, for training: EnvPool's, perhaps with
-            changes (``PoolWrapper``). Evaluations play ``env``, and so does engine sync.
-        workers: processes in which sync environments are stepped, and acted in, while they are
-            trained in. None: measured when a run begins, one for each core if a step takes long
-            enough to be worth it; the run keeps the choice, as results depend on it. The members of
-            a population are split among them; None: they stay in one.
+            changes (``PoolWrapper``). Scores are of ``env``, and so is engine sync; whether what
+            was learnt together is kept is found out in the pool.
+        workers: processes in which environments are stepped, and acted in, while they are trained
+            in. None: one, where they stand in a pool; else it is measured when a run begins, one
+            for each core if a step takes long enough to be worth it. The run keeps the choice, as
+            results depend on it. The members of a population are split among them; None: they stay
+            in one.
 
     Raises:
         SkillweaveError: a field is of another kind, or fields do not fit each other; the message
@@ -209,11 +211,16 @@ def workers_for(spec: EnvSpec) -> int:
         return 1
     env = spec.make()
     try:
-        if spec.engine != "sync" and _pool_of(spec, env) is not None:
+        if in_pool(spec, env):
             return 1
         return cores() if _step_seconds(env) > SLOW else 1
     finally:
         env.close()
+
+
+def in_pool(spec: EnvSpec, reference: gym.Env[Any, Any]) -> bool:
+    """Whether ``make_engine`` makes a pool of this environment."""
+    return spec.engine != "sync" and _pool_of(spec, reference) is not None
 
 
 def _pool_of(spec: EnvSpec, reference: gym.Env[Any, Any]) -> MakePool | None:

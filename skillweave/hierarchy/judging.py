@@ -1,6 +1,7 @@
 """Which hierarchy a run ends with, of those that it could: found out by episodes of all of them.
 
-They are played where it was trained: in EnvPool, where that has the environment.
+They are played by the engine that it was trained with, in one process: in a pool, where there is
+one.
 """
 
 from __future__ import annotations

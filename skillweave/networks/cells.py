@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -78,7 +79,8 @@ class CellsEncoder:
     """Each value of each cell has a learnt vector; features are the ReLU of their sum.
 
     This is a dense layer on the one-hot cells, without the zeros. Where the space says that a value
-    is never above 5, it has six vectors. Numbers beside the images are features as they are.
+    is never above 5, it has six vectors, and larger numbers count as 5. Numbers beside the images
+    are features as they are.
     """
 
     def __init__(self, obs: ObsCodec) -> None:
@@ -100,16 +102,16 @@ class CellsEncoder:
             self.shapes |= {f"{i}.weight": (len(rows), WIDTH), f"{i}.bias": (1, WIDTH)}
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
-        """Orthogonal vectors, gain √2, biases zero.
+        """Rows of an orthogonal table, gain √2; biases zero.
 
-        They are drawn for all KINDS: a vector does not depend on how many kinds there are.
+        The table is drawn for all KINDS: a vector does not depend on how many kinds there are.
         """
         for i, (rows, cells) in enumerate(zip(self._rows, self._sizes, strict=True)):
             views[f"{i}.bias"].zero_()
-            view = views[f"{i}.weight"]
-            every = torch.empty(len(view), cells * KINDS, WIDTH)
-            orthogonal_(every, math.sqrt(2.0), generators)
-            view.copy_(every[:, rows])
+            every = torch.empty(1, cells * KINDS, WIDTH)
+            for member, generator in zip(views[f"{i}.weight"], generators, strict=True):
+                orthogonal_(every, math.sqrt(2.0), [generator])
+                member.copy_(every[0, rows])
 
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
         """Images (P, B, …) of whole numbers to features (P, B, F)."""
@@ -129,10 +131,11 @@ class CellsEncoder:
 
 def _kinds(highest: Tensor) -> Tensor:
     """How many kinds each value of a cell has, for the highest numbers (C, H, W), (K,) int64."""
-    return highest.flatten().clamp(0, KINDS - 1).long() + 1
+    kinds = np.clip(highest.flatten().numpy(), 0, KINDS - 1)  # torch clips no uint16
+    return torch.from_numpy(kinds.astype(np.int64)) + 1
 
 
 def _rows_of(kinds: Tensor) -> Tensor:
-    """Rows of a table with KINDS for each value (K·KINDS, …), without those that there are not."""
+    """Rows of kinds that exist, in a table with KINDS for each value (K·KINDS, …)."""
     exists = torch.arange(KINDS) < kinds[:, None]
     return exists.flatten().nonzero().flatten()

@@ -46,7 +46,7 @@ FAR = 14
 """More than to any of them."""
 LEFT, RIGHT, FORWARD, PICK_UP, DROP, TOGGLE = range(6)
 HIGHEST = np.broadcast_to(np.array([10, 5, 2], np.uint8), (7, 7, 3))
-"""Kind, colour and state of a cell are never more. MiniGrid's own space says 255."""
+"""Kind, colour and state of a cell are never higher. MiniGrid's own space says 255."""
 SPACE, ACTIONS = gym.spaces.Box(0, HIGHEST, dtype=np.uint8), gym.spaces.Discrete(7)
 
 

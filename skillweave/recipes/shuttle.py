@@ -121,8 +121,9 @@ SELECTOR = PPO(
 )
 
 COLLECTORS = 2
-"""Processes that step half-cheetahs and act in them, while this one learns: on two cores that takes
-about four fifths of the time. What is learnt depends on it, so it does not follow the machine."""
+"""Processes that step half-cheetahs and act in them, while this one learns. On two cores that takes
+about four fifths of the time of a single one. What is learnt depends on their number, so it is the
+same on every machine."""
 
 # At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort
 # costs, and would stand still; and skills learn to turn where others have run. In the end a few

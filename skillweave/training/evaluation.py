@@ -1,4 +1,7 @@
-"""Evaluation: whole episodes, on Gymnasium's own environment, each from a seed of its own."""
+"""Evaluation: whole episodes on Gymnasium's own environment, each from a seed of its own.
+
+Or in a pool, which is faster, and where all episodes begin from one seed.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
-from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.envs.make import EngineName, EnvSpec, make_engine
+from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.messages import whole_number
 from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
@@ -25,7 +27,7 @@ from skillweave.types import Array, Policy, SkillweaveError
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
 POOL_SEEDS = 2**30
-"""EnvPool takes seeds below twice this; those of its environments follow that of the pool."""
+"""A pool has the first episode's seed, modulo this: EnvPool takes seeds below twice as much."""
 
 
 @dataclass(frozen=True)
@@ -156,47 +158,56 @@ def evaluate(
         env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
         seed: picks the episodes; the same seed gives the same starts to every policy.
         deterministic: act greedily, else sample.
-        num_envs: environments side by side; does not change the result of a greedy policy.
+        num_envs: environments side by side; does not change the result of a greedy policy. In a
+            pool there is one for each episode.
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
             as many as the environment's own time limit, or ``LONGEST_EPISODE``.
         watch: is shown every step that is played.
-        engine: "sync": Gymnasium's own environments; "auto": EnvPool's, where it has them, each for
-            one episode. That is faster, and the episodes are other ones.
+        engine: "sync": Gymnasium's own environments; "envpool": a pool of EnvPool's; "auto": a
+            pool where there can be one. That is faster, and the episodes are other ones.
 
     Returns:
         Returns, lengths, and what each skill did.
 
     Raises:
-        SkillweaveError: the policy was made for other spaces.
+        SkillweaveError: the policy was made for other spaces; or there is no such engine, or no
+            pool.
     """
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
-    n = min(whole_number(num_envs, "num_envs", 1), episodes)
+    n = whole_number(num_envs, "num_envs", 1)
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
-    reference = spec.make()
-    try:
-        limit = limit or time_limit(reference) or LONGEST_EPISODE
-        threshold = reference.spec.reward_threshold if reference.spec else None
-    finally:
-        reference.close()
-    envs = make_engine(spec, n if engine == "sync" else episodes)
+    longest, threshold, pooled = _about(spec)
+    envs = make_engine(spec, episodes if pooled else min(n, episodes))
     try:
         spaces = envs.observation_space, envs.action_space
         if isinstance(policy, Foreign):
             policy = policy.bind(*spaces, "the policy")
         _check_spaces(policy, *spaces, spec.name)
-        envs.reset(0)
-        seeds = episode_seeds(seed, episodes)
-        in_pool = isinstance(envs, EnvPoolEngine)  # single environments take no seed there
+        seeds: Any = episode_seeds(seed, episodes)
+        if pooled:  # its environments take no seeds of their own
+            seeds = seeds[0] % POOL_SEEDS
+        else:
+            envs.reset(0)
         moments = play(
             policy,
-            SeededEpisodes(envs, seeds[0] % POOL_SEEDS if in_pool else seeds, limit),
+            SeededEpisodes(envs, seeds, limit or longest),
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
         return replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
     finally:
         envs.close()
+
+
+def _about(spec: EnvSpec) -> tuple[int, float | None, bool]:
+    """The longest episode, the return at which it is solved, and whether there is a pool."""
+    env = spec.make()
+    try:
+        threshold = env.spec.reward_threshold if env.spec else None
+        return time_limit(env) or LONGEST_EPISODE, threshold, in_pool(spec, env)
+    finally:
+        env.close()
 
 
 def episode_seeds(seed: int, episodes: int) -> list[int]:

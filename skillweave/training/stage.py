@@ -241,8 +241,8 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
             if entry["workers"] > 1 and entry["algorithm"].get("device") == "cuda":
                 raise SkillweaveError(
                     f"stage {entry['name']!r}: device is 'cuda', but the parts of a population "
-                    "learn on processors alone: set device='cpu', or leave out the number of "
-                    "collectors (workers)"
+                    "learn on processors alone: set device='cpu', or workers=1 "
+                    "(--collectors 1)"
                 )
         elif spec.workers is None:
             fitting = (k for k in range(workers, 0, -1) if num_envs % k == 0)
@@ -250,7 +250,8 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
         elif num_envs % workers:
             raise SkillweaveError(
                 f"stage {entry['name']!r}: num_envs is {num_envs}; it must be a multiple of "
-                f"workers, {workers}, so that each has as many environments"
+                f"workers, {workers}, so that each has as many environments; or set workers=1 "
+                "(--collectors 1)"
             )
         else:
             entry["workers"] = workers
@@ -277,7 +278,7 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
         raise SkillweaveError(
             f"stage {entry['name']!r}: it evolves, and all members of {type(config).__name__} "
             f"learn from one replay buffer, so they cannot be split into {entry['workers']} parts. "
-            "Leave out the number of collectors (workers), take PPO, or name other stages: "
+            "Set workers=1 (--collectors 1), take PPO, or name other stages: "
             "evolve={...}"
         )
     try:  # what is not written takes no memory

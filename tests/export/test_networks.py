@@ -31,6 +31,7 @@ torch.set_num_threads(1)
 SMALL = Network((8,), cnn=CNN.small())
 REPLAY: dict[str, Any] = {"buffer_size": 100, "network": SMALL, "normalize_obs": True}
 BOX64 = gym.spaces.Box(np.array([-2.0, -np.inf]), np.array([1.0, np.inf]), dtype=np.float64)
+FEW = gym.spaces.Box(0, np.arange(96, dtype=np.uint8).reshape(6, 8, 2) % 7, dtype=np.uint8)
 NESTED = gym.spaces.Dict(
     image=gym.spaces.Box(0, 255, (5, 5, 3), np.uint8),
     inner=gym.spaces.Tuple(
@@ -57,6 +58,9 @@ CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
     "ppo, cells": (
         PPO(network=Network((8,), encoder="cells")), SHOWS["image, channels last"],
         ASKS["Discrete"][0],
+    ),
+    "ppo, cells with few kinds": (
+        PPO(network=Network((8,), encoder="cells")), FEW, ASKS["Discrete"][0],
     ),
     "dqn, impala": (
         DQN(**REPLAY | {"network": Network((8,), cnn=CNN.impala((4,)))}),

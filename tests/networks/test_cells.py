@@ -33,6 +33,13 @@ HIGHEST = np.array([[[1, 4]], [[0, 9]], [[2, 99]]])  # more than 15 count as 15
 """Of each value of three cells, in one column."""
 
 
+@pytest.mark.parametrize("dtype", [np.bool_, np.uint16, np.uint64, np.int8])
+def test_numbers_of_any_type_have_kinds(dtype):
+    most = 1 if dtype is np.bool_ else 9
+    space = gym.spaces.Box(0, most, (3, 3, 2), dtype)
+    assert CellsEncoder(obs_codec(space)).shapes["0.weight"] == (18 * (most + 1), WIDTH)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])
 def test_each_value_has_as_many_vectors_as_its_space_has_kinds(dtype):
     """They are those of a table for sixteen kinds of all values, and learn the same."""

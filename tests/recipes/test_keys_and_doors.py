@@ -177,6 +177,7 @@ def test_a_step_is_what_each_agents_room_makes_of_it():
                 np.testing.assert_array_equal(reward[mine], pays > 0)
                 np.testing.assert_array_equal([terminated[mine], truncated[mine]], ends)
         seen |= {row.tobytes() for row in obs}
+        assert (obs <= world.HIGHEST).all()
         done |= bool(reward.any())
         ids = ids[~(terminated | truncated)]
     assert done
@@ -200,6 +201,7 @@ def test_rooms_are_drawn_anew_for_each_episode():
     again = world.Rooms(world.SMALL)
     same = [again.reset(seed=s)[0] for s in (0, *[None] * 40)]
     np.testing.assert_array_equal(drawn, same)
+    assert all(world.SPACE.contains(obs) for obs in drawn)
     seen = set(np.unique([d[..., 0] for d in drawn]))
     assert {world.KEY, world.BALL, world.DOOR} <= seen
 

@@ -114,9 +114,20 @@ def test_in_a_pool_each_environment_plays_one_episode(seed):
 
 
 def test_where_there_is_no_pool_the_engine_makes_no_difference():
-    wrapped = EnvSpec("CartPole-v1", wrappers=(gym.wrappers.RecordEpisodeStatistics,))
-    policy = agent("CartPole-v1")
-    found = [evaluate(policy, wrapped, episodes=8, engine=e) for e in ("sync", "auto")]
+    made = []
+
+    class Counted(gym.Wrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            made.append(self)
+
+    wrapped = EnvSpec("CartPole-v1", wrappers=(Counted,))
+    policy, how = agent("CartPole-v1"), {"episodes": 8, "num_envs": 3, "deterministic": False}
+    found = []
+    for engine in ("sync", "auto"):
+        made.clear()
+        found.append(evaluate(policy, wrapped, **how, engine=engine))
+        assert len(made) < 8, "there are three, and those that are asked for spaces"
     assert found[0] == found[1]
     with pytest.raises(SkillweaveError, match="no engine 'fast'"):
         evaluate(policy, wrapped, engine="fast")
