@@ -289,10 +289,12 @@ def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn
 
 def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
     for how in ({}, {"selector": replace(ON, floor=0.7)}):
-        (stage,) = training.stages_of(declare(interrupt=True, **how))
+        told = Together(floor_fraction=0.3)
+        (stage,) = training.stages_of(declare(interrupt=True, together=told, **how))
         critic = stage.beside["skill_critic"]
-        assert (critic.floor, critic.floor_final) == (stage.config.floor, stage.config.floor_final)
-        assert critic.floor == (0.7 if how else Together().floor)
+        for name in ("floor", "floor_final", "floor_fraction"):
+            assert getattr(critic, name) == getattr(stage.config, name)
+        assert (critic.floor, critic.floor_fraction) == ((0.7, 1.0) if how else (1.0, 0.3))
 
 
 def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():

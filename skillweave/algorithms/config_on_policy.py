@@ -84,7 +84,9 @@ class PPO(OnPolicy):
     floor: float = 0.0
     """Share of actions drawn uniformly from those allowed, discrete ones, at the start."""
     floor_final: float | None = None
-    """The same at the end of the budget, reached linearly; None: constant."""
+    """The same afterwards, reached linearly; None: constant."""
+    floor_fraction: float = 1.0
+    """Share of the budget over which the floor falls."""
     vf_coef: float = 0.5
     """Weight of the value loss."""
     max_grad_norm: float = 0.5
@@ -118,7 +120,7 @@ class PPO(OnPolicy):
         number(self, "gae_lambda", high=1.0)
         positive(self, "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")
         number(self, "ent_coef", "vf_coef", "min_advantage_std")
-        number(self, "floor", high=1.0)
+        number(self, "floor", "floor_fraction", high=1.0)
         for name in ("ent_coef_final", "floor_final"):
             if getattr(self, name) is not None:
                 number(self, name, high=1.0 if name == "floor_final" else math.inf)
@@ -188,13 +190,15 @@ class SkillCritic(OnPolicy):
     """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
     cut: while skills learn, what skills are worth is multiplied by 1 − floor."""
     floor_final: float | None = None
-    """The same at the end of the budget, reached linearly; None: constant."""
+    """The same afterwards, reached linearly; None: constant."""
+    floor_fraction: float = 1.0
+    """Share of the budget over which the floor falls."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         whole(self, "batch_size", "update_epochs")
         number(self, "gae_lambda", high=1.0)
-        number(self, "floor", high=1.0)
+        number(self, "floor", "floor_fraction", high=1.0)
         number(self, "min_advantage_std")
         if self.floor_final is not None:
             number(self, "floor_final", high=1.0)

@@ -50,7 +50,8 @@ def floor_now(config: PPO | SkillCritic, progress: float, like: Tensor) -> Tenso
     first, last = config.floor, config.floor_final
     if max(first, last or 0.0) == 0.0:
         return None
-    share = first if last is None else first + progress * (last - first)
+    fallen = min(1.0, progress / max(config.floor_fraction, 1e-9))
+    share = first if last is None else first + fallen * (last - first)
     return torch.full((len(like), 1, 1), share, device=like.device)
 
 

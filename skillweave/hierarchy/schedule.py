@@ -126,7 +126,8 @@ def _nats(declaration: Declaration) -> dict[str, float]:
 def _with_floor(config: Any, how: Together) -> Any:
     """A selector's settings, with the floor of learning together where it names none."""
     if isinstance(config, PPO) and not config.floor:
-        return replace(config, floor=how.floor, floor_final=how.floor_final)
+        names = "floor", "floor_final", "floor_fraction"
+        return replace(config, **{name: getattr(how, name) for name in names})
     return config
 
 
@@ -136,7 +137,7 @@ def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
     if isinstance(own, PPO):
         same = (
             "n_steps", "gae_lambda", "network", "overlap", "floor", "floor_final",
-            "min_advantage_std",
+            "floor_fraction", "min_advantage_std",
         )  # fmt: skip
         shared |= {f: getattr(own, f) for f in same}
     if "network" in shared:  # the critic remembers nothing

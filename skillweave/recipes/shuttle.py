@@ -127,8 +127,10 @@ same on every machine."""
 
 # At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort
 # costs, and would stand still; and skills learn to turn where others have run. In the end a few
-# are, so that skills keep knowing how to begin elsewhere than where the task asks for them.
-FLOOR = Together(floor=0.95, floor_final=0.05)
+# are, so that skills keep knowing how to begin elsewhere than where the task asks for them. After a
+# sixth of the steps the selector knows its task. While calls are drawn by lot, points are seldom
+# passed, and that is where skills learn to brake: so the share falls fast.
+FLOOR = Together(floor=0.95, floor_final=0.05, floor_fraction=0.4)
 
 FURTHER_CALL_STEPS = 100
 """Skills that are there already end by themselves where a leg is done. By lot, calls of 40 steps

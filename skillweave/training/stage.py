@@ -94,7 +94,9 @@ class Together:
     floor: float = 1.0
     """The least share of calls that are drawn uniformly from those allowed, at the start."""
     floor_final: float = 0.1
-    """The same at the end of the budget, reached linearly."""
+    """The same afterwards, reached linearly."""
+    floor_fraction: float = 1.0
+    """Share of the budget over which the floor falls."""
     task_weight: float = 0.0
     """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
     for skills that learn by PPO."""
@@ -108,7 +110,7 @@ class Together:
     """A skill learns when it has acted in this share of a rollout's rows, or more."""
 
     def __post_init__(self) -> None:
-        for name in ("floor", "floor_final", "quota"):
+        for name in ("floor", "floor_final", "floor_fraction", "quota"):
             number(self, name, high=1.0)
         number(self, "task_weight")
         number(self, "margin")

@@ -1,5 +1,7 @@
 """What a stage adds to PPO: the floor under discrete actions, the anchor, the task's advantage."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -33,6 +35,12 @@ def test_a_floor_is_shared_among_what_is_allowed():
 def test_the_floor_falls_over_the_budget():
     config, like = PPO(floor=0.5, floor_final=0.1), torch.zeros(2)
     assert floor_now(config, 0.25, like).flatten().tolist() == pytest.approx([0.4, 0.4])
+    fast = replace(config, floor_fraction=0.4)
+    for progress, share in ((0.0, 0.5), (0.1, 0.4), (0.4, 0.1), (1.0, 0.1)):
+        assert floor_now(fast, progress, like).flatten().tolist() == pytest.approx([share] * 2)
+    at_once = replace(config, floor_fraction=0.0)
+    assert floor_now(at_once, 0.0, like).flatten().tolist() == [0.5, 0.5]
+    assert floor_now(at_once, 0.01, like).flatten().tolist() == pytest.approx([0.1, 0.1])
     assert floor_now(PPO(floor=0.5), 0.9, like).flatten().tolist() == [0.5, 0.5]
     assert floor_now(PPO(), 0.5, like) is None
 
@@ -52,6 +60,8 @@ def test_a_floor_needs_discrete_actions():
         make_algorithm(PPO(floor=0.1), SEEN, SEEN)
     with pytest.raises(SkillweaveError, match="floor"):
         PPO(floor=1.5)
+    with pytest.raises(SkillweaveError, match="floor_fraction"):
+        PPO(floor_fraction=1.5)
 
 
 def test_divergence_of_heads_is_that_of_their_distributions():
