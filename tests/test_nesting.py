@@ -59,6 +59,13 @@ def declare(inner=None, **how):
     return Hierarchy(skills=[Left(), inner, Push()], **options(call_steps=7) | how)
 
 
+def test_selectors_of_all_levels_have_the_floor_of_learning_together():
+    told = Together(floor=0.8, floor_final=0.2, floor_fraction=0.3)
+    (stage,) = training.stages_of(declare(learn="together", together=told))
+    for config in (stage.config, stage.beside["inner/selector"]):
+        assert (config.floor, config.floor_final, config.floor_fraction) == (0.8, 0.2, 0.3)
+
+
 class Careful(Skill):
     """A hierarchy that is paid in its own way, and stops by itself."""
 

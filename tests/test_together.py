@@ -36,6 +36,7 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
+from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.adoption import told_differences
 from skillweave.hierarchy import judging, training
@@ -295,6 +296,23 @@ def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
         for name in ("floor", "floor_final", "floor_fraction"):
             assert getattr(critic, name) == getattr(stage.config, name)
         assert (critic.floor, critic.floor_fraction) == ((0.7, 1.0) if how else (1.0, 0.3))
+
+
+@pytest.mark.parametrize("name", ["floor_final", "floor_fraction"])
+def test_how_a_selectors_floor_falls_is_not_lost_where_it_has_none(name):
+    alone = declare(selector=replace(ON, **{name: 0.5}))
+    with pytest.raises(SkillweaveError, match=rf"set together\.{name}, or selector\.floor, too"):
+        training.stages_of(alone)
+    (stage,) = training.stages_of(declare(selector=replace(ON, floor=0.7, **{name: 0.5})))
+    assert getattr(stage.config, name) == 0.5
+    assert stage.config.floor == 0.7
+    training.stages_of(declare(learn="apart", selector=replace(ON, **{name: 0.5})))
+
+
+@pytest.mark.parametrize("make", [Together, SkillCritic])
+def test_a_floor_falls_over_a_share_of_the_budget(make):
+    with pytest.raises(SkillweaveError, match=r"floor_fraction is 1\.5"):
+        make(floor_fraction=1.5)
 
 
 def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():

@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> None:
             if told := of_other_code(results):
                 print(told)
             print(*draw(suite, results, out), sep="\n", flush=True)
-    print(f"\nall results of these suites took {spent:.1f} hours of one process")
+    print(f"\nall results of these suites took {spent:.1f} hours, one after another")
 
 
 if __name__ == "__main__":

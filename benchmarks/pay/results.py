@@ -143,7 +143,7 @@ def of_other_code(results: Sequence[Result]) -> str:
 
 
 def hours(results: Sequence[Result]) -> float:
-    """What these results took, in hours of one process: trainings and scores."""
+    """What these results took, in hours, one after another: trainings and scores."""
     own = {(r.suite, r.task, r.seed, r.seconds): r.seconds for r in results}  # F3 has one of F0's
     return sum(own.values()) / 3600.0
 

@@ -84,7 +84,7 @@ class PPO(OnPolicy):
     floor: float = 0.0
     """Share of actions drawn uniformly from those allowed, discrete ones, at the start."""
     floor_final: float | None = None
-    """The same afterwards, reached linearly; None: constant."""
+    """The share that it falls to, linearly; None: constant."""
     floor_fraction: float = 1.0
     """Share of the budget over which the floor falls."""
     vf_coef: float = 0.5
@@ -190,7 +190,7 @@ class SkillCritic(OnPolicy):
     """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
     cut: while skills learn, what skills are worth is multiplied by 1 − floor."""
     floor_final: float | None = None
-    """The same afterwards, reached linearly; None: constant."""
+    """The share that it falls to, linearly; None: constant."""
     floor_fraction: float = 1.0
     """Share of the budget over which the floor falls."""
 

@@ -72,8 +72,8 @@ class Run:
             deterministic: act greedily, else sample. Of a hierarchy it is about the selector;
                 ``greedy_skills`` is about its skills.
             skill: score this skill alone, as if the selector always chose it. The hierarchy's
-                reflexes are in force, with ``reflexes_in_training=False``, too.
-            max_steps: an episode that nothing has ended by then is cut; None: as ``evaluate``.
+                reflexes are in force, also where it was trained without them.
+            max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
             save: keep the result in the run's directory, where ``info`` finds it, instead of the
                 one before. Not with ``skill`` or another engine.
             engine: sync: Gymnasium's environment; envpool, auto: see ``evaluate``.

@@ -63,7 +63,7 @@ class Train(OnRay):
     """Write a captioned GIF into the run as well."""
     collectors: int | None = None
     """Processes, or with --ray actors, that step environments, or train the parts of a population;
-    default: measured. Results depend on their number, not on where they are."""
+    default: the recipe's, else measured. Results depend on their number, not on where they are."""
 
 
 @dataclass(frozen=True)

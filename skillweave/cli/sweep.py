@@ -178,8 +178,9 @@ def _hierarchies(
         hierarchy = recipes.load(command.recipe)
         apply_overrides(hierarchy, [*command.set, *choice])
         hierarchy.scale(command.scale)
-        # Runs share the cores, so each has one; and it is the same whichever machine it is on.
-        hierarchy.env = replace(hierarchy.spec, workers=1)
+        # Runs share the cores, so each has one process, or as many as the recipe says: the same
+        # number on every machine.
+        hierarchy.env = replace(hierarchy.spec, workers=hierarchy.spec.workers or 1)
         yield ", ".join(choice), hierarchy
 
 

@@ -48,8 +48,8 @@ class EnvSpec:
         engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
             environment as Gymnasium defines it, else sync.
         pool: makes the same environments side by side, for training: EnvPool's, perhaps with
-            changes (``PoolWrapper``). Scores are of ``env``, and so is engine sync; whether what
-            was learnt together is kept is found out in the pool.
+            changes (``PoolWrapper``). Scores are of ``env``; engine sync steps ``env``, too. What
+            is kept after learning together is found out in the pool.
         workers: processes in which environments are stepped, and acted in, while they are trained
             in. None: one, where they stand in a pool; else it is measured when a run begins, one
             for each core if a step takes long enough to be worth it. The run keeps the choice, as

@@ -20,6 +20,7 @@ from skillweave.training.scene import (
     woven_scene,
 )
 from skillweave.training.stage import CRITIC, SELECTOR, Policies, Stage, Together, target_of
+from skillweave.types import SkillweaveError
 
 
 def stages_of(declaration: Declaration, seen_as: Skill | None = None) -> list[Stage]:
@@ -125,10 +126,18 @@ def _nats(declaration: Declaration) -> dict[str, float]:
 
 def _with_floor(config: Any, how: Together) -> Any:
     """A selector's settings, with the floor of learning together where it names none."""
-    if isinstance(config, PPO) and not config.floor:
-        names = "floor", "floor_final", "floor_fraction"
-        return replace(config, **{name: getattr(how, name) for name in names})
-    return config
+    if not isinstance(config, PPO) or config.floor:
+        return config
+    usual = PPO()
+    for name in ("floor_final", "floor_fraction"):
+        if getattr(config, name) != getattr(usual, name):
+            raise SkillweaveError(
+                f"selector.{name} is {getattr(config, name)}, but it has no floor of its own, and "
+                f"one that learns together has that of Together: set together.{name}, or "
+                "selector.floor, too"
+            )
+    names = "floor", "floor_final", "floor_fraction"
+    return replace(config, **{name: getattr(how, name) for name in names})
 
 
 def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:

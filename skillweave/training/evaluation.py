@@ -159,7 +159,7 @@ def evaluate(
         seed: picks the episodes; the same seed gives the same starts to every policy.
         deterministic: act greedily, else sample.
         num_envs: environments side by side; does not change the result of a greedy policy. In a
-            pool there is one for each episode.
+            pool there is one for each episode, so at most 65,536.
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
             as many as the environment's own time limit, or ``LONGEST_EPISODE``.
         watch: is shown every step that is played.

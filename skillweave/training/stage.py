@@ -92,9 +92,10 @@ class Together:
     """
 
     floor: float = 1.0
-    """The least share of calls that are drawn uniformly from those allowed, at the start."""
+    """The least share of calls that are drawn uniformly from those allowed, at the start. A
+    selector with a floor of its own has its own ``floor_final`` and ``floor_fraction``, too."""
     floor_final: float = 0.1
-    """The same afterwards, reached linearly."""
+    """The share that it falls to, linearly."""
     floor_fraction: float = 1.0
     """Share of the budget over which the floor falls."""
     task_weight: float = 0.0

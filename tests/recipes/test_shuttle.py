@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.pay.shuttle import POINTS
+from benchmarks.pay.shuttle import suite as shuttle_suite
 from skillweave import SkillweaveError, Step
+from skillweave.hierarchy import training
 from skillweave.recipes import _cheetah as cheetah
 from skillweave.recipes import shuttle
 
@@ -203,6 +205,20 @@ def test_skills_see_all_but_the_leg():
     assert everything - set(shuttle.RUNNER.network.sees) == set(range(21)[cheetah.LEG])
     assert shuttle.SELECTOR.network.sees is None
     assert shuttle.declare().plain_agent().algorithm.network.sees is None
+
+
+def test_calls_by_lot_become_few_long_before_the_end():
+    (stage,) = training.stages_of(shuttle.declare())
+    config = stage.config
+    assert (config.floor, config.floor_final, config.floor_fraction) == (0.95, 0.05, 0.4)
+
+
+def test_the_protocol_trains_in_as_many_processes_as_the_recipe():
+    tasks, suite = POINTS, shuttle_suite()
+    ready = dict.fromkeys(("forward", "backward", "stop"), lambda obs: np.zeros((len(obs), 6)))
+    found = [suite.hierarchy(suite.task(n), ready if i else None) for i, n in enumerate(tasks)]
+    assert [h.spec.workers for h in found] == [shuttle.COLLECTORS, 1, 1, 1]
+    assert shuttle.declare().spec.workers == shuttle.COLLECTORS == 2
 
 
 def test_a_patrol_has_no_threshold_of_the_half_cheetahs_own_reward():
