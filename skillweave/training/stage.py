@@ -224,6 +224,10 @@ def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> N
             )
 
 
+ONE = "one collector (EnvSpec(workers=1), --collectors 1, Ray(collectors=1))"
+"""What a message advises where a stage cannot have several."""
+
+
 def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
     """Write into each stage's entry how many processes are to step its environments.
 
@@ -244,8 +248,7 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
             if entry["workers"] > 1 and entry["algorithm"].get("device") == "cuda":
                 raise SkillweaveError(
                     f"stage {entry['name']!r}: device is 'cuda', but the parts of a population "
-                    "learn on processors alone: set device='cpu', or workers=1 "
-                    "(--collectors 1)"
+                    f"learn on processors alone: set device='cpu', or have {ONE}"
                 )
         elif spec.workers is None:
             fitting = (k for k in range(workers, 0, -1) if num_envs % k == 0)
@@ -253,8 +256,7 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
         elif num_envs % workers:
             raise SkillweaveError(
                 f"stage {entry['name']!r}: num_envs is {num_envs}; it must be a multiple of "
-                f"workers, {workers}, so that each has as many environments; or set workers=1 "
-                "(--collectors 1)"
+                f"workers, {workers}, so that each has as many environments; or have {ONE}"
             )
         else:
             entry["workers"] = workers
@@ -281,8 +283,7 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
         raise SkillweaveError(
             f"stage {entry['name']!r}: it evolves, and all members of {type(config).__name__} "
             f"learn from one replay buffer, so they cannot be split into {entry['workers']} parts. "
-            "Set workers=1 (--collectors 1), take PPO, or name other stages: "
-            "evolve={...}"
+            f"Have {ONE}, take PPO, or name other stages: evolve={{...}}"
         )
     try:  # what is not written takes no memory
         store_of(algorithm, config.num_envs * members, members, shared=members > 1)

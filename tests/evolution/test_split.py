@@ -207,7 +207,7 @@ def test_a_part_that_dies_again_and_again_is_told(tmp_path):
         (
             DQN(num_envs=2, buffer_size=400, learning_starts=20),
             "stage 'agent': it evolves, and all members of DQN learn from one replay buffer, so "
-            "they cannot be split into 2 parts. Leave out",
+            "they cannot be split into 2 parts. Have one collector",
         ),
         (replace(SMALL, device="cuda"), "learn on processors alone: set device='cpu'"),
     ],
