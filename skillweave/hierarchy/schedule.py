@@ -128,16 +128,15 @@ def _with_floor(config: Any, how: Together) -> Any:
     """A selector's settings, with the floor of learning together where it names none."""
     if not isinstance(config, PPO) or config.floor:
         return config
-    usual = PPO()
-    for name in ("floor_final", "floor_fraction"):
+    usual, falls = PPO(), ("floor_final", "floor_fraction")
+    for name in falls:
         if getattr(config, name) != getattr(usual, name):
             raise SkillweaveError(
                 f"selector.{name} is {getattr(config, name)}, but it has no floor of its own, and "
                 f"one that learns together has that of Together: set together.{name}, or "
                 "selector.floor, too"
             )
-    names = "floor", "floor_final", "floor_fraction"
-    return replace(config, **{name: getattr(how, name) for name in names})
+    return replace(config, **{name: getattr(how, name) for name in ("floor", *falls)})
 
 
 def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
