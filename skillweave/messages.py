@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import difflib
-import traceback
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from skillweave.tracebacks import place
 from skillweave.types import Array, SkillweaveError
 
 MOST = 10**12
@@ -42,19 +42,14 @@ def observed(obs: Array) -> str:
 
 
 def told(error: BaseException) -> str:
-    """An error of somebody else's code as part of a sentence: its kind, its message, its line."""
+    """Return an error of the user's code for a sentence: its kind, message, file and line."""
     try:
         message = str(error)
     except Exception:
         message = ""
     text = type(error).__name__ + (f": {shortened(message)}" if message else "")
-    own, frames = str(Path(__file__).parent), traceback.extract_tb(error.__traceback__)
-    theirs = [f for f in frames if not f.filename.startswith(own)]
-    # The user's line, where there is one: not that of a library which it called.
-    written = [f for f in theirs if "site-packages" not in f.filename] or theirs
-    if written:
-        text += f" ({Path(written[-1].filename).name}, line {written[-1].lineno})"
-    return text
+    where = place(error)
+    return f"{text.removesuffix('.')} ({where})" if where else text
 
 
 def whole_number(value: object, name: str, least: int) -> int:

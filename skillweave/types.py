@@ -1,20 +1,19 @@
 """Words that every room shares: steps, and what acts and what learns.
 
-This module imports nothing of the library and does not import torch at run time.
+This module imports nothing of the library but ``tracebacks``, and no torch at run time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from gymnasium import Space
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    pass
+from skillweave.tracebacks import ShortTraceback
 
 T = TypeVar("T")
 Array: TypeAlias = NDArray[Any]
@@ -43,7 +42,7 @@ def flat(prefix: str, value: Any) -> dict[str, Any]:
     return found
 
 
-class SkillweaveError(Exception):
+class SkillweaveError(ShortTraceback, Exception):
     """An error made for people: it says what was wrong, where, and what to do about it."""
 
 

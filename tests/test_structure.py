@@ -19,16 +19,17 @@ ROOT = Path(__file__).parents[1] / "skillweave"
 MODULES = sorted(ROOT.rglob("*.py"))
 
 # The table of docs/architecture.md: what a room may import. `seeding` is open to all.
-BASE = {"types", "messages", "reading", "experience", "shapes"}
+BASE = {"types", "tracebacks", "messages", "reading", "experience", "shapes"}
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
 LEARNING |= {"collecting", "selectors"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "recipes", "api"}
 EVERYTHING |= {"export"}
 ROOMS: dict[str, set[str]] = {
     "seeding": set(),
-    "types": set(),
+    "tracebacks": set(),
+    "types": {"tracebacks"},
     "shapes": set(),
-    "messages": {"types"},
+    "messages": {"types", "tracebacks"},
     "reading": {"types", "messages"},
     "experience": {"types"},
     "ops": BASE,

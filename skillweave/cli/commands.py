@@ -22,6 +22,8 @@ class Output:
     """No progress."""
     json: bool = False
     """Print one JSON object on standard output, and nothing else there."""
+    traceback: bool = False
+    """Show the whole traceback of an error (also: SKILLWEAVE_TRACEBACK=1)."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Teach agents skills and weave them into one policy.",
         args=given,
     )
+    from skillweave.tracebacks import all_frames_wanted
     from skillweave.types import SkillweaveError
 
     try:
@@ -35,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return execute.run(command)
     except SkillweaveError as error:
+        if command.traceback or all_frames_wanted():
+            traceback.print_exception(error)
         return _fail(command, str(error), 1)
     except KeyboardInterrupt as error:
         return _fail(command, str(error) or "interrupted", 130)

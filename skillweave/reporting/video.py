@@ -13,7 +13,7 @@ import numpy as np
 from skillweave.envs.checks import LONGEST_FILM
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
-from skillweave.messages import shortened, whole_number
+from skillweave.messages import told, whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.screen import hint, without_screen
@@ -126,9 +126,8 @@ def frame_of(env: gym.Env[Any, Any]) -> Array:
     try:
         frame: Any = env.render()
     except Exception as error:
-        told = f"{type(error).__name__}: {shortened(str(error)).rstrip('.')}"
         raise SkillweaveError(
-            f"{name} cannot be filmed: its render() failed with {told}.{hint(error)}"
+            f"{name} cannot be filmed: its render() raised {told(error)}.{hint(error)}"
         ) from error
     if not isinstance(frame, np.ndarray):
         raise SkillweaveError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")

@@ -12,7 +12,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector.utils import batch_space
 
-from skillweave.messages import short, shortened
+from skillweave.messages import short, told
 from skillweave.types import Array, Memory, Memoryless, Policy, SkillweaveError
 
 
@@ -88,9 +88,9 @@ class Foreign(Memoryless):
         except SkillweaveError:
             raise
         except Exception as error:
+            space = short(self.observation_space, 300)
             raise SkillweaveError(
-                f"{self._who} fails on observations of {short(self.observation_space, 300)}: "
-                f"{type(error).__name__}: {shortened(str(error))}"
+                f"{self._who} fails on observations of {space}: {told(error)}"
             ) from error
 
 

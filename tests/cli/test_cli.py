@@ -741,3 +741,16 @@ def test_a_weights_file_that_names_code_is_refused(
     assert answer.code == 1
     assert "--recipe" in answer.err
     assert not marker.exists()
+
+
+def test_an_error_is_one_line_and_its_traceback_is_shown_on_demand(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sentence = "error: nowhere is neither a run nor a weights file\n"
+    assert call("evaluate", "nowhere").err == sentence
+    shown = call("evaluate", "nowhere", "--traceback").err
+    assert shown.startswith("Traceback (most recent call last)")
+    assert "targets.py" in shown
+    assert shown.endswith(sentence)
+    monkeypatch.setenv("SKILLWEAVE_TRACEBACK", "1")
+    assert call("evaluate", "nowhere").err == shown

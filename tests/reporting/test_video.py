@@ -359,7 +359,7 @@ def test_an_environment_that_fails_to_draw_is_named(tmp_path: Path) -> None:
         def render(self) -> Any:
             raise RuntimeError("no light here.")
 
-    told = "NoScreen cannot be filmed: its render.. failed with RuntimeError: no light here"
+    told = r"NoScreen cannot be filmed: its render.. raised RuntimeError: no light here \(test_vid"
     with pytest.raises(SkillweaveError, match=told) as caught:
         render_policy(EnvSpec(NoScreen), Walker(), tmp_path / "a.gif")
     assert isinstance(caught.value.__cause__, RuntimeError)
