@@ -33,11 +33,14 @@ def all_frames_wanted() -> bool:
 def place(error: BaseException) -> str:
     """Return the file and the line where the user's code raised ``error``; "" if unknown.
 
-    Where no frame is the user's, the last one outside this library counts.
+    Where no frame is the user's, the last one outside this library counts. The message of a
+    SyntaxError has its place already.
     """
+    if isinstance(error, SyntaxError) and error.filename:
+        return ""
     frames = list(traceback.walk_tb(error.__traceback__))
     written = [(f, line) for f, line in frames if is_own(f)]
-    written = written or [(f, line) for f, line in frames if not _is_library(_file(f))]
+    written = written or [(f, line) for f, line in frames if not _is_hidden(_file(f))]
     if not written:
         return ""
     frame, line = written[-1]
@@ -47,8 +50,10 @@ def place(error: BaseException) -> str:
 def is_own(frame: FrameType) -> bool:
     """Return whether a frame runs the user's code: no package's, and not Python's own."""
     file = _file(frame)
-    if file.startswith("<"):  # other such names are importlib's, or of code that libraries generate
-        return file.startswith((SENT, "<stdin>", "<string>", "<ipython-input-"))
+    if file == "<string>":  # `python -c`; elsewhere code that was generated, as of dataclasses
+        return frame.f_globals.get("__name__") == "__main__"
+    if file.startswith("<"):
+        return file.startswith((SENT, "<stdin>", "<ipython-input-"))
     path = Path(file)
     if _is_library(file) or _PACKAGES & set(path.parts):
         return False
@@ -99,6 +104,10 @@ def _file(frame: FrameType) -> str:
 def _is_library(file: str) -> bool:
     path = Path(file)
     return path.is_relative_to(LIBRARY) and not path.is_relative_to(RECIPES)
+
+
+def _is_hidden(file: str) -> bool:
+    return _is_library(file) or file.startswith("<frozen")
 
 
 def _name(frame: FrameType) -> str:

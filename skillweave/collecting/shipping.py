@@ -21,6 +21,21 @@ from skillweave.algorithms.config import add_registration, own_registrations
 from skillweave.messages import told
 from skillweave.types import SkillweaveError
 
+_FOLDERS: list[str] = []
+"""Folders of recipes, whose files these may import."""
+
+
+def add_folder(folder: Path) -> None:
+    """Let files in a recipe's ``folder`` be imported by name: here, and where its code is sent.
+
+    A folder that was added first keeps its place before later ones.
+    """
+    name = str(folder.resolve())
+    if name in _FOLDERS:
+        return
+    sys.path.insert(sum(known in sys.path for known in _FOLDERS), name)
+    _FOLDERS.append(name)
+
 
 def packed(thing: Any, who: str) -> bytes:
     """Anything with the code that it needs: recipes, scripts, and what they registered.
@@ -35,7 +50,8 @@ def packed(thing: Any, who: str) -> bytes:
     """
     with _own_code():
         try:
-            found: bytes = cloudpickle.dumps((dict(gym.registry), own_registrations(), thing))
+            known = dict(gym.registry), own_registrations(), tuple(_FOLDERS)
+            found: bytes = cloudpickle.dumps((*known, thing))
         except Exception as error:
             raise SkillweaveError(
                 f"{who} cannot be sent to another process: {told(error)}. Make what cannot be sent "
@@ -46,7 +62,9 @@ def packed(thing: Any, who: str) -> bytes:
 
 def unpacked(data: bytes) -> Any:
     """The inverse of ``packed``."""
-    registered, algorithms, thing = pickle.loads(data)
+    registered, algorithms, folders, thing = pickle.loads(data)
+    for folder in folders:
+        add_folder(Path(folder))
     gym.registry.update(registered)  # an id that Gymnasium knows may mean another environment
     for algorithm in algorithms:
         add_registration(algorithm)

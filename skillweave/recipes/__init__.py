@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import importlib
-import importlib.util
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,27 +32,19 @@ def file_of(recipe: str) -> Path:
 def load(recipe: str) -> Hierarchy:
     """The hierarchy of a shipped recipe, or of a Python file that defines one.
 
-    A file's hierarchy is its variable ``hierarchy``, or its only ``Hierarchy``.
+    A file's hierarchy is its variable ``hierarchy``, or its only ``Hierarchy``. The file may import
+    others that lie beside it.
 
     Raises:
-        SkillweaveError: no such recipe (with close matches) or file, no hierarchy in it, or the
-            file trains as soon as it is read.
+        SkillweaveError: no such recipe (with close matches) or file, no hierarchy in it, the file
+            trains as soon as it is read, or it raises an error.
     """
     from skillweave.api import Hierarchy
-    from skillweave.api.running import READING
+    from skillweave.api.recipe_file import read_recipe_file
 
     path = file_of(recipe)
     if path.suffix == ".py" and path.is_file():
-        spec = importlib.util.spec_from_file_location(f"skillweave_recipe_{path.stem}", path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[spec.name] = module
-        outer = READING.set(recipe)
-        try:
-            spec.loader.exec_module(module)
-        finally:
-            READING.reset(outer)
+        module = read_recipe_file(path, recipe, shipped=path.parent == _HERE)
     else:
         near = difflib.get_close_matches(recipe, names(), n=3, cutoff=0.4)
         hint = f" Did you mean {' or '.join(near)}?" if near else ""

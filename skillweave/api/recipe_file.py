@@ -1,0 +1,127 @@
+"""Reads a recipe's Python file, with the files beside it that it imports."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import sys
+from collections.abc import Iterator
+from importlib.machinery import PathFinder
+from pathlib import Path
+from types import ModuleType
+
+from skillweave.api.running import READING
+from skillweave.collecting.shipping import add_folder
+from skillweave.messages import told
+from skillweave.tracebacks import place
+from skillweave.types import SkillweaveError
+
+
+def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> ModuleType:
+    """Run a recipe's file and return its module; nothing in it may train.
+
+    Args:
+        path: the file.
+        recipe: how the user names it, for messages.
+        shipped: it is one of this library's, which imports nothing beside it by its bare name.
+
+    Raises:
+        SkillweaveError: the file raises an error (the message has its file and line), or imports
+            a file beside it whose name another module has.
+    """
+    if not shipped:
+        add_folder(path.parent)
+        _check_names(path, recipe)
+    spec = importlib.util.spec_from_file_location(_free_name(path), path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    outer = READING.set(recipe)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[spec.name]
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise SkillweaveError(_sentence(error, recipe)) from error
+    finally:
+        READING.reset(outer)
+    return module
+
+
+def _sentence(error: BaseException, recipe: str) -> str:
+    """Return what went wrong while a recipe's file ran."""
+    if isinstance(error, SystemExit):
+        return (
+            f"{recipe} ends Python while it is read ({place(error)}). Put what is to run only as a "
+            "script inside a block that begins with: if __name__ == '__main__':"
+        )
+    if not isinstance(error, SkillweaveError):
+        return f"{recipe} raised {told(error)}"
+    if str(error).startswith(recipe):
+        return str(error)
+    return f"{recipe}: {str(error).removesuffix('.')} ({place(error)})"
+
+
+def _free_name(path: Path) -> str:
+    """Return a module's name for a recipe's file that no other file's module has."""
+    name = first = f"skillweave_recipe_{path.stem}"
+    number = 1
+    while (known := _file_of(sys.modules.get(name))) is not None and known != path.resolve():
+        number += 1
+        name = f"{first}_{number}"
+    return name
+
+
+def _check_names(path: Path, recipe: str) -> None:
+    """Raise a SkillweaveError where a file beside a recipe would not be what it imports.
+
+    Python keeps one module of each name. Without this check, a recipe could get the file of another
+    recipe, or a package, and nobody would notice.
+    """
+    for name, beside in _beside(path).items():
+        module = sys.modules.get(name)
+        if module is None:
+            spec = PathFinder.find_spec(name, sys.path)
+            found = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
+        else:
+            found = _file_of(module)
+        if found != beside:
+            where = "in Python itself" if found is None else str(found)
+            raise SkillweaveError(
+                f"{recipe} imports {name!r}: beside it lies {beside.name}, but Python finds "
+                f"another module of this name ({where}). Rename {beside.name}"
+            )
+
+
+def _beside(path: Path) -> dict[str, Path]:
+    """Return the files that a recipe imports from its folder, also by one another, by name."""
+    folder = path.parent.resolve()
+    files: dict[str, Path] = {}
+    due = [path]
+    while due:
+        for name in _imported(due.pop()):
+            for file in (folder / name / "__init__.py", folder / f"{name}.py"):
+                if name not in files and name != "skillweave" and file.is_file():
+                    files[name] = file.resolve()
+                    due.append(file)
+    return files
+
+
+def _imported(file: Path) -> Iterator[str]:
+    """Yield the first parts of the names that a file imports, wherever in it."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError):
+        return  # importing it raises the same error, and says where
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module.partition(".")[0]
+
+
+def _file_of(module: ModuleType | None) -> Path | None:
+    file = getattr(module, "__file__", None)
+    return Path(file).resolve() if isinstance(file, str) else None
