@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1] / "skillweave"
 MODULES = sorted(ROOT.rglob("*.py"))
 
 # The table of docs/architecture.md: what a room may import. `seeding` is open to all.
-BASE = {"types", "tracebacks", "messages", "reading", "experience", "shapes"}
+BASE = {"types", "tracebacks", "notebooks", "messages", "reading", "experience", "shapes"}
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
 LEARNING |= {"collecting", "selectors"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "recipes", "api"}
@@ -27,6 +27,7 @@ EVERYTHING |= {"export"}
 ROOMS: dict[str, set[str]] = {
     "seeding": set(),
     "tracebacks": set(),
+    "notebooks": set(),
     "types": {"tracebacks"},
     "shapes": set(),
     "messages": {"types", "tracebacks"},

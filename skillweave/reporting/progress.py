@@ -1,131 +1,258 @@
-"""How training goes, for people: live bars on a terminal, plain lines anywhere else.
+"""How training and evaluation go, for people: live on a terminal or in a notebook, else as lines.
 
-Everything goes to stderr, so that stdout stays clean for results.
+Everything goes to stderr, so that stdout stays clean for results; in a notebook below the cell.
 """
 
 from __future__ import annotations
 
-import functools
-import importlib.util
-import os
+import logging
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Self
 
-REFRESH = 0.25  # seconds between two drawings of the bars
-EVERY = 5.0  # seconds between two plain lines
-RECENT = 10.0  # seconds of training over which the speed is taken
+import numpy as np
+
+from skillweave.reporting.displays import Display, Row, open_display
+
+EVERY = 5.0
+"""Seconds between two plain lines, at first."""
+SPREAD = 0.25
+"""The same later, as a share of the time that the stage has taken: a long run has few lines."""
+RECENT = 10.0
+"""Seconds of training over which the speed is taken."""
+PATIENCE = 1.0
+"""Seconds that an evaluation may take before its progress is shown."""
+IN_ALL = "in all"
+LOG = logging.getLogger("skillweave")
+LOG.addHandler(logging.NullHandler())
 
 
 class Progress:
     """Shows each stage's steps, return (mean of the last 100 episodes), speed and time left.
 
     Where several learn in a stage, each has a line below it: how much it acts, and its own reward.
+    Of several stages it shows which one this is, and the time left in all.
 
-    A context manager and a listener of the training loops. Without a terminal, in CI, and with
-    NO_COLOR or TERM=dumb, it writes a line when a stage begins, one about every 5 s, and one when
-    it ends. With ``quiet`` it writes nothing.
+    A context manager and a listener of the training loops. Without a terminal or a notebook, in CI,
+    and with NO_COLOR or TERM=dumb, it writes a line when a stage begins, some while it goes on, and
+    one when it ends. With ``quiet`` it writes nothing. Messages go to the logger "skillweave", too.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
-        self._bars: Any = None  # rich.progress.Progress
-        self._tasks: dict[str, Any] = {}
-        self._budgets: dict[str, int] = {}
+        self._display: Display | None = None
+        self._plan: dict[str, int] = {}
+        """Budgets of stages, in their order."""
+        self._several = False
+        self._spent: dict[str, tuple[int, float]] = {}
+        """Steps and seconds of each stage so far."""
+        self._over: set[str] = set()
         self._recent: deque[tuple[int, float]] = deque()  # (steps, seconds) of the latest ticks
-        self._shown = 0.0
+        self._begun = self._shown = 0.0
 
     def __enter__(self) -> Self:
-        self._bars = _make_bars() if not self._quiet and _may_draw() else None
-        if self._bars is not None:
-            self._bars.start()
+        self._display = None if self._quiet else open_display()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bars is not None:
-            self._bars.refresh()
-            self._bars.stop()
-            self._bars = None
+        if self._display is not None:
+            self._display.close()
+            self._display = None
+
+    def plan(self, stages: Iterable[Mapping[str, Any]]) -> None:
+        """All stages of the run, as its manifest lists them."""
+        for stage in stages:
+            self._plan[stage["name"]] = int(stage["budget"])
+            if stage["status"] == "done":
+                self._spent[stage["name"]] = int(stage["steps"]), float(stage["seconds"])
+                self._over.add(stage["name"])
+        self._several = len(self._plan) > 1
 
     def stage(self, name: str, budget: int) -> None:
         """A stage begins, or goes on; ``budget`` in environment steps."""
-        self._budgets[name], self._shown = budget, time.monotonic()
+        self._plan[name] = budget
+        self._begun = self._shown = time.monotonic()
         self._recent.clear()
-        if self._bars is None:
-            self._line(f"{name}: training for {budget:,} steps")
-        else:
-            fields = {"steps": f"0/{_short(budget)}", "result": "", "speed": "", "left": ""}
-            self._tasks[name] = self._bars.add_task(name, total=budget, **fields)
-            self._bars.refresh()
+        if self._display is None:
+            self._line(f"{self._numbered(name)}: training for {budget:,} steps")
+            return
+        if self._several:
+            self._put_total(name)
+        self._display.put(Row(name, 0.0, f"0/{_short(budget)}"))
+        self._display.draw()
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """An update was made after ``steps`` and ``seconds`` of training."""
         self._recent.append((steps, seconds))
+        self._spent[name] = steps, seconds
         while len(self._recent) > 2 and self._recent[1][1] < seconds - RECENT:
             self._recent.popleft()
         now = time.monotonic()
-        if self._quiet or now - self._shown < (EVERY if self._bars is None else REFRESH):
+        pause = max(EVERY, SPREAD * (now - self._begun))
+        if self._display is not None:
+            pause = self._display.every
+        if self._quiet or now - self._shown < pause:
             return
+        if self._display is None and steps >= self._plan[name]:
+            return  # ``done`` says so next
         self._shown = now
-        then, since = self._recent[0] if len(self._recent) > 1 else (0, 0.0)
-        speed = (steps - then) / max(seconds - since, 1e-9)
-        budget = self._budgets[name]
-        left = _clock(max(budget - steps, 0) / max(speed, 1e-9))
-        self._show(name, steps, metrics, f"{speed:,.0f} steps/s", f"{left} left")
+        left = _clock(self._left(name))
+        self._show(name, steps, metrics, f"{self._speed():,.0f} steps/s", f"{left} left")
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """A stage is over."""
+        if name not in self._plan:
+            self.stage(name, steps)
+        self._spent[name] = steps, seconds
+        self._over.add(name)
         if self._quiet:
             return
-        if name not in self._budgets:
-            self.stage(name, steps)
         speed = f"{steps / max(seconds, 1e-9):,.0f} steps/s"
         self._show(name, steps, metrics, speed, f"done in {_clock(seconds)}")
 
     def message(self, text: str) -> None:
         """A line of text, above the bars where there are any."""
-        if self._bars is None:
+        LOG.info(text)
+        if self._display is None:
             self._line(text)
         else:
-            self._bars.console.print(text, markup=False, highlight=False)
+            self._display.message(text)
 
     def _show(
         self, name: str, steps: int, metrics: dict[str, float], speed: str, left: str
     ) -> None:
-        budget = self._budgets[name]
+        budget = self._plan[name]
+        share = min(steps / budget, 1.0)
         result = f"return {metrics['return']:.1f}" if "return" in metrics else ""
-        if self._bars is None:
-            part = f"{steps:,} of {budget:,} steps ({min(steps / budget, 1):.0%})"
-            self._line(f"{name}: " + ", ".join(filter(None, (part, result, speed, left))))
-            for agent, _, acts, reward in _agents(metrics):
-                self._line(f"  {agent}: " + ", ".join(filter(None, (acts, reward))))
-        else:
-            fields = {"result": result, "speed": speed, "left": left}
-            fields["steps"] = f"{_short(steps)}/{_short(budget)}"
-            self._bars.update(self._tasks[name], completed=min(steps, budget), **fields)
-            for told in _agents(metrics):
-                self._show_agent(name, *told)
-            self._bars.refresh()
+        if self._display is None:
+            part = f"{steps:,} of {budget:,} steps ({share:.0%})"
+            seconds = self._left_in_all(name)
+            in_all = "" if seconds is None else f"{_clock(seconds)} left in all"
+            told = ", ".join(filter(None, (part, result, speed, left, in_all)))
+            self._line(f"{self._numbered(name)}: {told}")
+            if name in self._over:
+                for agent, _, acts, reward in _agents(metrics):
+                    self._line(f"  {agent}: " + ", ".join(filter(None, (acts, reward))))
+            return
+        counted = f"{_short(steps)}/{_short(budget)}"
+        self._display.put(Row(name, share, counted, result, speed, left))
+        for agent, usage, acts, reward in _agents(metrics):
+            self._display.put(Row(agent, usage or 0.0, acts, reward, under=name))
+        if self._several:
+            self._put_total(name)
+        self._display.draw()
 
-    def _show_agent(
-        self, stage: str, name: str, usage: float | None, acts: str, reward: str
-    ) -> None:
-        """The bar of one who learns in a stage: how much it acts, of all steps."""
-        path = f"{stage}/{name}"
-        if path not in self._tasks:
-            fields = {"steps": "", "result": "", "speed": "", "left": ""}
-            self._tasks[path] = self._bars.add_task(f"  {name}", total=1.0, **fields)
-        self._bars.update(self._tasks[path], completed=usage or 0.0, steps=acts, result=reward)
+    def _put_total(self, name: str) -> None:
+        """Put the row of all stages."""
+        assert self._display is not None
+        budget = sum(self._plan.values())
+        passed = sum(self._plan[n] for n in self._over)
+        if name not in self._over:
+            passed += min(self._spent.get(name, (0, 0.0))[0], self._plan[name])
+        steps = sum(steps for steps, _ in self._spent.values())
+        left = self._left_in_all(name)
+        if left is None:
+            words = ""
+        elif left == 0.0:
+            words = f"done in {_clock(sum(seconds for _, seconds in self._spent.values()))}"
+        else:
+            words = f"{_clock(left)} left"
+        at = f"stage {list(self._plan).index(name) + 1} of {len(self._plan)}"
+        counted = f"{_short(steps)}/{_short(budget)}"
+        self._display.put(Row(IN_ALL, passed / budget, counted, at, "", words))
+
+    def _numbered(self, name: str) -> str:
+        """Return a stage's name, and of several which one it is."""
+        if not self._several:
+            return name
+        return f"{name} ({list(self._plan).index(name) + 1} of {len(self._plan)})"
+
+    def _speed(self) -> float:
+        """Return the recent steps per second."""
+        steps, seconds = self._recent[-1]
+        then, since = self._recent[0] if len(self._recent) > 1 else (0, 0.0)
+        return (steps - then) / max(seconds - since, 1e-9)
+
+    def _left(self, name: str) -> float:
+        """Return the seconds that a stage still takes at the recent speed."""
+        return max(self._plan[name] - self._recent[-1][0], 0) / max(self._speed(), 1e-9)
+
+    def _left_in_all(self, name: str) -> float | None:
+        """Return the seconds that all stages still take; None: unknown, or there is one stage.
+
+        Stages that have not begun are taken to be as fast as all steps so far.
+        """
+        if not self._several:
+            return None
+        later = sum(b for n, b in self._plan.items() if n not in self._over and n != name)
+        steps = sum(steps for steps, _ in self._spent.values())
+        seconds = sum(seconds for _, seconds in self._spent.values())
+        now = 0.0 if name in self._over else self._left(name) if self._recent else None
+        if (later and not steps) or now is None:
+            return None
+        return now + (later * seconds / steps if later else 0.0)
 
     def _line(self, text: str) -> None:
         if not self._quiet:
             print(text, file=sys.stderr, flush=True)
 
 
+class EpisodeProgress:
+    """Shows how many episodes of an evaluation are over, where it takes longer than a second.
+
+    It goes away when the evaluation ends. Without a terminal or a notebook it shows nothing.
+
+    Args:
+        episodes: how many are played.
+        quiet: show nothing.
+        name: what is played.
+    """
+
+    def __init__(self, episodes: int, *, quiet: bool = False, name: str = "evaluation") -> None:
+        self._episodes, self._quiet, self._name = episodes, quiet, name
+        self._over = 0
+        self._display: Display | None = None
+        self._tried = False
+
+    def __enter__(self) -> Self:
+        self._begun = self._shown = time.monotonic()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._display is not None:
+            self._display.close()
+            self._display = None
+
+    def watch(self, played: Any) -> None:
+        """See a step of some episodes (``Played``)."""
+        if self._quiet:
+            return
+        self._over += int(np.count_nonzero(played.over & (played.episode >= 0)))
+        now = time.monotonic()
+        pause = PATIENCE if self._display is None else self._display.every
+        if now - self._shown < pause:
+            return
+        self._shown = now
+        if not self._tried:
+            self._tried, self._display = True, open_display(transient=True)
+        if self._display is None:
+            self._quiet = True
+            return
+        self._draw(now)
+
+    def _draw(self, now: float) -> None:
+        assert self._display is not None
+        taken, share = now - self._begun, self._over / self._episodes
+        left = f"{_clock(taken / share - taken)} left" if share else ""
+        counted = f"{self._over:,} of {self._episodes:,} episodes"
+        self._display.put(Row(self._name, share, counted, left=left))
+        self._display.draw()
+
+
 def _agents(metrics: dict[str, float]) -> Iterator[tuple[str, float | None, str, str]]:
-    """Who learns side by side: name, share of the steps in which it acts, and both in words."""
+    """Yield who learns side by side: name, share of the steps in which it acts, both in words."""
     for key, value in metrics.items():
         name, _, what = key.rpartition(".")
         if what == "usage":
@@ -134,38 +261,6 @@ def _agents(metrics: dict[str, float]) -> Iterator[tuple[str, float | None, str,
             yield name, value, f"{value:.0%} of steps", words
         elif what == "call_length":
             yield name, None, f"calls of {value:.1f} steps", ""
-
-
-def _may_draw() -> bool:
-    """Whether it is worth importing rich to find out if bars can be drawn."""
-    if os.environ.get("TERM") == "dumb" or any(os.environ.get(v) for v in ("NO_COLOR", "CI")):
-        return False
-    # A notebook's stderr is no terminal; rich draws there through ipywidgets, or warns each time.
-    notebook = "IPython" in sys.modules and importlib.util.find_spec("ipywidgets") is not None
-    return sys.stderr.isatty() or notebook
-
-
-def _make_bars() -> Any:
-    """A rich display that is drawn only when told, or None where rich sees no screen."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    console = Console(stderr=True)
-    if not (console.is_terminal or console.is_jupyter):
-        return None
-    right = functools.partial(TextColumn, justify="right", markup=False)
-    return Progress(
-        TextColumn("{task.description}", markup=False, style="bold"),
-        BarColumn(bar_width=None, complete_style="cyan", finished_style="green"),
-        right("{task.fields[steps]}"),
-        right("{task.fields[result]}", style="green"),
-        right("{task.fields[speed]}", style="cyan"),
-        right("{task.fields[left]}"),
-        console=console,
-        auto_refresh=False,  # no thread beside training
-        redirect_stdout=sys.stdout.isatty(),  # else print() would land on stderr, not in the pipe
-        expand=True,
-    )
 
 
 def _short(steps: int) -> str:

@@ -8,11 +8,13 @@ import subprocess
 import sys
 from contextlib import redirect_stderr
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from skillweave.reporting import progress as module
-from skillweave.reporting.progress import Progress
+from skillweave.reporting.progress import EpisodeProgress, Progress
 
 
 class Clock:
@@ -70,7 +72,6 @@ def test_plain_lines(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
         "landing: 5,000 of 20,000 steps (25%), return 50.0, 1,000 steps/s, 0:15 left",
         "landing: 10,000 of 20,000 steps (50%), return 100.0, 1,000 steps/s, 0:10 left",
         "landing: 15,000 of 20,000 steps (75%), return 150.0, 1,000 steps/s, 0:05 left",
-        "landing: 20,000 of 20,000 steps (100%), return 200.0, 1,000 steps/s, 0:00 left",
         "landing: 20,000 of 20,000 steps (100%), return 200.0, 1,000 steps/s, done in 0:20",
     ]
 
@@ -94,15 +95,17 @@ TOGETHER = {
 }  # fmt: skip
 
 
-def test_everyone_who_learns_in_a_stage_has_a_line(
+def test_everyone_who_learns_in_a_stage_has_a_line_at_its_end(
     clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Progress() as progress:
         progress.stage("together", 10_000)
         clock.now += 6
         progress.tick("together", 5_000, 5.0, TOGETHER)
+        progress.done("together", 10_000, 10.0, TOGETHER)
     assert capsys.readouterr().err.splitlines()[1:] == [
         "together: 5,000 of 10,000 steps (50%), return 22.8, 1,000 steps/s, 0:05 left",
+        "together: 10,000 of 10,000 steps (100%), return 22.8, 1,000 steps/s, done in 0:10",
         "  selector: calls of 5.2 steps",
         "  left: 25% of steps, reward 0.031 a step",
         "  inner/right: 75% of steps, reward -1.5 a step",
@@ -189,7 +192,7 @@ def test_no_bars_where_they_are_unwanted(
     with redirect_stderr(terminal), Progress() as progress:
         train(progress, clock)
     assert "\x1b" not in terminal.getvalue()
-    assert len(terminal.getvalue().splitlines()) == 6
+    assert len(terminal.getvalue().splitlines()) == 5
 
 
 def test_the_display_ends_with_an_error(clock: Clock, terminal: Terminal) -> None:
@@ -217,3 +220,118 @@ def test_rich_is_imported_only_to_draw() -> None:
     command = [sys.executable, "-c", code, str(Path(str(module.__file__)))]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "hello\n")
+
+
+STAGES = [
+    {"name": "left", "budget": 20_000, "status": "done", "steps": 10_000, "seconds": 5.0},
+    {"name": "right", "budget": 20_000, "status": "new"},
+    {"name": "selector", "budget": 40_000, "status": "new"},
+]
+
+
+def later_stages(progress: Progress, clock: Clock) -> None:
+    """A run goes on whose first stage reached its target early; later ones are slower."""
+    progress.plan(STAGES)
+    progress.stage("right", 20_000)
+    clock.now += 10
+    progress.tick("right", 10_000, 10.0, {})
+    clock.now += 10
+    progress.done("right", 20_000, 20.0, {})
+    progress.stage("selector", 40_000)
+    clock.now += 40
+    progress.tick("selector", 20_000, 40.0, {})
+    progress.done("selector", 40_000, 80.0, {})
+
+
+def test_of_several_stages_it_tells_which_one_it_is_and_the_time_left_in_all(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Progress() as progress:
+        later_stages(progress, clock)
+    # After 10 s of the second: 10 s at its speed, and 40,000 steps at 20,000 in 15 s.
+    assert capsys.readouterr().err.splitlines() == [
+        "right (2 of 3): training for 20,000 steps",
+        "right (2 of 3): 10,000 of 20,000 steps (50%), 1,000 steps/s, 0:10 left, 0:40 left in all",
+        "right (2 of 3): 20,000 of 20,000 steps (100%), 1,000 steps/s, done in 0:20, "
+        "0:33 left in all",
+        "selector (3 of 3): training for 40,000 steps",
+        "selector (3 of 3): 20,000 of 40,000 steps (50%), 500 steps/s, 0:40 left, 0:40 left in all",
+        "selector (3 of 3): 40,000 of 40,000 steps (100%), 500 steps/s, done in 1:20, "
+        "0:00 left in all",
+    ]
+
+
+def test_of_several_stages_the_first_bar_is_of_all(clock: Clock, terminal: Terminal) -> None:
+    with redirect_stderr(terminal), Progress() as progress:
+        later_stages(progress, clock)
+    lines = [" ".join(line.split()) for line in screen(terminal)]
+    bar = "━+[╸╺]?━*"
+    total = [line for line in lines if line.startswith("in all")]
+    for told in ("20k/80k stage 2 of 3 0:40 left", "70k/80k stage 3 of 3 done in 1:45"):
+        assert any(re.fullmatch(f"in all {bar} {told}", line) for line in total), total
+    assert lines.index(total[-1]) < len(lines) - 2, "it stands above the stages"
+
+
+def test_a_long_run_without_a_terminal_writes_few_lines(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Progress() as progress:
+        progress.stage("landing", 10_000_000)
+        for i in range(1, 36_000):  # an hour
+            clock.now += 0.1
+            progress.tick("landing", 100 * i, 0.1 * i, {})
+    lines = capsys.readouterr().err.splitlines()
+    assert 15 < len(lines) < 40
+
+
+def test_messages_go_to_the_logger_too_also_where_it_is_quiet(
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    caplog.set_level("INFO", logger="skillweave")
+    with Progress(quiet=True) as progress:
+        progress.message("left: target reached")
+    assert [(r.name, r.levelname, r.message) for r in caplog.records] == [
+        ("skillweave", "INFO", "left: target reached")
+    ]
+    assert capsys.readouterr().err == ""
+
+
+def played(over: int, of: int = 4) -> SimpleNamespace:
+    return SimpleNamespace(over=np.arange(of) < over, episode=np.arange(of))
+
+
+def test_an_evaluation_shows_its_episodes_after_a_second_and_then_goes_away(
+    clock: Clock, terminal: Terminal
+) -> None:
+    with redirect_stderr(terminal), EpisodeProgress(20) as progress:
+        for _ in range(9):
+            clock.now += 0.1
+            progress.watch(played(0))
+        assert terminal.getvalue() == ""
+        clock.now += 1.1
+        progress.watch(played(4))
+        clock.now += 2.0
+        progress.watch(played(4))
+    lines = [" ".join(line.split()) for line in screen(terminal)]
+    assert any(re.fullmatch(r"evaluation \S+ 4 of 20 episodes 0:08 left", x) for x in lines)
+    assert any(re.fullmatch(r"evaluation \S+ 8 of 20 episodes 0:06 left", x) for x in lines)
+    assert "\x1b[2K" in terminal.getvalue().rpartition("8 of 20")[2], "the line is erased"
+
+
+def test_episodes_are_not_shown_without_a_terminal_where_quiet_or_under_another_display(
+    clock: Clock, terminal: Terminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def evaluate(progress: EpisodeProgress) -> None:
+        with progress:
+            clock.now += 5
+            progress.watch(played(4))
+
+    evaluate(EpisodeProgress(20))
+    with redirect_stderr(terminal):
+        evaluate(EpisodeProgress(20, quiet=True))
+        assert terminal.getvalue() == ""
+        with Progress() as training:
+            training.stage("landing", 10)
+            evaluate(EpisodeProgress(20))
+    assert "evaluation" not in terminal.getvalue()
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,86 @@
+"""HTML for notebooks: plain tables with escaped text, in the notebook's own colours.
+
+This module imports nothing of the library, and IPython only where it runs already.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import Any
+
+_LEFT = "text-align: left; white-space: nowrap; padding: 2px 8px"
+_RIGHT = "text-align: right; white-space: nowrap; padding: 2px 8px"
+
+
+class Markup(str):
+    """HTML that is put into a table as it is."""
+
+
+def in_notebook() -> bool:
+    """Return whether this code runs in a notebook: in IPython, with a kernel."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return getattr(shell, "kernel", None) is not None
+
+
+def table(head: Sequence[object], rows: Iterable[Sequence[object]], left: int = 1) -> Markup:
+    """Return a table.
+
+    Args:
+        head: the titles of the columns; none: the table has no titles.
+        rows: the cells, row by row; everything but ``Markup`` is escaped.
+        left: how many columns are aligned left; the others have numbers.
+    """
+    titles = f"<thead>{_row(head, left, 'th')}</thead>" if head else ""
+    body = "".join(_row(row, left, "td") for row in rows)
+    return Markup(f"<table>{titles}<tbody>{body}</tbody></table>")
+
+
+def facts(rows: Iterable[tuple[str, object]]) -> Markup:
+    """Return a table of two columns: names, and what is so named."""
+    return table((), ((Markup(f"<b>{escape(k)}</b>"), v) for k, v in rows), left=2)
+
+
+def paragraph(text: object) -> Markup:
+    """Return a paragraph of text."""
+    return Markup(f"<p>{_html(text)}</p>")
+
+
+def joined(parts: Iterable[str]) -> str:
+    """Return pieces of HTML as what ``_repr_html_`` returns."""
+    return f"<div>{''.join(parts)}</div>"
+
+
+class Area:
+    """An output of a notebook's cell that can be changed."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, html: str, text: str) -> None:
+        """Show this, in place of what was shown before; ``text`` is for what knows no HTML."""
+        display: Any = importlib.import_module("IPython.display").display
+        data = {"text/html": html, "text/plain": text}
+        if self._handle is None:
+            self._handle = display(data, raw=True, display_id=True)
+        else:
+            self._handle.update(data, raw=True)
+
+    def clear(self) -> None:
+        """Show nothing any more."""
+        if self._handle is not None:
+            self.show("", "")
+
+
+def _row(cells: Sequence[object], left: int, tag: str) -> str:
+    parts = [
+        f'<{tag} style="{_LEFT if i < left else _RIGHT}">{_html(cell)}</{tag}>'
+        for i, cell in enumerate(cells)
+    ]
+    return f"<tr>{''.join(parts)}</tr>"
+
+
+def _html(value: object) -> str:
+    return value if isinstance(value, Markup) else escape(str(value))

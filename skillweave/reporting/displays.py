@@ -1,0 +1,201 @@
+"""Where progress is drawn: bars on a terminal, a table in a notebook."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from skillweave.notebooks import Area, Markup, in_notebook, joined, paragraph, table
+
+
+@dataclass
+class Row:
+    """A line of progress."""
+
+    name: str
+    """What goes on."""
+    share: float
+    """How much of it is done, from 0 to 1."""
+    steps: str = ""
+    """The same in numbers."""
+    result: str = ""
+    """What it has reached so far."""
+    speed: str = ""
+    """Steps per second."""
+    left: str = ""
+    """Time left, or taken."""
+    under: str = ""
+    """The stage that it belongs to."""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What tells it from other rows."""
+        return self.under, self.name
+
+
+class Display(Protocol):
+    """Shows rows, each under the ones before."""
+
+    every: float
+    """Seconds between two drawings."""
+
+    def put(self, row: Row) -> None:
+        """Add a row, or replace the one of the same key; ``draw`` shows it."""
+        ...
+
+    def draw(self) -> None:
+        """Show all rows as they are now."""
+        ...
+
+    def message(self, text: str) -> None:
+        """Show a line of text."""
+        ...
+
+    def close(self) -> None:
+        """Draw for the last time."""
+        ...
+
+
+_open: list[Display] = []
+"""The display that is drawn now: a terminal has room for one."""
+
+
+def open_display(*, transient: bool = False) -> Display | None:
+    """Return a display, or None: plain lines are to be written instead.
+
+    Args:
+        transient: nothing is left of it when it is closed.
+    """
+    if _open:
+        return None
+    found: Display | None = None
+    if in_notebook():
+        found = Cell(transient)
+    elif _may_draw():
+        found = make_bars(transient)
+    if found is not None:
+        _open.append(found)
+    return found
+
+
+class Bars:
+    """Bars on a terminal, drawn by rich."""
+
+    every = 0.25
+
+    def __init__(self, bars: Any) -> None:
+        self._bars, self._tasks = bars, dict[tuple[str, str], Any]()
+        bars.start()
+
+    def put(self, row: Row) -> None:
+        """Add or replace a row."""
+        fields = {"steps": row.steps, "result": row.result, "speed": row.speed, "left": row.left}
+        if row.key not in self._tasks:
+            name = f"  {row.name}" if row.under else row.name
+            self._tasks[row.key] = self._bars.add_task(name, total=1.0, **fields)
+        self._bars.update(self._tasks[row.key], completed=row.share, **fields)
+
+    def draw(self) -> None:
+        """Show all rows."""
+        self._bars.refresh()
+
+    def message(self, text: str) -> None:
+        """Show a line above the bars."""
+        self._bars.console.print(text, markup=False, highlight=False)
+
+    def close(self) -> None:
+        """Draw for the last time."""
+        _open.remove(self)
+        self._bars.refresh()
+        self._bars.stop()
+
+
+class Cell:
+    """A table in the output of a notebook's cell; what it showed last stays in the notebook."""
+
+    every = 0.5
+
+    def __init__(self, transient: bool = False) -> None:
+        self._area, self._transient = Area(), transient
+        self._rows: dict[tuple[str, str], Row] = {}
+        self._messages: list[str] = []
+
+    def put(self, row: Row) -> None:
+        """Add or replace a row."""
+        self._rows[row.key] = row
+
+    def draw(self) -> None:
+        """Show all rows, and messages below them."""
+        indent = "\N{NO-BREAK SPACE}" * 4
+        rows = [
+            (
+                (indent if row.under else "") + row.name,
+                _bar(row.share),
+                row.steps,
+                row.result,
+                row.speed,
+                row.left,
+            )
+            for row in self._rows.values()
+        ]
+        shown = [table((), rows)] if rows else []
+        lines = [" ".join(filter(None, _texts(row))) for row in self._rows.values()]
+        self._area.show(
+            joined([*shown, *map(paragraph, self._messages)]), "\n".join([*lines, *self._messages])
+        )
+
+    def message(self, text: str) -> None:
+        """Show a line below the table."""
+        self._messages.append(text)
+        self.draw()
+
+    def close(self) -> None:
+        """Draw for the last time."""
+        _open.remove(self)
+        if self._transient:
+            self._area.clear()
+        elif self._rows or self._messages:
+            self.draw()
+
+
+def _texts(row: Row) -> tuple[str, ...]:
+    return row.name, f"{row.share:.0%}", row.steps, row.result, row.speed, row.left
+
+
+def _bar(share: float) -> Markup:
+    return Markup(f'<progress value="{share:.3f}" max="1">{share:.0%}</progress>')
+
+
+def _may_draw() -> bool:
+    """Return whether it is worth importing rich to find out if bars can be drawn."""
+    if os.environ.get("TERM") == "dumb" or any(os.environ.get(v) for v in ("NO_COLOR", "CI")):
+        return False
+    return sys.stderr.isatty()
+
+
+def make_bars(transient: bool) -> Bars | None:
+    """Return bars that are drawn only when asked for, or None where rich sees no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        return None
+    right = functools.partial(TextColumn, justify="right", markup=False)
+    bars = Progress(
+        TextColumn("{task.description}", markup=False, style="bold"),
+        BarColumn(bar_width=None, complete_style="cyan", finished_style="green"),
+        right("{task.fields[steps]}"),
+        right("{task.fields[result]}", style="green"),
+        right("{task.fields[speed]}", style="cyan"),
+        right("{task.fields[left]}"),
+        console=console,
+        auto_refresh=False,  # no thread beside training
+        redirect_stdout=sys.stdout.isatty(),  # else print() would land on stderr, not in the pipe
+        expand=True,
+        transient=transient,
+    )
+    return Bars(bars)
