@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.common import median, report, table
+from benchmarks.grouped import regroup
 from skillweave import Hierarchy, recipes
 from skillweave.skills import Skill
 from skillweave.types import Policy
@@ -28,7 +29,7 @@ def no_reflex(h: Hierarchy) -> None:
 
 
 def sampled(h: Hierarchy) -> None:
-    h.greedy_skills = False
+    regroup(h, greedy_skills=False)
 
 
 def calls_of(steps: int) -> Change:
@@ -55,7 +56,7 @@ LANDINGS: dict[str, dict[str, float]] = {
 def trained_skills(seed: int, only: str | None = None, **settings: float) -> dict[str, Policy]:
     """The recipe's skills after training, without a selector to speak of."""
     h = recipes.load("lunar-lander")
-    h.selector_steps = 1
+    regroup(h, selector_steps=1)
     if only is not None:
         h.skills = [h.skill(only)]
     landing = h.skill("landing")
@@ -77,7 +78,8 @@ def alone(policy: Policy, seed: int) -> tuple[float, float]:
     h = recipes.load("lunar-lander")
     skill: Skill = h.skill("landing")
     skill.policy = policy
-    h.skills, h.selector_steps = [skill], 1
+    h.skills = [skill]
+    regroup(h, selector_steps=1)
     return score(h, seed)
 
 

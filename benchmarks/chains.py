@@ -87,22 +87,24 @@ LANDER_TOGETHER = [
     "selector.learning_rate=0.002",
     "selector.num_envs=256",  # fewer, longer steps of the engine: less of Python for each
     "selector.n_steps=40",
-    "greedy_skills=false",  # greedy ones scored less on seeds 20 to 22
+    "selection.greedy_skills=false",  # greedy ones scored less on seeds 20 to 22
     "learn=apart, then together",
     "together.task_weight=100",
-    "together.anchor_nats=none",
-    "together.floor=0.3",
-    "together.floor_final=0.02",
+    "together.reference_kl=none",
+    "together.epsilon=0.3",
+    "together.epsilon_final=0.02",
 ]
 """How the skills and the selector of ``lunar-lander`` learn from the same steps."""
 LANDER_STEPS = {
-    "skill_steps": 10_000,
+    "apart.skill_steps": 10_000,
     "skills.landing.steps": 50_000,
-    "selector_steps": 50_000,
-    "together_steps": 1_500_000,
+    "apart.selector_steps": 50_000,
+    "together.steps": 1_500_000,
 }
 """For how long: most of it together, as the task's advantage teaches more than their rewards."""
-LANDER_TOTAL = sum(LANDER_STEPS.values()) + LANDER_STEPS["skill_steps"]  # of each of two skills
+LANDER_TOTAL = (
+    sum(LANDER_STEPS.values()) + LANDER_STEPS["apart.skill_steps"]
+)  # of each of two skills
 
 
 def lander_budgets(steps: int = LANDER_TOTAL) -> list[str]:

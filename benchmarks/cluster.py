@@ -238,7 +238,7 @@ def population(given: argparse.Namespace) -> dict[str, Any]:
 
 
 SWEPT = """
-from skillweave import Network, PPO, Hierarchy, Skill
+from skillweave import Apart, Network, PPO, Hierarchy, Skill, TrainDefaults
 
 class Still(Skill):
     def reward(self, step):
@@ -246,8 +246,9 @@ class Still(Skill):
 
 small = PPO(num_envs=2, n_steps=32, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
 hierarchy = Hierarchy(
-    "CartPole-v1", [Still()], algorithm=small, selector=small, skill_steps=640,
-    selector_steps=640, cut_every=128,
+    "CartPole-v1", [Still()], algorithm=small, selector=small, learn="apart",
+    apart=Apart(skill_steps=640, selector_steps=640),
+    train_defaults=TrainDefaults(checkpoint_every=128),
 )
 """
 

@@ -29,7 +29,17 @@ import numpy as np
 
 from benchmarks.chains import LANDER_TOGETHER
 from benchmarks.common import machine
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Ray, Skill, recipes, train_agent
+from skillweave import (
+    PPO,
+    Apart,
+    EnvSpec,
+    Hierarchy,
+    Network,
+    Ray,
+    Skill,
+    recipes,
+    train_agent,
+)
 from skillweave.cli.overrides import apply_overrides
 from skillweave.types import Array, Step
 
@@ -137,10 +147,13 @@ def calls(random_lengths: bool, steps: int) -> float:
     skills = [type(name, (Glide,), {"ends": random_lengths})() for name in ("One", "Two", "Three")]
     small = PPO(num_envs=64, n_steps=64, update_epochs=4, network=Network((64, 64), "tanh"))
     hierarchy = Hierarchy(
-        "LunarLander-v3", skills, call_steps=64 if random_lengths else 32, algorithm=small,
+        "LunarLander-v3",
+        skills,
+        call_steps=64 if random_lengths else 32,
+        algorithm=small,
         selector=PPO(num_envs=256, n_steps=256, update_epochs=4, network=NETWORK),
-        skill_steps=5_000, selector_steps=steps,
-    )  # fmt: skip
+        apart=Apart(skill_steps=5_000, selector_steps=steps),
+    )
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", quiet=True)
         return float(run.info()["stages"][-1]["steps_per_second"])
@@ -157,8 +170,9 @@ TOGETHER: dict[str, list[str]] = {
 def together(changed: list[str], steps: int) -> tuple[float, float]:
     """Of the selector over frozen skills, then of all who learn together."""
     hierarchy = recipes.load("lunar-lander")
-    budgets = ["skill_steps=5000", "skills.landing.steps=5000", f"selector_steps={steps}"]
-    budgets += ["learn=apart, then together", f"together_steps={steps}"]
+    budgets = ["apart.skill_steps=5000", "skills.landing.steps=5000"]
+    budgets += [f"apart.selector_steps={steps}"]
+    budgets += ["learn=apart, then together", f"together.steps={steps}"]
     apply_overrides(hierarchy, budgets + changed)
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", quiet=True)

@@ -23,7 +23,7 @@ from skillweave.training.learner import Stack
 
 def learn(seed: int, steps: int, every: float) -> dict[str, object]:
     hierarchy = recipes.load("lunar-lander")
-    config = hierarchy.flat or hierarchy.algorithm
+    config = hierarchy.train_defaults.flat or hierarchy.algorithm
     copies: list[tuple[float, int, AgentPolicy]] = []
 
     last: list[Tick] = []
@@ -35,7 +35,9 @@ def learn(seed: int, steps: int, every: float) -> dict[str, object]:
             copies.append((tick.seconds, tick.steps, policy))
 
     seeds = Seeds(seed) / "flat"
-    stack = train_bare(hierarchy.spec, config, seeds, steps, on_tick, hierarchy.cut_every)
+    stack = train_bare(
+        hierarchy.spec, config, seeds, steps, on_tick, hierarchy.train_defaults.checkpoint_every
+    )
     seconds = last[-1].seconds
     scores = []
     reached = None

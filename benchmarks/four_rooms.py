@@ -40,7 +40,17 @@ from examples.four_rooms import (
     hallway_skills,
     moves,
 )
-from skillweave import DQN, PPO, Agent, EnvSpec, Hierarchy, Network, Skill
+from skillweave import (
+    DQN,
+    PPO,
+    Agent,
+    Apart,
+    EnvSpec,
+    Hierarchy,
+    Network,
+    Skill,
+    TrainDefaults,
+)
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
@@ -295,9 +305,13 @@ def curve(which: str, goal: str, steps: int, seed: int) -> list[int]:
         declared = Agent(env, DQN(**CURVE, train_freq=CALL), steps)
     else:
         declared = Hierarchy(
-            env, SETS[which](), call_steps=None, selector=DQN(**CURVE), selector_steps=steps,
-            cut_every=10**9,
-        )  # fmt: skip
+            env,
+            SETS[which](),
+            call_steps=None,
+            selector=DQN(**CURVE),
+            apart=Apart(selector_steps=steps),
+            train_defaults=TrainDefaults(checkpoint_every=10**9),
+        )
     with tempfile.TemporaryDirectory() as folder:
         declared.train(Path(folder) / "run", seed=seed, quiet=True)
     return lengths

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.grouped import regroup
 from skillweave import Array, Lengths
 from skillweave.recipes import mazes
 
@@ -53,8 +54,8 @@ def score(calls: str, seed: int, steps: int, out: Path) -> float:
     file = out / f"{calls}-{steps}-{seed}.json"
     if file.exists():
         return float(json.loads(file.read_text())["score"])
-    how = settings(calls) | {"selector_steps": steps}
-    hierarchy = mazes.with_skills("large", skills_of(seed, out), **how)
+    hierarchy = mazes.with_skills("large", skills_of(seed, out))
+    regroup(hierarchy, **settings(calls), selector_steps=steps)
     path = file.with_suffix("")
     if path.exists():
         run = hierarchy.resume(path, quiet=True)

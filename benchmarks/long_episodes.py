@@ -65,7 +65,7 @@ class Stopping(Progress):
 
 
 def hierarchy(length: int, steps: int) -> Hierarchy:
-    return Hierarchy(lambda: Late(length), [Task()], algorithm=PPO(), flat_steps=steps)
+    return Hierarchy(lambda: Late(length), [Task()], algorithm=PPO())
 
 
 def main() -> None:

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import cases_asked, median, report, table, workers
+from benchmarks.grouped import regroup
 from examples import nested
-from skillweave import Hierarchy, SkillweaveError
+from skillweave import Hierarchy, SkillweaveError, TrainDefaults
 from skillweave.runs.directory import RunDirectory
 
 CASES = ("together", "apart", "apart, then together", "flat")
@@ -29,12 +30,14 @@ CASES = ("together", "apart", "apart, then together", "flat")
 def declare(case: str, steps: int) -> Hierarchy:
     """The hierarchy, with so many steps in all: seven stages apart, if there are any."""
     if case in ("together", "flat"):
-        return nested.declare(steps, cut_every=10_000)
+        return nested.declare(steps, train_defaults=TrainDefaults(checkpoint_every=10_000))
     apart = steps if case == "apart" else steps // 2
-    each = {"skill_steps": apart // 7, "selector_steps": apart // 7, "cut_every": 10_000}
-    found = nested.declare(steps, learn=case, together_steps=steps - apart, **each)
+    found = nested.declare(steps, learn=case)
+    each = {"skill_steps": apart // 7, "selector_steps": apart // 7}
+    regroup(found, **each, checkpoint_every=10_000, together_steps=steps - apart)
     for skill in found.skills:
-        skill.policy.skill_steps = skill.policy.selector_steps = apart // 7
+        skill.policy.learn = "apart"
+        regroup(skill.policy, **each)
     return found
 
 

@@ -15,7 +15,18 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.common import median, report, table
-from skillweave import PPO, Array, EnvSpec, Hierarchy, Network, Skill, Step, Together, train_agent
+from skillweave import (
+    PPO,
+    Array,
+    EnvSpec,
+    Hierarchy,
+    Network,
+    Selection,
+    Skill,
+    Step,
+    Together,
+    train_agent,
+)
 
 SPEC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 CONFIG = PPO(num_envs=16, n_steps=64, network=Network((64, 64), "tanh"))
@@ -37,10 +48,15 @@ def flat(seed: int, steps: int, path: Path) -> float:
 
 def together(seed: int, steps: int, path: Path) -> float:
     hierarchy = Hierarchy(
-        SPEC, [Task()], algorithm=CONFIG, selector=CONFIG, call_steps=1, learn="together",
-        together_steps=steps, together=Together(floor=0.0, floor_final=0.0, quota=1.0),
-        greedy_skills=True,
-    )  # fmt: skip
+        SPEC,
+        [Task()],
+        algorithm=CONFIG,
+        selector=CONFIG,
+        call_steps=1,
+        learn="together",
+        together=Together(epsilon=0.0, epsilon_final=0.0, quota=1.0, steps=steps),
+        selection=Selection(greedy_skills=True),
+    )
     return hierarchy.train(path, seed=seed, quiet=True).evaluate(EPISODES).mean
 
 

@@ -31,20 +31,24 @@ from typing import Any
 
 from benchmarks.chains import TASKS, Task
 from benchmarks.common import cases_asked, median, report, table, workers
+from benchmarks.grouped import PLACES, regroup
 from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.suite import Seldom, Shaped
 from skillweave import PPO, Array, Hierarchy, Lengths, Run, Skill, SkillweaveError, Step
 from skillweave.hierarchy.training import manifest
 
-FLOORS = {"floor": 0.1, "floor_final": 0.0}
-"""Of a selector over skills that are trained already: with a high floor, or with one that stays, it
-never learns what it does by itself."""
+EPSILONS = {"epsilon": 0.1, "epsilon_final": 0.0}
+"""Of a selector over skills that are trained already: with a high or constant epsilon, it never
+ learns what it does by itself."""
 
 
 def together(task: Task, steps: int, **how: Any) -> Hierarchy:
     """Skills and selector from the same steps, from nothing."""
-    return task.declare(steps, workers=1, **how)  # runs go side by side
+    single = {name: how.pop(name) for name in PLACES.keys() & how.keys()}
+    found = task.declare(steps, workers=1, **how)  # runs go side by side
+    regroup(found, **single)
+    return found
 
 
 def otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: Any) -> Hierarchy:
@@ -59,7 +63,7 @@ def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
     asked: dict[str, Any] = {
         "learn": "apart",
         "start_calls": 8,
-        "selector": task.algorithm(**FLOORS),
+        "selector": task.algorithm(**EPSILONS),
         "selector_steps": last,
     }
     hierarchy = together(task, steps, **asked | dict(task.apart) | how)
@@ -165,7 +169,7 @@ def flat(task: Task, steps: int, weight: float = 0.0, bonus: float = 0.0, **how:
         bonus: for the first visit of a cell (F2).
     """
     hierarchy = together(task, steps, **how)
-    agent = Flat(hierarchy.spec, hierarchy.flat or hierarchy.algorithm, steps)
+    agent = Flat(hierarchy.spec, hierarchy.train_defaults.flat or hierarchy.algorithm, steps)
     if weight:
         weights = {skill.name: weight for skill in hierarchy.skills}
         agent.learns = Shaped(list(hierarchy.skills), weights, task_weight=1.0)
@@ -182,20 +186,20 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     "less entropy": less_entropy,
     "no start calls": functools.partial(apart, start_calls=None, episode_calls=1),
     "large call cost": functools.partial(apart, call_cost=0.01),
-    "low floor": functools.partial(otherwise, changed={"floor": 0.3, "floor_final": 0.02}),
+    "low epsilon": functools.partial(otherwise, changed={"epsilon": 0.3, "epsilon_final": 0.02}),
     # The critic's errors are made as large as a success, where hardly anything was won yet.
     "no least deviation": functools.partial(learnt_otherwise, changed={"min_advantage_std": 0.0}),
     "one advantage scale": one_advantage_scale,
     "no imitation": functools.partial(no_imitation, who=("algorithm", "selector")),
     "selector does not imitate": functools.partial(no_imitation, who=("selector",)),
-    "no floor": functools.partial(otherwise, changed={"floor": 0.0, "floor_final": 0.0}),
+    "no epsilon": functools.partial(otherwise, changed={"epsilon": 0.0, "epsilon_final": 0.0}),
     "no call cost": functools.partial(together, call_cost=0.0),
     # As `together` on 8x8, and refused there; in the other rooms `no call cost` is.
     "small call cost": functools.partial(together, call_cost=0.001),
     "task advantage": functools.partial(otherwise, changed={"task_weight": 1.0}),
     "no task advantage": functools.partial(otherwise, changed={"task_weight": 0.0}),
-    "anchor": functools.partial(otherwise, changed={"anchor_nats": 0.05}),
-    "then, no anchor": functools.partial(then_otherwise, changed={"anchor_nats": None}),
+    "anchor": functools.partial(otherwise, changed={"reference_kl": 0.05}),
+    "then, no anchor": functools.partial(then_otherwise, changed={"reference_kl": None}),
     "limit ends": limit_ends,
     "lengths": functools.partial(together, call_steps=Lengths(4, ..., 64)),
     "interrupt": functools.partial(together, interrupt=True),
@@ -255,7 +259,8 @@ def without_selector(
     policy: Any = run.policy
     for skill, learnt in zip(same.skills, policy.skills.policies, strict=True):
         skill.policy = learnt
-    greedy = same.greedy_skills = policy.skills.greedy  # as in the run itself
+    greedy = policy.skills.greedy
+    regroup(same, greedy_skills=greedy)  # as in the run itself
     chosen = by_lot(same, seed).train(path, seed=seed, quiet=True)
     alone = {s.name: task.score(run, greedy, skill=s.name)[0] for s in same.skills}
     return {"by lot": task.score(chosen)[0]} | alone

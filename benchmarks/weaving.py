@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmarks.bare import train_bare
 from benchmarks.common import median, report, table, warm_up
+from benchmarks.grouped import regroup
 from skillweave import recipes
 from skillweave.recipes import lander_missions as missions
 from skillweave.seeding import Seeds
@@ -30,7 +31,7 @@ EPISODES, FLAT_STEPS = 50, 200_000
 def flat_seconds() -> float:
     """How long the baseline takes."""
     lander = recipes.load("lunar-lander")
-    config = lander.flat or lander.algorithm
+    config = lander.train_defaults.flat or lander.algorithm
     started = time.perf_counter()
     train_bare(lander.spec, config, Seeds(0) / "flat", FLAT_STEPS, lambda *_: None)
     return time.perf_counter() - started
@@ -42,7 +43,7 @@ def woven(source: Path, mission: str, seed: int, steps: int | None) -> dict[str,
     skills = dict(zip(policy.labels, policy.skills.policies, strict=True))
     hierarchy = missions.with_skills(mission, skills)
     if steps is not None:
-        hierarchy.selector_steps = steps
+        regroup(hierarchy, selector_steps=steps)
     flat = flat_seconds()
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()

@@ -140,8 +140,8 @@ def declare(steps: int = 500_000, workers: int | None = None, **how: Any) -> sw.
     """The hierarchy; ``how`` changes any of its settings."""
     settings = {
         "call_steps": None,  # a call lasts until its skill stops
-        "learn": "together",
-        "together_steps": steps,
+        "steps": steps,
+        "together": sw.Together(task_weight=0.0),
         "algorithm": algorithm(),
         "selector": algorithm(),
     } | how

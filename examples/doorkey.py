@@ -123,16 +123,14 @@ def declare(
     learner = algorithm(**fast) if here else algorithm(sw.SelfImitationPPO)
     settings = {
         "call_steps": 32,
-        "learn": "together",
-        "together_steps": steps,
+        "steps": steps,
         # At first any skill that may start is called: else one that may start anywhere takes all.
-        "together": sw.Together(floor=1.0, floor_final=0.1),
+        "together": sw.Together(task_weight=0.0, epsilon=1.0, epsilon_final=0.1),
         # A call that ends at once is not worth as much as one that does not. But before anything is
         # won, a cost teaches the selector to call the skill with the longest calls, and in other
         # rooms that lasts long. There is none there, at the risk of calls that end at once again
         # and again.
-        "call_cost": 0.001 if here else 0.0,
-        "greedy_skills": False,
+        "selection": sw.Selection(call_cost=0.001 if here else 0.0, greedy_skills=False),
         "algorithm": learner,
         "selector": learner,
     } | how

@@ -18,7 +18,15 @@ import stable_baselines3 as sb3
 import torch
 from onnx import TensorProto, helper
 
-from skillweave import PPO, Array, Hierarchy, Skill, from_onnx, from_sb3
+from skillweave import (
+    PPO,
+    Apart,
+    Array,
+    Hierarchy,
+    Skill,
+    from_onnx,
+    from_sb3,
+)
 
 ENV = "CartPole-v1"
 
@@ -86,7 +94,7 @@ def main() -> None:
             skills(folder),
             call_steps=5,
             selector=PPO(num_envs=8, n_steps=320, batch_size=128),
-            selector_steps=args.steps,
+            apart=Apart(selector_steps=args.steps),
         )
         run = hierarchy.train(folder / "run", seed=args.seed, quiet=True)
         for entry in run.info()["skills"]:

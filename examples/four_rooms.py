@@ -15,7 +15,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import DQN, Array, Hierarchy, Network, Skill
+from skillweave import (
+    DQN,
+    Apart,
+    Array,
+    Hierarchy,
+    Network,
+    Skill,
+)
 
 PLAN = [
     "#############",
@@ -147,7 +154,7 @@ def main() -> None:
         [*hallway_skills(), *moves()],
         call_steps=None,
         selector=DQN(learning_rate=0.01, gamma=0.9, network=Network(())),
-        selector_steps=asked.steps,
+        apart=Apart(selector_steps=asked.steps),
     )
     with tempfile.TemporaryDirectory() as folder:
         run = hierarchy.train(Path(folder) / "run", seed=asked.seed, quiet=True)

@@ -110,14 +110,14 @@ def declare(steps: int = 150_000, **how: Any) -> sw.Hierarchy:
         gae_lambda=0.98,
         network=sw.Network(hidden=(64, 64)),
     )
-    settings = {"algorithm": learner, "selector": learner, "call_cost": 0.01}
-    settings |= {"skill_steps": steps // 8, "selector_steps": steps // 8, "greedy_skills": False}
+    selection = sw.Selection(call_cost=0.01, greedy_skills=False)
+    settings = {"algorithm": learner, "selector": learner, "selection": selection}
     errands = [
         sw.Hierarchy(env, [Fetch(name), Deliver(name)], call_steps=30, name=name, **settings)
         for name in ERRANDS
     ]
-    above = {"call_steps": 40, "learn": "together", "together_steps": steps} | settings
-    above["together"] = sw.Together(floor=0.5, floor_final=0.05)
+    above = {"call_steps": 40, "steps": steps} | settings
+    above["together"] = sw.Together(task_weight=0.0, epsilon=0.5, epsilon_final=0.05)
     return sw.Hierarchy(env, errands, **above | how)
 
 

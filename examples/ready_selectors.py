@@ -120,8 +120,8 @@ guided = sw.Hierarchy(
     Corridor,
     [GetKey(), OpenDoor(), Leave()],
     selector=sw.PPO(num_envs=8, n_steps=32),
-    guide=guide,
-    selector_steps=4_000,
+    guide=sw.Guide(guide),
+    apart=sw.Apart(selector_steps=4_000),
 )
 
 

@@ -14,7 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from skillweave import PPO, Hierarchy, Reflex, Skill
+from skillweave import (
+    PPO,
+    Apart,
+    Hierarchy,
+    Reflex,
+    Skill,
+)
 
 X, Y, ANGLE = 0, 1, 4
 
@@ -58,8 +64,7 @@ hierarchy = Hierarchy(
     call_steps=40,
     reflexes=[Reflex(landed, action=0, name="engines off")],
     algorithm=PPO(update_epochs=4, learning_rate=1e-3, gamma=0.99, gae_lambda=0.95),
-    skill_steps=500_000,
-    selector_steps=1_000_000,
+    apart=Apart(skill_steps=500_000, selector_steps=1_000_000),
 )
 
 

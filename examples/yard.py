@@ -117,8 +117,8 @@ def algorithm(**how: Any) -> sw.PPO:
 def declare(steps: int = 300_000, workers: int | None = None, **how: Any) -> sw.Hierarchy:
     """The hierarchy; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
-        "learn": "together",
-        "together_steps": steps,
+        "steps": steps,
+        "together": sw.Together(task_weight=0.0),
         "algorithm": algorithm(),
         "selector": algorithm(),
     } | how

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from skillweave.envs.make import EnvSpec
     from skillweave.envs.pool import PoolWrapper, envpool
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
-    from skillweave.evolution.selection import Heir, Selection
+    from skillweave.evolution.selection import Heir, ParentSelection
     from skillweave.experience import Report, Rollout, Sample
     from skillweave.export.write import Export
     from skillweave.hierarchy.options import OptionsEnv
     from skillweave.hierarchy.policy import HierarchyPolicy
+    from skillweave.hierarchy.settings import Apart, Guide, Selection
     from skillweave.networks.config import CNN, RNN, Network
     from skillweave.networks.encoders import Encoder, register_encoder
     from skillweave.networks.heads import ActionHead
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from skillweave.seeding import Seeds
     from skillweave.selectors import Automaton, LastCall, tree
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
+    from skillweave.training.defaults import TrainDefaults
     from skillweave.training.evaluation import Evaluation, evaluate
     from skillweave.training.stage import Together
     from skillweave.types import Array, Policy, SkillweaveError, Step
@@ -48,6 +50,7 @@ _HOME = {
     "Agent": "api",
     "AgentState": "algorithms.base",
     "Algorithm": "algorithms.base",
+    "Apart": "hierarchy.settings",
     "Array": "types",
     "Automaton": "selectors",
     "CNN": "networks.config",
@@ -57,6 +60,7 @@ _HOME = {
     "Evaluation": "training.evaluation",
     "Evolution": "evolution.config",
     "Export": "export.write",
+    "Guide": "hierarchy.settings",
     "Heir": "evolution.selection",
     "Hierarchy": "api",
     "HierarchyPolicy": "hierarchy.policy",
@@ -70,6 +74,7 @@ _HOME = {
     "OptionsEnv": "hierarchy.options",
     "PPO": "algorithms.config",
     "ParameterGroup": "algorithms.parameters",
+    "ParentSelection": "evolution.selection",
     "Player": "api.player",
     "Policy": "types",
     "PoolWrapper": "envs.pool",
@@ -83,7 +88,7 @@ _HOME = {
     "SAC": "algorithms.config",
     "Sample": "experience",
     "Seeds": "seeding",
-    "Selection": "evolution.selection",
+    "Selection": "hierarchy.settings",
     "SelfImitationPPO": "algorithms.config",
     "Skill": "skills",
     "SkillweaveError": "types",
@@ -91,6 +96,7 @@ _HOME = {
     "TD3": "algorithms.config",
     "Together": "training.stage",
     "Tournament": "evolution.config",
+    "TrainDefaults": "training.defaults",
     "Truncation": "evolution.config",
     "adam_": "ops.optim",
     "clip_grad_norm_": "ops.optim",
@@ -124,6 +130,7 @@ __all__ = [
     "Agent",
     "AgentState",
     "Algorithm",
+    "Apart",
     "Array",
     "Automaton",
     "Encoder",
@@ -131,6 +138,7 @@ __all__ = [
     "Evaluation",
     "Evolution",
     "Export",
+    "Guide",
     "Heir",
     "Hierarchy",
     "HierarchyPolicy",
@@ -143,6 +151,7 @@ __all__ = [
     "OnPolicy",
     "OptionsEnv",
     "ParameterGroup",
+    "ParentSelection",
     "Player",
     "Policy",
     "PoolWrapper",
@@ -161,6 +170,7 @@ __all__ = [
     "Step",
     "Together",
     "Tournament",
+    "TrainDefaults",
     "Truncation",
     "adam_",
     "clip_grad_norm_",

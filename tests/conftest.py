@@ -40,12 +40,12 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(scope="session", autouse=True)
 def few_episodes() -> Iterator[None]:
     """Who learnt together is judged by few episodes: here it is of no matter who wins."""
-    from skillweave.hierarchy import judging
+    from skillweave.hierarchy import select_best
     from skillweave.runs import kept
 
-    assert kept.EPISODES == judging.EPISODES == 100, "so it is documented"
+    assert kept.EPISODES == select_best.EPISODES == 100, "so it is documented"
     with pytest.MonkeyPatch.context() as patch:
-        for module in (judging, kept):
+        for module in (select_best, kept):
             patch.setattr(module, "EPISODES", 4)
         yield
 
@@ -53,10 +53,10 @@ def few_episodes() -> Iterator[None]:
 @pytest.fixture
 def usual_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who learnt together is judged by as many episodes as users have."""
-    from skillweave.hierarchy import judging
+    from skillweave.hierarchy import select_best
     from skillweave.runs import kept
 
-    for module in (judging, kept):
+    for module in (select_best, kept):
         monkeypatch.setattr(module, "EPISODES", 100)
 
 

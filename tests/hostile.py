@@ -18,6 +18,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from declaring import plainly
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
@@ -76,7 +77,7 @@ def train(folder: Path, env: Any = Ramp, skill: Skill | None = None, **declared:
         "algorithm": PPO_TINY, "selector": PPO_TINY, "skill_steps": STEPS, "selector_steps": STEPS,
         "call_steps": 2,
     }  # fmt: skip
-    hierarchy = Hierarchy(env, [skill or Plain()], **{**how, **declared})
+    hierarchy = Hierarchy(env, [skill or Plain()], **plainly({**how, **declared}))
     score = hierarchy.train(folder / "run", quiet=True).evaluate(2)
     assert np.isfinite(score.mean), "something that is not finite was accepted"
 
@@ -238,7 +239,7 @@ def skill_cases(draw: Any) -> Case:
 def _two_skills(folder: Path, skill: Skill) -> None:
     how: dict[str, Any] = {"algorithm": PPO_TINY, "selector": PPO_TINY, "call_steps": 2}
     how |= {"skill_steps": STEPS, "selector_steps": STEPS}
-    Hierarchy(Ramp, [Plain(), skill], **how).train(folder / "run", quiet=True).evaluate(2)
+    Hierarchy(Ramp, [Plain(), skill], **plainly(how)).train(folder / "run", quiet=True).evaluate(2)
 
 
 @st.composite
@@ -462,7 +463,7 @@ def _declared(folder: Path, field: str, value: Any) -> None:
         "skills": [Plain()], "algorithm": PPO_TINY, "selector": PPO_TINY, "skill_steps": STEPS,
         "selector_steps": STEPS, "call_steps": 2, "eval_every": STEPS, "eval_episodes": 1,
     }  # fmt: skip
-    Hierarchy(Ramp, **{**how, field: value}).train(folder / "run", quiet=True).evaluate(1)
+    Hierarchy(Ramp, **plainly({**how, field: value})).train(folder / "run", quiet=True).evaluate(1)
 
 
 _TRAINED: list[Any] = []
@@ -474,7 +475,9 @@ def _trained() -> Any:
         folder = tempfile.TemporaryDirectory()
         how: dict[str, Any] = {"algorithm": PPO_TINY, "selector": PPO_TINY, "call_steps": 2}
         how |= {"skill_steps": STEPS, "selector_steps": STEPS}
-        run = Hierarchy(Ramp, [Plain()], **how).train(Path(folder.name) / "run", quiet=True)
+        run = Hierarchy(Ramp, [Plain()], **plainly(how)).train(
+            Path(folder.name) / "run", quiet=True
+        )
         _TRAINED[:] = [run, folder]
     return _TRAINED[0]
 
@@ -502,7 +505,7 @@ def call_cases(draw: Any) -> Case:
         if call == "train":
             how: dict[str, Any] = {"algorithm": PPO_TINY, "selector": PPO_TINY, "call_steps": 2}
             how |= {"skill_steps": STEPS, "selector_steps": STEPS}
-            hierarchy = Hierarchy(Ramp, [Plain()], **how)
+            hierarchy = Hierarchy(Ramp, [Plain()], **plainly(how))
             given = {"run_dir": folder / "run", "quiet": True, field: value}
             with contextlib.chdir(folder):
                 hierarchy.train(given.pop("run_dir"), **given)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from declaring import plainly
 
 import skillweave as sw
 
@@ -30,7 +31,9 @@ class Right(sw.Skill):
 def declare(*skills: sw.Skill) -> sw.Hierarchy:
     env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
     how: dict[str, Any] = {"call_steps": 5, "algorithm": SMALL, "selector": SMALL}
-    return sw.Hierarchy(env, skills, skill_steps=100, selector_steps=100, **how)
+    return sw.Hierarchy(
+        env, skills, apart=sw.Apart(skill_steps=100, selector_steps=100), **plainly(how)
+    )
 
 
 def files_of(path: Path) -> dict[str, bytes]:

@@ -8,7 +8,7 @@ from small_runs import Left, Push, assert_same, new_run
 from test_together import Other, declare
 
 from skillweave import SkillweaveError
-from skillweave.hierarchy import judging, training
+from skillweave.hierarchy import select_best, training
 from skillweave.training.stage_log import StageLog
 from skillweave.training.woven_learner import WovenLearner
 
@@ -85,7 +85,7 @@ def test_a_run_killed_while_it_was_judged_is_judged_when_it_is_resumed(
 
     run = new_run(then(), tmp_path / "run")
     with monkeypatch.context() as patch:
-        patch.setattr(judging, "evaluate", killed)
+        patch.setattr(select_best, "evaluate", killed)
         with pytest.raises(KeyboardInterrupt):
             training.train(then(), run)
     run.close()

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from declaring import plainly
 from small_runs import MEMORY, OFF, ON, Balance, Left, Push, Whole, lines, policies, stopped_run
 
 from skillweave import (
@@ -25,8 +26,8 @@ from skillweave import (
 from skillweave.cli import main
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy import training
-from skillweave.hierarchy.judging import settled
 from skillweave.hierarchy.nesting import every_hierarchy, every_skill
+from skillweave.hierarchy.select_best import settled
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.call_log import CallLog
@@ -50,20 +51,20 @@ def options(**how):
 
 def inside(*skills, **how):
     skills = skills or (Balance(), Right())
-    return Hierarchy(skills=skills, **options(call_steps=3, name="inner") | how)
+    return Hierarchy(skills=skills, **plainly(options(call_steps=3, name="inner") | how))
 
 
 def declare(inner=None, **how):
     """Left, a hierarchy of balance and right, and a ready skill."""
     inner = inside() if inner is None else inner
-    return Hierarchy(skills=[Left(), inner, Push()], **options(call_steps=7) | how)
+    return Hierarchy(skills=[Left(), inner, Push()], **plainly(options(call_steps=7) | how))
 
 
 def test_selectors_of_all_levels_have_the_floor_of_learning_together():
-    told = Together(floor=0.8, floor_final=0.2, floor_fraction=0.3)
+    told = Together(epsilon=0.8, epsilon_final=0.2, epsilon_fraction=0.3, task_weight=0.0)
     (stage,) = training.stages_of(declare(learn="together", together=told))
     for config in (stage.config, stage.beside["inner/selector"]):
-        assert (config.floor, config.floor_final, config.floor_fraction) == (0.8, 0.2, 0.3)
+        assert (config.epsilon, config.epsilon_final, config.epsilon_fraction) == (0.8, 0.2, 0.3)
 
 
 class Careful(Skill):
@@ -89,7 +90,7 @@ def three():
     """A hierarchy in a hierarchy in a hierarchy."""
     deepest = inside(Right(), Push(), call_steps=2, name="deepest")
     middle = inside(Balance(), deepest, call_steps=4, name="middle", interrupt=True)
-    return Hierarchy(skills=[Left(), middle], **options(call_steps=7, learn="together"))
+    return Hierarchy(skills=[Left(), middle], **plainly(options(call_steps=7, learn="together")))
 
 
 class InParts(gym.ObservationWrapper):
@@ -126,7 +127,7 @@ def in_parts():
     env = replace(CARTPOLE, wrappers=[InParts])
     inner = inside(LeansLeft(), LeansRight(), env=env)
     return Hierarchy(
-        skills=[LeansRight(), inner], **options(call_steps=7, learn="together", env=env)
+        skills=[LeansRight(), inner], **plainly(options(call_steps=7, learn="together", env=env))
     )
 
 
@@ -354,8 +355,10 @@ class Short(Skill):
 
 def test_a_run_without_code_is_loaded_from_its_own_record(tmp_path, capsys):
     plain = options(env="CartPole-v1", call_steps=3)
-    inner = Hierarchy(skills=[Short(), Task()], **plain | {"name": "inner", "call_steps": 2})
-    found = Hierarchy(skills=[Task(), inner], **plain | {"learn": "together"})
+    inner = Hierarchy(
+        skills=[Short(), Task()], **plainly(plain | {"name": "inner", "call_steps": 2})
+    )
+    found = Hierarchy(skills=[Task(), inner], **plainly(plain | {"learn": "together"}))
     run = found.train(tmp_path / "run", quiet=True)
     assert not run.info()["needs_recipe"]
     again = Hierarchy.from_manifest(run.info()).load(run.path)
@@ -379,7 +382,7 @@ def test_a_run_of_other_levels_is_refused(whole):
 def test_a_hierarchy_of_a_run_can_be_a_skill_beside_one_that_is_trained(tmp_path, whole):
     run, _ = whole("apart")
     both = [run.as_skill("done"), inside()]
-    found = Hierarchy(skills=both, **options(call_steps=5, learn="together"))
+    found = Hierarchy(skills=both, **plainly(options(call_steps=5, learn="together")))
     made = found.train(tmp_path / "run", quiet=True)
     assert {k.partition("/")[0] for k in made.evaluate(2).skills} == {"done", "inner"}
     assert found.load(tmp_path / "run").evaluate(2) == made.evaluate(2)

@@ -15,13 +15,13 @@ from skillweave import SkillweaveError
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = """
-ActingParams ActionHead Agent AgentState Algorithm Array Automaton CNN DQN Encoder EnvSpec
-Evaluation Evolution Export Heir Hierarchy HierarchyPolicy LastCall Layout Lengths Mutations Net
-Network OnPolicy OptionsEnv PPO ParameterGroup Player Policy PoolWrapper RNN Range Ray Reflex Report
-Rollout Run SAC Sample Seeds Selection SelfImitationPPO Skill SkillweaveError Step TD3 Together
-Tournament Truncation adam_ clip_grad_norm_ envpool evaluate from_function from_hub from_onnx
-from_sb3 from_torch gae make_options_env mask_logits masked_mean normalise register_algorithm
-register_encoder train_agent tree
+ActingParams ActionHead Agent AgentState Algorithm Apart Array Automaton CNN DQN Encoder EnvSpec
+Evaluation Evolution Export Guide Heir Hierarchy HierarchyPolicy LastCall Layout Lengths Mutations
+Net Network OnPolicy OptionsEnv PPO ParameterGroup ParentSelection Player Policy PoolWrapper RNN
+Range Ray Reflex Report Rollout Run SAC Sample Seeds Selection SelfImitationPPO Skill
+SkillweaveError Step TD3 Together Tournament TrainDefaults Truncation adam_ clip_grad_norm_
+envpool evaluate from_function from_hub from_onnx from_sb3 from_torch gae make_options_env
+mask_logits masked_mean normalise register_algorithm register_encoder train_agent tree
 """
 
 
@@ -69,7 +69,11 @@ def test_a_policy_is_evaluated_on_an_environment_by_its_id() -> None:
 
 def test_an_options_env_is_made_of_a_declaration_and_of_a_run(tmp_path: Path) -> None:
     hierarchy = sw.Hierarchy(
-        "CartPole-v1", [Left(), Right()], call_steps=3, selector=lambda obs: np.zeros(len(obs), int)
+        "CartPole-v1",
+        [Left(), Right()],
+        call_steps=3,
+        selector=lambda obs: np.zeros(len(obs), int),
+        learn="apart",
     )
     run = hierarchy.train(tmp_path / "run", quiet=True)
     seen = []
@@ -87,7 +91,7 @@ def test_what_cannot_be_an_options_env_is_said() -> None:
     class Learns(sw.Skill):
         pass
 
-    hierarchy = sw.Hierarchy("CartPole-v1", [Left(), Learns()])
+    hierarchy = sw.Hierarchy("CartPole-v1", [Left(), Learns()], learn="apart")
     with pytest.raises(SkillweaveError, match="skill 'learns' has no policy"):
         sw.make_options_env(hierarchy, 2, 0.9)
     with pytest.raises(SkillweaveError, match="gamma is 2"):

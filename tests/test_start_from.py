@@ -9,6 +9,7 @@ from functools import partial
 
 import pytest
 import torch
+from declaring import plainly
 from small_runs import MEMORY, OFF, ON, SMALL, Heard, Left, Push, assert_same, new_run
 
 from skillweave import (
@@ -16,12 +17,15 @@ from skillweave import (
     PPO,
     SAC,
     Agent,
+    Apart,
     Hierarchy,
     Network,
+    Selection,
     SelfImitationPPO,
     Skill,
     SkillweaveError,
     Together,
+    TrainDefaults,
 )
 from skillweave.cli import main
 from skillweave.collecting.acting import Acting
@@ -61,7 +65,7 @@ def declare(learn="apart", rate=None, skills=(Left, Other, Push), **how):
         "algorithm": ON, "selector": ON, "cut_every": 100, "greedy_skills": False,
     }  # fmt: skip
     env = how.pop("env", "CartPole-v1")
-    found = Hierarchy(env, [s() for s in skills], learn=learn, **settings | how)
+    found = Hierarchy(env, [s() for s in skills], **plainly(settings | how | {"learn": learn}))
     if rate is not None:
         found.algorithm = replace(found.algorithm, learning_rate=rate)
         for who, name in ((found, "selector"), *((s, "algorithm") for s in found.skills)):
@@ -112,7 +116,7 @@ def test_a_plain_agent_begins_with_the_weights_it_ended_with(kind, tmp_path):
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
 def test_all_who_have_learnt_there_begin_with_it(learn, source, tmp_path):
     path = tmp_path / "run"
-    how = {"together": Together(anchor_nats=None)}
+    how = {"together": Together(reference_kl=None, task_weight=0.0)}
     declare(learn, STILL, **how).train(path, seed=6, quiet=True, start_from=source)
     before, after = weights_of(source), weights_of(path)
     assert set(before) == set(after) == {"left", "other", "selector"}
@@ -410,10 +414,16 @@ def nested(rate=None, **how):
     inner.name = "inner"
     outer = declare(rate=rate, skills=(Other,), **how)
     return Hierarchy(
-        "CartPole-v1", [*outer.skills, inner.as_skill("inner")], call_steps=8, selector_steps=600,
-        skill_steps=600, algorithm=outer.algorithm, selector=outer.selector, cut_every=200,
-        greedy_skills=False,
-    )  # fmt: skip
+        "CartPole-v1",
+        [*outer.skills, inner.as_skill("inner")],
+        call_steps=8,
+        algorithm=outer.algorithm,
+        selector=outer.selector,
+        apart=Apart(selector_steps=600, skill_steps=600),
+        selection=Selection(greedy_skills=False),
+        train_defaults=TrainDefaults(checkpoint_every=200),
+        learn="apart",
+    )
 
 
 def test_all_levels_of_a_nested_hierarchy_begin_with_what_they_learnt(tmp_path):

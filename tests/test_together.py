@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from declaring import plainly
 from small_runs import (
     MEMORY,
     OFF,
@@ -39,7 +40,7 @@ from skillweave import (
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.adoption import told_differences
-from skillweave.hierarchy import judging, training
+from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.training import woven
 from skillweave.training.stage_log import START, StageLog, success_rate
@@ -58,7 +59,7 @@ def declare(*skills, **how):
         "selector_steps": 150,
         "cut_every": 75,
     }
-    return Hierarchy(**options | how)
+    return Hierarchy(**plainly(options | how))
 
 
 class Other(Balance):
@@ -85,7 +86,9 @@ KINDS = {
     "replay then": lambda: declare(Left(), Other(), learn="apart, then together"),
     "off-policy selector": lambda: declare(Left(), Balance(), selector=OFF),
     "then": lambda: declare(
-        learn="apart, then together", together=Together(anchor_nats=0.001), greedy_skills=True
+        learn="apart, then together",
+        together=Together(reference_kl=0.001, task_weight=0.0),
+        greedy_skills=True,
     ),
     "interrupt apart": lambda: declare(learn="apart", interrupt=True, selector_steps=450),
 }
@@ -216,7 +219,7 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
     assert set(kept) == played
     assert kept[best] == max(kept.values())
     assert greedy == {asked is None and best != "sampled"}
-    assert run.evaluate(100, seed=judging.SEEDS + 3).mean == kept[best]
+    assert run.evaluate(100, seed=select_best.SEEDS + 3).mean == kept[best]
 
 
 @pytest.mark.usefixtures("usual_episodes")
@@ -225,7 +228,7 @@ def test_it_is_found_out_in_the_pool_where_it_was_trained_in_one(tmp_path):
     hierarchy = declare(env=EnvSpec("CartPole-v1", workers=1))
     run = hierarchy.train(tmp_path / "run", seed=3, quiet=True)
     kept = run.info()["stages"][-1]["kept"]
-    how = {"seed": judging.SEEDS + 3, "deterministic": True}
+    how = {"seed": select_best.SEEDS + 3, "deterministic": True}
     assert run.evaluate(100, **how, engine="auto").mean == kept[kept["kept"]]
     assert run.evaluate(100, **how).mean != kept[kept["kept"]]
 
@@ -245,7 +248,7 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
         mean = 10.0 if policy.skills.greedy is better else 5.0
         return SimpleNamespace(mean=mean, lengths=(7, 8))
 
-    monkeypatch.setattr(judging, "evaluate", played)
+    monkeypatch.setattr(select_best, "evaluate", played)
     heard = Heard()
     hierarchy = declare(env=EnvSpec("CartPole-v1", engine=engine))
     run = new_run(hierarchy, tmp_path / "run")
@@ -266,7 +269,7 @@ def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(judging, "evaluate", stopped)
+        patched.setattr(select_best, "evaluate", stopped)
         with pytest.raises(KeyboardInterrupt):
             declare().train(tmp_path / "run", seed=3, quiet=True)
     with pytest.raises(SkillweaveError, match=r"was not judged yet.*resume"):
@@ -289,30 +292,30 @@ def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn
 
 
 def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
-    for how in ({}, {"selector": replace(ON, floor=0.7)}):
-        told = Together(floor_fraction=0.3)
+    for how in ({}, {"selector": replace(ON, epsilon=0.7)}):
+        told = Together(epsilon_fraction=0.3, task_weight=0.0)
         (stage,) = training.stages_of(declare(interrupt=True, together=told, **how))
         critic = stage.beside["skill_critic"]
-        for name in ("floor", "floor_final", "floor_fraction"):
+        for name in ("epsilon", "epsilon_final", "epsilon_fraction"):
             assert getattr(critic, name) == getattr(stage.config, name)
-        assert (critic.floor, critic.floor_fraction) == ((0.7, 1.0) if how else (1.0, 0.3))
+        assert (critic.epsilon, critic.epsilon_fraction) == ((0.7, 1.0) if how else (1.0, 0.3))
 
 
-@pytest.mark.parametrize("name", ["floor_final", "floor_fraction"])
+@pytest.mark.parametrize("name", ["epsilon_final", "epsilon_fraction"])
 def test_how_a_selectors_floor_falls_is_not_lost_where_it_has_none(name):
     alone = declare(selector=replace(ON, **{name: 0.5}))
-    with pytest.raises(SkillweaveError, match=rf"set together\.{name}, or selector\.floor, too"):
+    with pytest.raises(SkillweaveError, match=rf"set together\.{name}, or selector\.epsilon, too"):
         training.stages_of(alone)
-    (stage,) = training.stages_of(declare(selector=replace(ON, floor=0.7, **{name: 0.5})))
+    (stage,) = training.stages_of(declare(selector=replace(ON, epsilon=0.7, **{name: 0.5})))
     assert getattr(stage.config, name) == 0.5
-    assert stage.config.floor == 0.7
+    assert stage.config.epsilon == 0.7
     training.stages_of(declare(learn="apart", selector=replace(ON, **{name: 0.5})))
 
 
 @pytest.mark.parametrize("make", [Together, SkillCritic])
 def test_a_floor_falls_over_a_share_of_the_budget(make):
-    with pytest.raises(SkillweaveError, match=r"floor_fraction is 1\.5"):
-        make(floor_fraction=1.5)
+    with pytest.raises(SkillweaveError, match=r"epsilon_fraction is 1\.5"):
+        make(epsilon_fraction=1.5)
 
 
 def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():
@@ -402,7 +405,9 @@ class Right(Skill):
 
 def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
     """What a flat agent would learn from: the value of a state is that of its episode."""
-    alone = declare(Right(), call_steps=1, together_steps=3_000, together=Together(floor=0.0))
+    alone = declare(
+        Right(), call_steps=1, together_steps=3_000, together=Together(epsilon=0.0, task_weight=0.0)
+    )
     path = tmp_path / "run"
     alone.train(path, seed=0, quiet=True)
     found = lines(path)[-1]

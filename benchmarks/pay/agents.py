@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.grouped import regroup
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Seldom, Shaped, Suite, Task
-from skillweave import Array, Hierarchy, Lengths, Skill
+from skillweave import Array, Hierarchy, Lengths, Selection, Skill, TrainDefaults
 from skillweave.api.run import Run
 from skillweave.runs.directory import RunDirectory
 
@@ -90,8 +91,11 @@ class Bench:
         if self._found(task, agent, budget, keep):
             return
         self.results.begin(path)
-        hierarchy.eval_every = max(1, budget // self.suite.evaluations)
-        hierarchy.eval_episodes = self.suite.evaluated
+        regroup(
+            hierarchy,
+            eval_every=max(1, budget // self.suite.evaluations),
+            eval_episodes=self.suite.evaluated,
+        )
         if path.exists():
             run = hierarchy.resume(path, quiet=True)
         else:
@@ -106,8 +110,8 @@ class Bench:
     def _as_learnt(self, hierarchy: Hierarchy) -> Hierarchy:
         """Skills are greedy, or sample, as on the first task, if neither the suite says it nor a
         stage in which they go on learning finds it out."""
-        if hierarchy.greedy_skills is None and hierarchy.learn == "apart":
-            hierarchy.greedy_skills = self._source_policy().skills.greedy
+        if hierarchy.selection.greedy_skills is None and hierarchy.learn == "apart":
+            regroup(hierarchy, greedy_skills=self._source_policy().skills.greedy)
         return hierarchy
 
     def _source_policy(self) -> Any:
@@ -209,9 +213,14 @@ class Bench:
         if budget > LONG:
             learner = replace(learner, compile="auto")
         return Flat(
-            task.env, learner, budget,
-            eval_every=max(1, budget // self.suite.evaluations), eval_episodes=self.suite.evaluated,
-        )  # fmt: skip
+            task.env,
+            learner,
+            budget,
+            evaluation=TrainDefaults(
+                eval_every=max(1, budget // self.suite.evaluations),
+                eval_episodes=self.suite.evaluated,
+            ),
+        )
 
     def _learn(self, agent: Flat, task: Task, name: str, keep: bool = False) -> Result:
         budget, path, started = agent.steps, self._path(task, name), time.perf_counter()
@@ -306,9 +315,13 @@ def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:
     """The same skills under a ready selector: nothing is learnt any more."""
     skills: list[Skill] = list(hierarchy.skills)
     return Hierarchy(
-        hierarchy.env, skills, call_steps=hierarchy.call_steps, selector=selector,
-        reflexes=hierarchy.reflexes, greedy_skills=hierarchy.greedy_skills,
-    )  # fmt: skip
+        hierarchy.env,
+        skills,
+        call_steps=hierarchy.call_steps,
+        selector=selector,
+        reflexes=hierarchy.reflexes,
+        selection=Selection(greedy_skills=hierarchy.selection.greedy_skills),
+    )
 
 
 def by_lot(hierarchy: Hierarchy, seed: int) -> Hierarchy:

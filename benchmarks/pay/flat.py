@@ -5,12 +5,12 @@ All are evaluated on the task's own reward while they train, whatever they learn
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skillweave import Agent, Skill
+from skillweave import Agent, Skill, TrainDefaults
 from skillweave.api.run import Run
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
@@ -28,14 +28,16 @@ class Flat(Agent):
 
     learns: Skill | None = None
     """F1 and F2: whose reward it learns."""
+    evaluation: TrainDefaults = field(default_factory=TrainDefaults)
+    """Evaluations while it trains."""
     starts_from: Path | None = None
     """F3: the run in which it has learnt another task."""
 
-    def stages(self, name: str = "agent") -> list[Stage]:
+    def stages(self) -> list[Stage]:
         """Its only stage."""
         spec, skill = self.spec, self.learns
         return [
-            Stage(name, "agent", self.algorithm, self.steps, lambda _: skill_scene(spec, skill))
+            Stage("agent", "agent", self.algorithm, self.steps, lambda _: skill_scene(spec, skill))
         ]
 
     def run(self, path: Path, seed: int) -> Run:
@@ -43,7 +45,7 @@ class Flat(Agent):
         if path.exists():
             run = RunDirectory.open(path)
         else:
-            content = self.manifest(seed)
+            content = self.manifest(seed, self.evaluation)
             content["stages"][0]["workers"] = 1  # runs go side by side
             learnt = {} if self.starts_from is None else learnt_in(self.starts_from)
             if self.starts_from is not None:
@@ -70,7 +72,7 @@ class _FlatLearner(OneAgent):
         fresh, manifest = super().open(), self.stage.run.manifest
         self.evaluation = PeriodicEvaluation(
             skill_scene(self._flat.spec), self.stage.seeds,
-            manifest.get("eval_every"), manifest.get("eval_episodes", 0),
+            manifest["eval_every"], manifest["eval_episodes"],
         )  # fmt: skip
         self._open.callback(self.evaluation.close)
         return fresh

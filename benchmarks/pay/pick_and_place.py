@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.grouped import regroup
 from benchmarks.pay.suite import Policies, Suite, Task
 from skillweave import Array, Hierarchy
 from skillweave.recipes import _arm as world
@@ -34,7 +35,8 @@ def anchored(task: Task, skills: Policies) -> Hierarchy:
 
 def with_skills(declare: Callable[..., Hierarchy], task: Task, skills: Policies) -> Hierarchy:
     """A hierarchy with the learnt skill."""
-    found = declare(DISTURBANCES[task.name], selector_steps=FURTHER_STEPS)
+    found = declare(DISTURBANCES[task.name])
+    regroup(found, selector_steps=FURTHER_STEPS)
     found.skill("recover").policy = skills["recover"]
     return found
 

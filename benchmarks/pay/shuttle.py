@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.grouped import regroup
 from benchmarks.pay.suite import Policies, Suite, Task
 from skillweave import Array, Hierarchy
 from skillweave.recipes import _cheetah as cheetah
@@ -36,7 +37,7 @@ def source(task: Task) -> Hierarchy:
 def further(task: Task, skills: Policies) -> Hierarchy:
     """A selector over skills that are there already."""
     found = shuttle.with_skills(POINTS[task.name], skills)
-    found.selector_steps = FURTHER_STEPS
+    regroup(found, selector_steps=FURTHER_STEPS)
     return found
 
 

@@ -17,6 +17,7 @@ from skillweave import (
     PPO,
     RNN,
     SAC,
+    Apart,
     EnvSpec,
     Evolution,
     Hierarchy,
@@ -24,8 +25,10 @@ from skillweave import (
     Mutations,
     Network,
     Reflex,
+    Selection,
     Skill,
     Together,
+    TrainDefaults,
 )
 from skillweave.api import Agent, Run
 
@@ -149,9 +152,14 @@ EVOLVES: dict[str, Any] = {
 def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
     """Two skills and a selector."""
     return Hierarchy(
-        IN_PYTHON, [Left(), Balance()], call_steps=6, algorithm=skill,
-        selector=selector, skill_steps=steps, selector_steps=steps, cut_every=steps // 4,
-    )  # fmt: skip
+        IN_PYTHON,
+        [Left(), Balance()],
+        call_steps=6,
+        algorithm=skill,
+        selector=selector,
+        apart=Apart(skill_steps=steps, selector_steps=steps),
+        train_defaults=TrainDefaults(checkpoint_every=steps // 4),
+    )
 
 
 def alone(env: Any, algorithm: Any, steps: int) -> Agent:
@@ -162,21 +170,31 @@ def alone(env: Any, algorithm: Any, steps: int) -> Agent:
 def together(steps: int) -> Hierarchy:
     """Two skills and a selector that learn at once, on-policy."""
     return Hierarchy(
-        IN_PYTHON, [Left(), Leaning()], call_steps=Lengths(2, 4, 8),
-        interrupt=True, learn="together", together_steps=steps, cut_every=steps // 4,
-        together=Together(quota=1.0),  # so that a checkpoint holds rows to learn from
-        greedy_skills=False,  # else 200 episodes are played; `together_replay` plays them
-        algorithm=PPO(**LEARNS, network=NET), selector=PPO(**LEARNS, network=NET),
-    )  # fmt: skip
+        IN_PYTHON,
+        [Left(), Leaning()],
+        call_steps=Lengths(2, 4, 8),
+        learn="together",
+        together=Together(quota=1.0, interrupt=True, steps=steps),
+        algorithm=PPO(**LEARNS, network=NET),
+        selector=PPO(**LEARNS, network=NET),
+        selection=Selection(greedy_skills=False),
+        train_defaults=TrainDefaults(checkpoint_every=steps // 4),
+    )
 
 
 def together_replay(steps: int) -> Hierarchy:
     """Two skills and a selector that learn from replay, apart, then together."""
     return Hierarchy(
-        IN_PYTHON, [Left(), Leaning()], call_steps=4, learn="apart, then together",
-        skill_steps=steps, selector_steps=steps, together_steps=2 * steps, cut_every=steps // 2,
-        algorithm=DQN.rainbow(**REPLAYS), selector=SAC(**REPLAYS),
-    )  # fmt: skip
+        IN_PYTHON,
+        [Left(), Leaning()],
+        call_steps=4,
+        learn="apart, then together",
+        algorithm=DQN.rainbow(**REPLAYS),
+        selector=SAC(**REPLAYS),
+        apart=Apart(skill_steps=steps, selector_steps=steps),
+        together=Together(steps=2 * steps),
+        train_defaults=TrainDefaults(checkpoint_every=steps // 2),
+    )
 
 
 KINDS: dict[str, Kind] = {
@@ -208,20 +226,13 @@ KINDS: dict[str, Kind] = {
     ),
     "search for a start": Kind(
         lambda: Hierarchy(
-            IN_PYTHON, [Leaning(), Balance()], call_steps=4, skill_steps=600,
-            algorithm=PPO(**LEARNS, network=NET), selector=DQN(**REPLAYS | {"update_ratio": 0.02}),
-            selector_steps=600, cut_every=150, eval_every=200, eval_episodes=2,
-            reflexes=[Reflex(leans_left, 0)],
-        ),
+            IN_PYTHON, [Leaning(), Balance()], call_steps=4, algorithm=PPO(**LEARNS, network=NET), selector=DQN(**REPLAYS | {"update_ratio": 0.02}), reflexes=[Reflex(leans_left, 0)], apart=Apart(skill_steps=600, selector_steps=600), train_defaults=TrainDefaults(checkpoint_every=150, eval_every=200, eval_episodes=2)),
     ),
     "populations of skills and selector": Kind(
         lambda: Hierarchy(
-            IN_PYTHON, [Leaning(), Balance()], call_steps=4, skill_steps=300,
-            algorithm=PPO(
+            IN_PYTHON, [Leaning(), Balance()], call_steps=4, algorithm=PPO(
                 **LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))
-            ),
-            selector=DQN(**REPLAYS), selector_steps=300,
-        ),
+            ), selector=DQN(**REPLAYS), apart=Apart(skill_steps=300, selector_steps=300)),
         evolve=Evolution(**EVOLVES | {"population": 2, "generations": 2}),
     ),
     "together": Kind(lambda: together(1200)),

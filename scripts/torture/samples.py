@@ -34,7 +34,14 @@ from scripts.torture.kinds import (
     together_replay,
     woven,
 )
-from skillweave import PPO, SAC, Hierarchy, Skill, from_onnx
+from skillweave import (
+    PPO,
+    SAC,
+    Apart,
+    Hierarchy,
+    Skill,
+    from_onnx,
+)
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Agent, Run, train_agent
 from skillweave.cli import commands, execute
@@ -273,8 +280,7 @@ def _with_onnx(folder: Path) -> Hierarchy:
         [Model(), Balance()],
         algorithm=ppo,
         selector=ppo,
-        skill_steps=64,
-        selector_steps=64,
+        apart=Apart(skill_steps=64, selector_steps=64),
     )
 
 

@@ -116,15 +116,6 @@ def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
     return {"algorithm": type(config).__name__, **asdict(config)}
 
 
-_ADDED_LATER: tuple[tuple[type, str, float], ...] = (
-    (OffPolicy, "bouts", 0.0),
-    (TD3, "action_l2", 0.0),
-    (PPO, "min_advantage_std", 0.0),
-    (SkillCritic, "min_advantage_std", 0.0),
-)
-"""Settings that older records lack, and what these runs learnt with."""
-
-
 def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConfig:
     """The inverse of ``config_to_json``.
 
@@ -141,9 +132,6 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
     if not isinstance(kind, str) or kind not in _REGISTERED:
         where = f"{file}: {path}: " if file else ""
         raise SkillweaveError(f"{where}{_not_registered(shown(kind))}")
-    for owner, name, before in _ADDED_LATER:
-        if issubclass(_REGISTERED[kind].config, owner):
-            values.setdefault(name, before)
     config: AlgorithmConfig = fit(_REGISTERED[kind].config, values, file, path or kind)
     return config
 

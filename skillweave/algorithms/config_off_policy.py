@@ -73,13 +73,13 @@ class OffPolicy:
     """Collect while learning, with the parameters of one update before: pays where environments
     are slow. The lag is ``train_freq`` steps of every environment. Where several learn together,
     only if all of them have it."""
-    bouts: float = 0.0
-    """Chance that an environment, somewhere in ``bout_steps`` of its steps, takes one random action
-    again and again (as in εz-greedy exploration, Dabney et al. 2021). It finds what needs patience,
+    action_repeat: float = 0.0
+    """Chance that an environment, somewhere in ``action_repeat_steps`` of its steps, repeats one
+    random action (as in εz-greedy exploration, Dabney et al. 2021). It finds what needs patience,
     like resting on the ground with the engines off. Falls to 0 over the budget. Only where it acts
     in every step: for plain agents, and skills that learn apart."""
-    bout_steps: int = 60
-    """Steps of the longest bout; shorter ones are as likely."""
+    action_repeat_steps: int = 60
+    """Steps of the longest repetition; shorter ones are as likely."""
     threads: int = 1
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
@@ -95,8 +95,8 @@ class OffPolicy:
         compiles(self)
         check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
         whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
-        whole(self, "bout_steps")
-        number(self, "gamma", "tau", "priority_alpha", "priority_beta", "bouts", high=1.0)
+        whole(self, "action_repeat_steps")
+        number(self, "gamma", "tau", "priority_alpha", "priority_beta", "action_repeat", high=1.0)
         positive(self, "learning_rate", "adam_eps", "update_ratio")
         if self.max_grad_norm is not None:
             positive(self, "max_grad_norm")
@@ -195,7 +195,7 @@ class ActorCritic(OffPolicy):
     """Share of the new weights in the target's at each target update."""
     normalize_obs: bool = True
     """Running zero mean, unit deviation of observations; saved with the policy."""
-    bouts: float = 0.2
+    action_repeat: float = 0.2
     """As of ``OffPolicy``."""
     network: Network = field(default_factory=lambda: Network((128, 128), "relu"))
     """The network that acts."""
@@ -235,13 +235,19 @@ class TD3(ActorCritic):
     def ddpg(cls, **settings: Any) -> TD3:
         """DDPG (Lillicrap et al. 2016): one critic, no delay, no noise on targets, one step.
 
-        Actor and critic learn at one rate, there are no bouts, and large outputs cost nothing;
+        Actor and critic learn at one rate, no action is repeated, and large outputs cost nothing;
         ``settings`` override.
         """
         plain = {
-            "twin": False, "policy_delay": 1, "target_noise": 0.0, "bouts": 0.0, "n_step": 1,
-            "exploration_noise": 0.1, "actor_rate": 1.0, "action_l2": 0.0,
-        }  # fmt: skip
+            "twin": False,
+            "policy_delay": 1,
+            "target_noise": 0.0,
+            "action_repeat": 0.0,
+            "n_step": 1,
+            "exploration_noise": 0.1,
+            "actor_rate": 1.0,
+            "action_l2": 0.0,
+        }
         return cls(**{**plain, **settings})
 
 

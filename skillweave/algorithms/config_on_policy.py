@@ -81,12 +81,12 @@ class PPO(OnPolicy):
     """Weight of the entropy bonus, and of the cost of bounded actions' deviations beyond 1."""
     ent_coef_final: float | None = None
     """Weight of the entropy bonus at the end of the budget, reached linearly; None: constant."""
-    floor: float = 0.0
-    """Share of actions drawn uniformly from those allowed, discrete ones, at the start."""
-    floor_final: float | None = None
-    """The share that it falls to, linearly; None: constant."""
-    floor_fraction: float = 1.0
-    """Share of the budget over which the floor falls."""
+    epsilon: float = 0.0
+    """Share of discrete actions drawn uniformly from the allowed ones, at the start."""
+    epsilon_final: float | None = None
+    """The value that epsilon falls to, linearly; None: constant."""
+    epsilon_fraction: float = 1.0
+    """Share of the budget over which epsilon falls."""
     vf_coef: float = 0.5
     """Weight of the value loss."""
     max_grad_norm: float = 0.5
@@ -120,10 +120,10 @@ class PPO(OnPolicy):
         number(self, "gae_lambda", high=1.0)
         positive(self, "clip_coef", "max_grad_norm", "action_std_init", "adam_eps")
         number(self, "ent_coef", "vf_coef", "min_advantage_std")
-        number(self, "floor", "floor_fraction", high=1.0)
-        for name in ("ent_coef_final", "floor_final"):
+        number(self, "epsilon", "epsilon_fraction", high=1.0)
+        for name in ("ent_coef_final", "epsilon_final"):
             if getattr(self, name) is not None:
-                number(self, name, high=1.0 if name == "floor_final" else math.inf)
+                number(self, name, high=1.0 if name == "epsilon_final" else math.inf)
         positive(self, *(k for k in ("target_kl", "clip_value") if getattr(self, k) is not None))
         one_of(self, "action_std", ("parameter", "state"))
         if self.learning_rate_schedule == "kl":
@@ -186,20 +186,20 @@ class SkillCritic(OnPolicy):
     """It also learns what it is worth to decide anew, which interruption asks for."""
     min_advantage_std: float = 0.05
     """The task's advantages of a smaller deviation, in units of reward, are divided by this."""
-    floor: float = 0.0
+    epsilon: float = 0.0
     """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
-    cut: while skills learn, what skills are worth is multiplied by 1 − floor."""
-    floor_final: float | None = None
-    """The share that it falls to, linearly; None: constant."""
-    floor_fraction: float = 1.0
-    """Share of the budget over which the floor falls."""
+    cut: while skills learn, what skills are worth is multiplied by 1 − epsilon."""
+    epsilon_final: float | None = None
+    """The value that epsilon falls to, linearly; None: constant."""
+    epsilon_fraction: float = 1.0
+    """Share of the budget over which epsilon falls."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         whole(self, "batch_size", "update_epochs")
         number(self, "gae_lambda", high=1.0)
-        number(self, "floor", "floor_fraction", high=1.0)
+        number(self, "epsilon", "epsilon_fraction", high=1.0)
         number(self, "min_advantage_std")
-        if self.floor_final is not None:
-            number(self, "floor_final", high=1.0)
+        if self.epsilon_final is not None:
+            number(self, "epsilon_final", high=1.0)
         positive(self, "max_grad_norm", "adam_eps")

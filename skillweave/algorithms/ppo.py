@@ -20,7 +20,7 @@ from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Devi
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.ppo_samples import Terms, floor_now, samples_of
+from skillweave.algorithms.ppo_samples import Terms, epsilon_now, samples_of
 from skillweave.algorithms.rollouts import Samples, minibatches
 from skillweave.experience import Report, Rollout
 from skillweave.networks.encoders import Inputs
@@ -28,7 +28,7 @@ from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
 from skillweave.ops.device import all_false
-from skillweave.ops.distributions import mask_logits, with_floor
+from skillweave.ops.distributions import mask_logits, with_epsilon
 from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
 from skillweave.ops.moments import masked_mean
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
@@ -65,10 +65,10 @@ class PPOAlgorithm(Algorithm):
         self, config: PPO, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         super().__init__(config, observation_space, action_space)
-        if max(config.floor, config.floor_final or 0.0) and not isinstance(
+        if max(config.epsilon, config.epsilon_final or 0.0) and not isinstance(
             action_space, gym.spaces.Discrete
         ):
-            raise SkillweaveError(f"floor needs discrete actions, but they are {action_space}")
+            raise SkillweaveError(f"epsilon needs discrete actions, but they are {action_space}")
         self.head = ActionHead(self.codec, config.action_std, config.squash_actions)
         self.actor_net = Net("actor", self.obs, config.network, self.head.width)
         self.critic_net = Net("critic", self.obs, config.critic or config.network, 1)
@@ -118,8 +118,8 @@ class PPOAlgorithm(Algorithm):
             _, other = self.critic_net.step(views, inputs, other)
             memory = torch.cat([own, other], dim=-1)
         if self.head.discrete:
-            floor = params.extra.get("floor")
-            head = mask_logits(head, mask) if floor is None else with_floor(head, mask, floor)
+            epsilon = params.extra.get("epsilon")
+            head = mask_logits(head, mask) if epsilon is None else with_epsilon(head, mask, epsilon)
         return self.head.act(head, views.get("actor.log_std"), noise), head, memory
 
     def acting_params(
@@ -127,8 +127,8 @@ class PPOAlgorithm(Algorithm):
     ) -> ActingParams:
         """A copy of what acting needs; see ``Algorithm.acting_params``."""
         found = super().acting_params(state, progress, device)
-        if (floor := floor_now(self.config, progress, state.learning_rate)) is not None:
-            found.extra["floor"] = floor.to(device)
+        if (epsilon := epsilon_now(self.config, progress, state.learning_rate)) is not None:
+            found.extra["epsilon"] = epsilon.to(device)
         return found
 
     def to_env(self, action: Array) -> Array:

@@ -41,16 +41,16 @@ class Terms:
         return cls(rate, ent_coef, rollout.anchor)
 
 
-def floor_now(config: PPO | SkillCritic, progress: float, like: Tensor) -> Tensor | None:
+def epsilon_now(config: PPO | SkillCritic, progress: float, like: Tensor) -> Tensor | None:
     """The share of actions that is drawn uniformly, (P, 1, 1); None: there is no such share.
 
     Args:
         like: (P,).
     """
-    first, last = config.floor, config.floor_final
+    first, last = config.epsilon, config.epsilon_final
     if max(first, last or 0.0) == 0.0:
         return None
-    fallen = min(1.0, progress / max(config.floor_fraction, 1e-9))
+    fallen = min(1.0, progress / max(config.epsilon_fraction, 1e-9))
     share = first if last is None else first + fallen * (last - first)
     return torch.full((len(like), 1, 1), share, device=like.device)
 
@@ -83,8 +83,8 @@ def samples_of(
     mean, scale = state.return_mean, state.return_scale
     action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.obs_mask)
     # Clipping and KL count from the policy as it is now, whoever acted: an older one, or one with a
-    # floor. A ratio of mixtures would let the policy collapse within the clip where the floor is
-    # high: all it can change in the mixture is 1 − floor.
+    # epsilon. A ratio of mixtures would let the policy collapse within the clip where epsilon is
+    # high: all it can change in the mixture is 1 − epsilon.
     head, _ = agent.run(agent.actor_net, params.views, inputs, memory, starts)
     log_prob, _ = agent.head.stats(head, params.views.get("actor.log_std"), mask, action)
     own = _own(cells.flat_or_none(rollout.overridden), valid)

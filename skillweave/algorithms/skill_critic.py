@@ -20,7 +20,7 @@ from torch import Tensor
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.ppo_samples import floor_now
+from skillweave.algorithms.ppo_samples import epsilon_now
 from skillweave.algorithms.rollouts import values_after
 from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
@@ -84,9 +84,9 @@ class SkillCriticAlgorithm(Algorithm):
     ) -> ActingParams:
         """A copy of what acting needs; ``trust`` multiplies worths while skills learn."""
         found = super().acting_params(state, progress, device)
-        floor = floor_now(self.config, progress, state.learning_rate)
-        if floor is not None and progress < 1.0:  # at the end calls are cut as they will be
-            found.extra["trust"] = 1.0 - floor.to(device)
+        epsilon = epsilon_now(self.config, progress, state.learning_rate)
+        if epsilon is not None and progress < 1.0:  # at the end calls are cut as they will be
+            found.extra["trust"] = 1.0 - epsilon.to(device)
         return found
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:

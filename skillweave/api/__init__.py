@@ -13,7 +13,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
 from skillweave.api.run import Run
-from skillweave.api.running import begin, declared_of, go_on
+from skillweave.api.running import begin, declared_of, evolving, go_on
 from skillweave.api.starting import StartFrom
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
@@ -26,6 +26,7 @@ from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
 from skillweave.messages import as_path, whole_number
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill
+from skillweave.training.defaults import TrainDefaults
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
 
@@ -40,18 +41,21 @@ class Agent(PlainAgent):
         run_dir: str | Path,
         *,
         seed: int = 0,
+        eval_every: int | None = None,
+        eval_episodes: int = 20,
+        checkpoint_every: int = 100_000,
         quiet: bool = False,
         track: Sequence[str] = (),
         evolve: Evolve = None,
         cluster: Ray | None = None,
         start_from: StartFrom = None,
     ) -> Run:
-        """Train it; all goes to ``run_dir``.
+        """Train the agent and write everything to ``run_dir``.
 
-        ``seed``, ``quiet``, ``track``, ``evolve``, ``cluster`` and ``start_from`` are as in
-        ``Hierarchy.train``.
+        The arguments are those of ``Hierarchy.train``.
         """
-        content = self.manifest(whole_number(seed, "seed", 0))
+        how = TrainDefaults(eval_every, eval_episodes, checkpoint_every)
+        content = self.manifest(whole_number(seed, "seed", 0), how)
         return begin(self, content, run_dir, quiet, track, evolve, cluster, start_from)
 
     def resume(
@@ -129,23 +133,32 @@ class Hierarchy(Declaration):
         run_dir: str | Path,
         *,
         seed: int = 0,
-        flat: bool = False,
+        flat: bool | AlgorithmConfig = False,
+        eval_every: int | None = None,
+        eval_episodes: int | None = None,
+        checkpoint_every: int | None = None,
         quiet: bool = False,
         track: Sequence[str] = (),
         evolve: Evolve = None,
         cluster: Ray | None = None,
         start_from: StartFrom = None,
     ) -> Run:
-        """Train every skill, then the selector if it is not ready; all goes to ``run_dir``.
+        """Train skills and selector and write everything to ``run_dir``.
 
         Args:
             run_dir: a new directory; an existing run is never overwritten.
             seed: the root of every random stream.
-            flat: train one plain agent on the same number of steps instead: the baseline.
+            flat: train one plain agent for the same number of steps instead: the baseline. True:
+                with the settings of ``train_defaults``; or its settings.
+            eval_every: environment steps between evaluations while training, by the learner's own
+                reward; None: as ``train_defaults`` says, by default none.
+            eval_episodes: episodes of each of these evaluations; None: 20.
+            checkpoint_every: environment steps between checkpoints; None: 100,000.
             quiet: no progress.
             track: any of "tensorboard", "wandb" and "mlflow".
             evolve: a population for every stage, or for some by name (a skill's, "selector",
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
+                Skills and selector of a population cannot learn together yet: they learn apart.
             cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
                 where it pays.
             start_from: another run, or its directory: whoever learns here and has learnt there, by
@@ -160,8 +173,13 @@ class Hierarchy(Declaration):
             SkillweaveError: the declaration does not fit the environment, training diverged, or
                 nobody can start from ``start_from``.
         """
-        content = training.manifest(self, seed=whole_number(seed, "seed", 0), flat=flat)
-        return begin(self, content, run_dir, quiet, track, evolve, cluster, start_from)
+        seed = whole_number(seed, "seed", 0)
+        how = self.train_defaults.given(
+            eval_every=eval_every, eval_episodes=eval_episodes, checkpoint_every=checkpoint_every
+        )
+        own, note = (self, "") if flat is not False else evolving(self, evolve)
+        content = training.manifest(own, seed=seed, flat=flat, how=how)
+        return begin(own, content, run_dir, quiet, track, evolve, cluster, start_from, note)
 
     def resume(
         self,
@@ -190,9 +208,9 @@ class Hierarchy(Declaration):
         own = adopted(self, run)
         return Run(declared_of(own, run), run.path, training.load(own, run))
 
-    def plain_agent(self) -> Agent:
-        """The flat baseline: one agent on the task itself, without skills and reflexes."""
-        return Agent(**vars(super().plain_agent()))
+    def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> Agent:
+        """Return the flat baseline: one agent on the task itself, without skills and reflexes."""
+        return Agent(**vars(super().plain_agent(algorithm)))
 
     def load_weights(self, path: str | Path) -> Run:
         """This hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
@@ -280,13 +298,18 @@ def train_agent(
         steps,
         target_return=target_return,
         target_success=target_success,
-        eval_every=eval_every,
-        eval_episodes=eval_episodes,
     )
     return agent.train(
-        run_dir, seed=seed, quiet=quiet, track=track, evolve=evolve, cluster=cluster,
+        run_dir,
+        seed=seed,
+        eval_every=eval_every,
+        eval_episodes=eval_episodes,
+        quiet=quiet,
+        track=track,
+        evolve=evolve,
+        cluster=cluster,
         start_from=start_from,
-    )  # fmt: skip
+    )
 
 
 __all__ = ["Agent", "Hierarchy", "Run", "train_agent"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from skillweave.envs.make import EnvSpec
@@ -13,7 +14,6 @@ from skillweave.hierarchy.training import manifest
 from skillweave.hierarchy.weights import adopt_calls, check_selector
 from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import UNSAID
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
 
@@ -63,11 +63,10 @@ def told_differences(declared: Hierarchy | Agent, run: RunDirectory) -> str:
         content = declared.manifest(seed)
     here, there = settings(content), settings(run.manifest)
     evolve = tuple(f"{s['name']}." for s in run.manifest["stages"] if s.get("evolution"))
-    # Settings that older versions did not know are not in both; who evolves has others by plan.
-    # Where a file lies is no setting; its checksum is.
+    # A population's settings follow a plan. Where a file lies is no setting; its checksum is.
     both = [k for k in here if k in there and not k.startswith(evolve) and not k.endswith(".file")]
     # Nor is it told where this declaration leaves it open.
-    left = [k for k in both if k.endswith("greedy_skills") and here[k] is None]
+    left = [k for k in both if k.endswith(("greedy_skills", "greedy_selector")) and here[k] is None]
     differ = [k for k in both if k not in left and plain(here[k]) != plain(there[k])]
     if not differ:
         return ""
@@ -81,12 +80,10 @@ def told_differences(declared: Hierarchy | Agent, run: RunDirectory) -> str:
 def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
     adopt_guide(declared, told, where)
     adopt_calls(declared, told)
-    declared.learn = told.get("learn", "apart")
-    declared.reflexes_in_training = told.get("reflexes_in_training", True)
-    declared.start_calls = told.get("start_calls")
-    declared.search_steps = told.get("search_steps")
-    for name, usual in UNSAID.items():
-        setattr(declared, name, told.get(name, usual))
+    declared.learn = told["learn"]
+    search = ("start_calls", "search_steps", "episode_calls")
+    declared.apart = replace(declared.apart, **{name: told[name] for name in search})
+    declared.selection = replace(declared.selection, call_cost=told["call_cost"])
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
@@ -121,7 +118,7 @@ def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
 
 def _check_reflexes(declared: Declaration, told: dict[str, Any], where: str) -> None:
     """Raise a SkillweaveError where others are in force than those that were trained with."""
-    theirs: list[str] = told.get("reflexes", [])
+    theirs: list[str] = told["reflexes"]
     mine = [str(r.name) for r in declared.reflexes]
     if mine != theirs:
         raise SkillweaveError(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from skillweave.api.run import Run
 from skillweave.api.starting import Spaces, StartFrom, starts
@@ -18,6 +18,7 @@ from skillweave.collecting.where import HERE, Where
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.nesting import copied, every_hierarchy
 from skillweave.messages import as_path, short
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import saved_words
@@ -57,12 +58,14 @@ def begin(
     evolve: Evolve,
     cluster: Ray | None,
     start_from: StartFrom = None,
+    note: str = "",
 ) -> Run:
-    """Check everything, begin a run of this manifest, and train it."""
+    """Check everything, begin a run of this manifest, and train it; ``note`` is printed first."""
     _may_train()
     run_dir = as_path(run_dir, "run_dir")
     spaces = _plan(declared, content, evolve, cluster)
-    learnt, note = starts(declared, content, start_from, spaces)
+    learnt, told = starts(declared, content, start_from, spaces)
+    note = " ".join(filter(None, (note, told)))
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
@@ -161,6 +164,29 @@ def go_on(
             again = f"resume({str(run.path)!r})"
             raise KeyboardInterrupt(f"{saved_words(run)}; go on with: {again}") from None
     return Run(declared_of(declared, run), run.path, policy)
+
+
+H = TypeVar("H", bound=Declaration)
+
+
+def evolving(declared: H, evolve: Evolve) -> tuple[H, str]:
+    """Return the hierarchy as it can evolve, and a sentence on what differs from the declaration.
+
+    Skills and selector cannot evolve together, so where that is declared they learn apart.
+    """
+    asked = evolve if isinstance(evolve, Mapping) else {"": evolve}
+    if all(how is None for how in asked.values()):
+        return declared, ""
+    found = copied(declared)
+    changed = [h for _, h in every_hierarchy(found) if h.learns_together and h.learn == "together"]
+    if not changed:
+        return declared, ""
+    for own in changed:
+        own.learn = "apart"
+    return found, (
+        "Skills and selector cannot evolve together yet, so they learn apart here; "
+        "learn='apart' in the declaration ends this message."
+    )
 
 
 def declared_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:

@@ -13,15 +13,23 @@ from typing import Any
 from skillweave.algorithms.config import named_config
 from skillweave.collecting.lengths import Lengths
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.skills import Skill
 from skillweave.types import SkillweaveError
 
-PLAIN = tuple(
-    f.name
-    for f in fields(Declaration)
-    if f.type in ("int", "int | None", "float", "float | None", "bool", "bool | None")
-    or f.name in ("call_steps", "learn")
-)
-CONFIGS = ("algorithm", "selector", "flat", "together")
+PLAIN = ("call_steps", "steps", "learn")
+"""Fields of a hierarchy that are set by themselves."""
+OF_SKILLS = ("steps", "task_weight", "target_return", "target_success")
+"""The same of a skill; its other settings are its algorithm's."""
+GROUPS = {
+    "apart": "apart",
+    "together": "together",
+    "selection": "selection",
+    "guide": "guide",
+    "train": "train_defaults",
+}
+"""By the first part of a name, the field that holds the group."""
+ALGORITHMS = ("algorithm", "selector", "flat")
+"""First parts of the names of algorithms' settings."""
 
 
 def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
@@ -42,45 +50,75 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         if head in PLAIN and not rest:
             hint = typing.get_type_hints(Declaration)[head]
             setattr(declaration, head, _parse(name, text, hint))
-        elif head == "skills" and len(rest) == 2 and rest[1] == "steps":
-            declaration.skill(rest[0]).steps = _parse(name, text, int)
-        elif head == "skills" and len(rest) == 2 and rest[1] in ("target_return", "target_success"):
-            setattr(declaration.skill(rest[0]), rest[1], _parse(name, text, float | None))
+        elif head == "skills" and len(rest) == 2 and rest[1] in OF_SKILLS:
+            hint = typing.get_type_hints(Skill)[rest[1]]
+            setattr(declaration.skill(rest[0]), rest[1], _parse(name, text, hint))
         elif head == "skills" and len(rest) == 1:
             kinds[head, rest[0]] = text
         elif head == "skills" and len(rest) >= 2:
             configs.setdefault((head, rest[0]), {})[name] = text
-        elif head in CONFIGS and not rest:
+        elif head in ALGORITHMS and not rest:
             kinds[(head,)] = text
-        elif head in CONFIGS:
+        elif head in (*ALGORITHMS, *GROUPS) and rest:
             configs.setdefault((head,), {})[name] = text
         else:
-            known = [*list_settings(declaration), *(f"{c}." for c in CONFIGS)]
+            known = [*list_settings(declaration), *(f"{c}." for c in (*ALGORITHMS, *GROUPS))]
             raise _unknown(name, known)
     for owner in kinds | configs:
         # All of a config's changes at once: some fit only together (num_envs, batch_size).
         changes = configs.get(owner, {})
         by_path = {tuple(n.split(".")[len(owner) :]): (n, text) for n, text in changes.items()}
-        target: Any = declaration.skill(owner[1]) if owner[0] == "skills" else declaration
-        field = "algorithm" if owner[0] == "skills" else owner[0]
-        config = getattr(target, field) or declaration.algorithm
+        config = _config(declaration, owner)
         if owner in kinds:
             config = named_config(kinds[owner], f"--set {'.'.join(owner)}={kinds[owner]}")
         if not is_dataclass(config):
-            raise SkillweaveError(
-                f"{next(iter(changes))}: the selector is ready, so it has no settings; with "
-                "--set selector=PPO it is trained"
-            )
-        setattr(target, field, replaced(config, by_path))
+            raise SkillweaveError(_without_settings(next(iter(changes)), owner))
+        _set_config(declaration, owner, replaced(config, by_path))
     declaration.__post_init__()
 
 
+def _config(declaration: Declaration, owner: tuple[str, ...]) -> Any:
+    """Return the settings that names starting with ``owner`` belong to."""
+    head = owner[0]
+    if head == "skills":
+        return declaration.skill(owner[1]).algorithm or declaration.algorithm
+    if head == "flat":
+        return declaration.train_defaults.flat or declaration.algorithm
+    return getattr(declaration, GROUPS.get(head, head))
+
+
+def _set_config(declaration: Declaration, owner: tuple[str, ...], config: Any) -> None:
+    """Put settings into their place; the inverse of ``_config``."""
+    head = owner[0]
+    if head == "skills":
+        declaration.skill(owner[1]).algorithm = config
+    elif head == "flat":
+        declaration.train_defaults = replace(declaration.train_defaults, flat=config)
+    else:
+        setattr(declaration, GROUPS.get(head, head), config)
+
+
+def _without_settings(name: str, owner: tuple[str, ...]) -> str:
+    if owner == ("guide",):
+        return f"{name}: the hierarchy has no guide; declare one: guide=Guide(automaton)"
+    return (
+        f"{name}: the selector is ready, so it has no settings; with --set selector=PPO it is "
+        "trained"
+    )
+
+
 def list_settings(declaration: Declaration) -> dict[str, Any]:
-    """The dotted name and the value of every setting."""
+    """Return the dotted name and the value of every setting."""
     found: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
+    for name, field in GROUPS.items():
+        if (group := getattr(declaration, field)) is not None:
+            found |= {f"{name}.{f.name}": getattr(group, f.name) for f in fields(group)}
+    found = {k: v for k, v in found.items() if k not in ("train.flat", "guide.selector")}
+    budgets = declaration.budgets()
     for skill in declaration.skills:
         if skill.policy is None:
-            found[f"skills.{skill.name}.steps"] = declaration.budget(skill)
+            found[f"skills.{skill.name}.steps"] = budgets.get(skill.name, skill.steps)
+            found[f"skills.{skill.name}.task_weight"] = skill.task_weight
             config = skill.algorithm or declaration.algorithm
             found |= _flatten(f"skills.{skill.name}.", config)
     trained = declaration.ready_selector is None

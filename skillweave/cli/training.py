@@ -42,7 +42,6 @@ def train(command: commands.Train) -> None:
     if command.versus_flat:
         if not command.json:  # now: the flat agent takes as long again
             print("\n".join(lines), flush=True)
-        hierarchy.flat_steps = None  # as many as the hierarchy
         flat = _trained(command, hierarchy, True, flat_out, baseline=True)
         result["flat"], more = _told(flat, command.evaluate)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])

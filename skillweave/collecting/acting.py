@@ -17,16 +17,16 @@ from skillweave.types import Array
 
 
 @dataclass(frozen=True)
-class Bouts:
+class ActionRepeat:
     """While one lasts, an environment takes one random action again and again.
 
-    Time is cut into spans of ``longest`` rows. In each, every environment has a chance of a bout,
-    which is as long as the span or shorter, and lies somewhere in it. The place of each bout
+    Time is cut into spans of ``longest`` rows. In each, every environment has a chance of a
+    repetition, which is as long as the span or shorter, and lies somewhere in it. The place of each
     follows from ``seeds`` and the row, so nothing needs to be kept between requests.
     """
 
     at: int  # the request's first row, counted from the start of the stage or generation
-    chance: float  # of a bout in a span
+    chance: float  # of a repetition in a span
     longest: int  # rows
     seeds: Seeds  # the same for all requests of a stage or generation
 
@@ -45,13 +45,15 @@ class Request:
     at_random: bool = False  # act at random instead
     greedy: bool = False  # do not explore
     parts: tuple[Request, ...] = ()  # the same of skills that learn below a selector
-    bouts: Bouts | None = None  # None: there are none
+    action_repeat: ActionRepeat | None = None  # None: there are none
 
     def of_collector(self, number: int) -> Request:
         """The same for one of several collectors."""
         parts = tuple(part.of_collector(number) for part in self.parts)
-        bouts = self.bouts and replace(self.bouts, seeds=self.bouts.seeds / number)
-        return replace(self, seeds=self.seeds / number, parts=parts, bouts=bouts)
+        action_repeat = self.action_repeat and replace(
+            self.action_repeat, seeds=self.action_repeat.seeds / number
+        )
+        return replace(self, seeds=self.seeds / number, parts=parts, action_repeat=action_repeat)
 
 
 @dataclass
@@ -65,10 +67,10 @@ class Acted:
 
 @dataclass(frozen=True)
 class _Span:
-    """The bouts of N environments in some rows, and what is done in them."""
+    """The repetitions of N environments in some rows, and the actions that they repeat."""
 
     key: tuple[Seeds, int]
-    chance: Array  # (N,), a bout takes place where it is below the request's
+    chance: Array  # (N,), a repetition takes place where it is below the request's
     first: Array  # (N,), its first row, counted from that of the span
     after: Array  # (N,), the row after the last one
     action: Array  # (N, …) in policy units
@@ -111,40 +113,46 @@ class Acting:
         at, self._at = self._at, self._at + 1
         acted = self._act(lambda stack: self._noises[stack][at], obs, mask, memory)
         request = self._request
-        if request.bouts is not None and not (request.at_random or request.greedy):
-            self._hold_actions(acted.action, request.bouts, request.bouts.at + at, mask)
+        if request.action_repeat is not None and not (request.at_random or request.greedy):
+            self._hold_actions(
+                acted.action, request.action_repeat, request.action_repeat.at + at, mask
+            )
         return acted
 
-    def _hold_actions(self, action: Array, bouts: Bouts, row: int, mask: Array | None) -> None:
-        """Replace what environments do (N, …) that are in a bout, in place."""
-        span, place = divmod(row, bouts.longest)
-        if self._span is None or self._span.key != (bouts.seeds, span):
-            self._span = self._drawn(bouts, span)
+    def _hold_actions(
+        self, action: Array, action_repeat: ActionRepeat, row: int, mask: Array | None
+    ) -> None:
+        """Replace what environments do (N, …) that repeat an action, in place."""
+        span, place = divmod(row, action_repeat.longest)
+        if self._span is None or self._span.key != (action_repeat.seeds, span):
+            self._span = self._drawn(action_repeat, span)
         drawn = self._span
-        now = (drawn.chance < bouts.chance) & (drawn.first <= place) & (place < drawn.after)
+        now = (drawn.chance < action_repeat.chance) & (drawn.first <= place) & (place < drawn.after)
         if mask is not None:
             now &= mask[np.arange(len(mask)), drawn.action]
         action[now] = drawn.action[now]
 
-    def _drawn(self, bouts: Bouts, span: int) -> _Span:
-        """The bouts of a span of rows."""
+    def _drawn(self, action_repeat: ActionRepeat, span: int) -> _Span:
+        """The repetitions of a span of rows."""
         times: list[Array] = []  # of each member: chances, first rows, rows after the last one
         actions: list[Array] = []
         for algorithm, count in self.stacks:
             first = len(times)
-            seeds = [bouts.seeds / span / "act" / (first + i) for i in range(count)]
+            seeds = [action_repeat.seeds / span / "act" / (first + i) for i in range(count)]
             for rng in (node.numpy() for node in seeds):
                 chance, length = (
                     rng.random(self.each),
-                    rng.integers(1, bouts.longest + 1, self.each),
+                    rng.integers(1, action_repeat.longest + 1, self.each),
                 )
-                begins = rng.integers(0, bouts.longest - length + 1)
+                begins = rng.integers(0, action_repeat.longest - length + 1)
                 times.append(np.stack([chance, begins, begins + length]))
             off_policy: Any = algorithm
             drawn = off_policy.random_actions([node.torch() for node in seeds], self.each, None)
             actions.append(_rows(drawn))
         chances, first_rows, after = np.concatenate(times, axis=1)
-        return _Span((bouts.seeds, span), chances, first_rows, after, np.concatenate(actions))
+        return _Span(
+            (action_repeat.seeds, span), chances, first_rows, after, np.concatenate(actions)
+        )
 
     @torch.inference_mode()
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:

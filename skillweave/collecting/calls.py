@@ -46,6 +46,8 @@ class SkillSet:
     """When the selector cuts a call; None: never."""
     reflexes_apart: bool = False
     """``act`` leaves reflexes to its caller, who asks ``override``."""
+    greedy_selector: bool = True
+    """The selector is greedy where its caller asks for deterministic actions; else it samples."""
 
     @property
     def lengths(self) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.ends import Why, judged, skill_step
-from skillweave.collecting.guide import Guide, tell_guide
+from skillweave.collecting.guide import ActiveGuide, tell_guide
 from skillweave.collecting.open_calls import Decisions, OpenCalls
 from skillweave.collecting.restored import ranges_of, ranges_of_guide
 from skillweave.envs.checks import LONGEST_EPISODE
@@ -36,7 +36,7 @@ class DecisionCollector(Collector):
         keep_rewards: of each call, keep the reward of every step, so that others may learn from it
             with a γ of their own.
         guide: a ready selector that is asked wherever they decide.
-        seen_as: the skill that all of it is, in another hierarchy: its reward and its ends count;
+        as_skill: the skill that all of it is, in another hierarchy: its reward and its ends count;
             None: the environment's.
     """
 
@@ -46,14 +46,14 @@ class DecisionCollector(Collector):
         acting: Acting | None,
         skills: SkillSet,
         keep_rewards: bool = False,
-        guide: Guide | None = None,
-        seen_as: Skill | None = None,
+        guide: ActiveGuide | None = None,
+        as_skill: Skill | None = None,
     ) -> None:
         super().__init__(engine, acting)
         n = self.num_envs
         self.skills, self.keep_rewards = skills, keep_rewards
-        self.guide, self.seen_as = guide, seen_as
-        self._watches = skills.watches or guide is not None or seen_as is not None
+        self.guide, self.as_skill = guide, as_skill
+        self._watches = skills.watches or guide is not None or as_skill is not None
         self._calls: Memory = skills.start(n)  # what the skills remember of each environment
         self._never = np.zeros(n, bool)
         self.kept |= prefixed("skills", self._calls)
@@ -68,7 +68,7 @@ class DecisionCollector(Collector):
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:
         """The same over other environments."""
         return DecisionCollector(
-            engine, acting, self.skills, self.keep_rewards, self.guide, self.seen_as
+            engine, acting, self.skills, self.keep_rewards, self.guide, self.as_skill
         )
 
     def _forget(self, ids: Array) -> None:
@@ -103,7 +103,7 @@ class DecisionCollector(Collector):
         raw = self.engine.step(action)
         seen = self._seen(obs, action, raw) if self._watches else None
         why = self.skills.observe(self._calls, self._all, seen)
-        counts = raw if self.seen_as is None else self._judged(self.seen_as, seen, raw, why)
+        counts = raw if self.as_skill is None else self._judged(self.as_skill, seen, raw, why)
         self._count(counts)
         ended = counts.terminated | counts.truncated
         why[ended] = Why.EPISODE

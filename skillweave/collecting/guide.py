@@ -65,7 +65,7 @@ class Ready(Protocol):
 
 
 @dataclass(frozen=True)
-class Guide:
+class ActiveGuide:
     """A ready selector that is asked wherever a selector decides.
 
     What it remembers stands under ``guide.<key>`` in the memories that it is given, with a row for
@@ -155,7 +155,7 @@ class Guide:
 
 
 def tell_guide(
-    guide: Guide, kept: Memory, skills: SkillSet, calls: Memory, step: Step, why: Array
+    guide: ActiveGuide, kept: Memory, skills: SkillSet, calls: Memory, step: Step, why: Array
 ) -> None:
     """Tell a collector's guide of a step of all environments, and how calls ended with it.
 

@@ -10,7 +10,7 @@ from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import as_wide
-from skillweave.collecting.guide import Guide, as_logits
+from skillweave.collecting.guide import ActiveGuide, as_logits
 from skillweave.collecting.restored import known
 from skillweave.experience import Experience
 from skillweave.types import Array, Memory
@@ -37,7 +37,7 @@ class OpenCalls:
         skills: SkillSet,
         memory_size: int,
         keep_rewards: bool = False,
-        guide: Guide | None = None,
+        guide: ActiveGuide | None = None,
         memory: Memory | None = None,
         prefix: str = "",
     ) -> None:

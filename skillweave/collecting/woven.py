@@ -11,7 +11,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.ends import ENDED, Why, judged, skill_step
-from skillweave.collecting.guide import Guide
+from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.levels import CRITIC, SELECTOR, Inside, Level, woven
 from skillweave.collecting.woven_rows import Rows
 from skillweave.envs.engine import Engine, RawStep
@@ -35,7 +35,7 @@ class WovenCollector(DecisionCollector):
         learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
             ``skill_critic`` and ``inner/skill_critic`` say what skills are worth.
         margins: by the paths of critics: calls are cut where deciding anew is worth so much more.
-        guide, seen_as: as of ``DecisionCollector``.
+        guide, as_skill: as of ``DecisionCollector``.
     """
 
     def __init__(
@@ -45,12 +45,12 @@ class WovenCollector(DecisionCollector):
         skills: SkillSet,
         learners: Mapping[str, Acting],
         margins: Mapping[str, float] | None = None,
-        guide: Guide | None = None,
-        seen_as: Skill | None = None,
+        guide: ActiveGuide | None = None,
+        as_skill: Skill | None = None,
     ) -> None:
         self.learners = dict(learners)
         acts = woven(skills, learners, margins or {})
-        super().__init__(engine, acting, acts, guide=guide, seen_as=seen_as)
+        super().__init__(engine, acting, acts, guide=guide, as_skill=as_skill)
         self._watches = True
         self.root = Level(self, self._calls, self.skills, learners)
         apart = any(x.skills.reflexes and x.skills.reflexes_apart for x in self.root.all())

@@ -241,7 +241,7 @@ class Evolution:
     start: Literal["config", "random"] = "config"
     """Members begin with the settings given, or with settings drawn from the ranges."""
     selection: Any = field(default_factory=Tournament)
-    """Tournament(), Truncation(), or your own: see ``Selection``."""
+    """Tournament(), Truncation(), or your own: see ``ParentSelection``."""
     mutations: Mutations = field(default_factory=Mutations)
     """What changes from parent to heir."""
 

@@ -32,10 +32,10 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
                 f"stage {name!r}: {' and '.join(entry['learns'])} learn together there, so it "
                 "cannot evolve; name the stages that are to: evolve={'a_skill': Evolution(...)}"
             )
-        if "guide_nats" in entry:
+        if "guide_kl" in entry:
             raise SkillweaveError(
-                f"stage {name!r}: guide_nats is given, and populations are not kept near a guide; "
-                "leave it out (guide_restricts works), or name other stages: evolve={...}"
+                f"stage {name!r}: the guide has a target_kl, and populations are not kept near a "
+                "guide; leave it out (restrict=True works), or name other stages: evolve={...}"
             )
         check_mutations(config_from_json(entry["algorithm"]), how, f"stage {name!r}: ")
         entry["evolution"] = evolution_to_json(how)

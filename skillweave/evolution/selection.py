@@ -19,7 +19,7 @@ class Heir:
     mutates: bool  # whether it may change; else it is the parent as it was
 
 
-class Selection(Protocol):
+class ParentSelection(Protocol):
     """How the next generation follows from this one's fitness; give your own to ``Evolution``."""
 
     def select(self, fitness: Array, rng: np.random.Generator) -> list[Heir]:

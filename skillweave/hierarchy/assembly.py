@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +20,7 @@ from skillweave.types import Policy
 def assembled(declared: Declaration, found: Mapping[str, Policy]) -> HierarchyPolicy:
     """The hierarchy of these policies, which are named by their paths."""
     skills = declared.skill_set([policy_of(s, found) for s in declared.skills])
-    if declared.interrupt:
+    if declared.together.interrupt:
         skills = with_interruption(skills, found[CRITIC], declared.together.margin)
     guide = restricting_guide(declared, found[SELECTOR].observation_space)
     return HierarchyPolicy(found[SELECTOR], skills, guide)
@@ -38,7 +37,7 @@ def can_act(skill: Skill, found: Mapping[str, Policy]) -> bool:
     if (inner := inner_of(skill)) is None:
         return skill.name in found
     own = below(found, skill.name)
-    needed = [SELECTOR, *([CRITIC] if inner.interrupt else [])]
+    needed = [SELECTOR, *([CRITIC] if inner.together.interrupt else [])]
     return all(name in own for name in needed) and all(can_act(s, own) for s in inner.skills)
 
 
@@ -55,5 +54,4 @@ def learning_set(declared: Declaration, found: Mapping[str, Policy]) -> SkillSet
         make = partial(HierarchyPolicy, guide=own_guide(inner))
         return Inner(learning_set(inner, own), selector, make)
 
-    skills = declared.skill_set([acts(s) for s in declared.skills])
-    return skills if declared.reflexes_in_training else replace(skills, reflexes=())
+    return declared.skill_set([acts(s) for s in declared.skills])

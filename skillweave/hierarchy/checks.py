@@ -6,11 +6,30 @@ from collections.abc import Collection, Sequence
 
 from skillweave.collecting.lengths import Lengths
 from skillweave.hierarchy.nesting import Nestable, inner_of
+from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.skills import Reflex, Skill, ready_policy
-from skillweave.training.plain_agent import check_algorithm
-from skillweave.training.stage import Target, target_of
+from skillweave.training.checks import check_algorithm
+from skillweave.training.defaults import TrainDefaults
+from skillweave.training.stage import Target, Together, target_of
 from skillweave.types import SkillweaveError
+
+GROUPS = {
+    "apart": (Apart, "Apart(skill_steps=100_000)"),
+    "together": (Together, "Together(task_weight=1.0)"),
+    "selection": (Selection, "Selection(call_cost=0.1)"),
+    "guide": (Guide, "Guide(automaton)"),
+    "train_defaults": (TrainDefaults, "TrainDefaults(eval_every=50_000)"),
+}
+"""By field of a hierarchy, the class of its group of settings, and an example."""
+
+
+def check_groups(declared: object) -> None:
+    """Raise a SkillweaveError where a group of settings is something else."""
+    for name, (kind, example) in GROUPS.items():
+        value = getattr(declared, name)
+        if not isinstance(value, kind) and not (name == "guide" and value is None):
+            raise SkillweaveError(f"{name} is {short(value)}; write {name}={example}")
 
 
 def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -14,36 +13,31 @@ from skillweave.algorithms.config import PPO, AlgorithmConfig
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
-from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
+from skillweave.hierarchy.budgets import budgets_of, scale_budgets
+from skillweave.hierarchy.checks import check_calls, check_groups, checked_reflexes, checked_skills
 from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted_selectors
 from skillweave.hierarchy.guidance import check_selection
 from skillweave.hierarchy.nesting import (
     Nestable,
     check_nested,
     every_skill,
-    inner_hierarchies,
     inner_of,
 )
+from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill
 from skillweave.spaces import action_codec, obs_codec
-from skillweave.training.plain_agent import (
-    AGENT,
-    PlainAgent,
-    check_algorithm,
-    check_env,
-    check_fields,
-)
-from skillweave.training.stage import CRITIC, SELECTOR, Together, target_of
+from skillweave.training.checks import check_algorithm, check_env, check_fields
+from skillweave.training.defaults import TrainDefaults
+from skillweave.training.plain_agent import AGENT, PlainAgent
+from skillweave.training.stage import CRITIC, SELECTOR, TOGETHER, Together, target_of
 from skillweave.types import Policy, SkillweaveError
 
-TOGETHER = "together"
-"""What the stage is named in which all learn together."""
-RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT, "flat")
-"""Names of stages that are not skills; "flat" in runs of older versions."""
+RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
+"""Names of stages that are not skills."""
 
 
 @dataclass
@@ -57,70 +51,35 @@ class Declaration(Nestable):
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     skills: Sequence[Skill]
-    """What the selector chooses from; a hierarchy among them is trained inside, where it learns
-    apart with its own budgets."""
+    """The skills that the selector chooses from; a hierarchy among them is trained inside."""
     call_steps: int | Lengths | None = 40
     """How long a skill acts before the selector decides again; None: until it stops by itself."""
-    learn: Literal["apart", "together", "apart, then together"] = "apart"
-    """Skills one by one, then the selector; or all from the same steps; or first so, then so."""
-    reflexes: Sequence[Reflex] = ()
-    """Rules that override the running skill's action."""
+    steps: int | None = None
+    """Training steps in all, split by ``learn``; None: 1,000,000. A budget that a skill, ``apart``
+    or ``together`` sets replaces that part and leaves the others as they are."""
+    learn: Literal["together", "apart", "apart, then together"] = "together"
+    """Train skills and selector from the same steps ("together"); or skills one by one, then the
+    selector ("apart"); or one after the other, half of the steps each. Where no skill learns, the
+    selector trains alone."""
     algorithm: AlgorithmConfig = field(default_factory=PPO)
     """Trains every skill that names none of its own."""
     selector: AlgorithmConfig | ReadyValue = field(default_factory=PPO)
     """Trains the selector; its γ is that of one environment step, and so its n_steps. Or a ready
     selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
-    guide: ReadyValue | None = None
-    """A ready selector that a trained one keeps to."""
-    guide_restricts: bool = True
-    """Only what the guide may choose is called, in training and afterwards."""
-    guide_nats: float | None = None
-    """How far from the guide the selector may be while it learns, in nats of KL; None: freely."""
-    skill_steps: int = 500_000
-    """Training budget of every skill that names none of its own."""
-    selector_steps: int = 1_000_000
-    """Training budget of the selector, in environment steps; a ready one takes none."""
-    start_calls: int | None = None
-    """While a skill trains apart, its episodes begin after up to this many calls of the skills that
-    can act already, a number drawn for each: it learns where it will be called. None: it starts as
-    soon as it may."""
-    search_steps: int | None = None
-    """While a skill trains apart, an episode begins anew in which it may not start within so many
-    steps: for environments of several kinds, where some have nothing for it. None: it goes on."""
-    episode_calls: int = 1
-    """The most calls of a skill in an episode, while it trains apart. After one that reached its
-    ``max_steps`` others are called if ``start_calls`` says so, then the skill again, if it may
-    start. 1: each call begins with a reset. Evaluations count an episode's first call."""
-    together_steps: int = 1_000_000
-    """Training budget of learning together, in environment steps."""
-    call_cost: float = 0.0
-    """What the selector pays for each decision while it learns, in units of reward, so that calls
-    which change nothing are worth less. More than the discounted reward makes long calls best."""
-    interrupt: bool = False
-    """The selector cuts a call where deciding anew is worth clearly more (``Together.margin``)."""
+    reflexes: Sequence[Reflex] = ()
+    """Rules that override the running skill's action, also while skills train."""
+    apart: Apart = field(default_factory=Apart)
+    """Settings of learning apart: budgets, and where skills start."""
     together: Together = field(default_factory=Together)
-    """How skills and selector learn together."""
-    selector_target_return: float | None = None
-    """The selector's stage ends early at this mean return of the periodic evaluation."""
-    flat: AlgorithmConfig | None = None
-    """Trains the flat baseline; None: as ``algorithm``, which then sees the whole observation."""
-    flat_steps: int | None = None
-    """Training budget of the flat baseline; None: as many steps as the whole hierarchy takes."""
-    greedy_skills: bool | None = None
-    """True: skills act greedily under the selector. False: they sample, as they do where they learn
-    together. None: they are greedy where they learn apart; where they learn together, 100 episodes
-    of each kind are played at the end, and the better is kept."""
-    reflexes_in_training: bool = True
-    """Reflexes are in force while skills train, apart or together: the body they will have."""
-    cut_every: int = 100_000
-    """Environment steps between checkpoints."""
-    eval_every: int | None = None
-    """Environment steps between evaluations of who trains, by its own reward; None: none. They are
-    ``eval_return`` and ``eval_success`` in ``metrics.jsonl``."""
-    eval_episodes: int = 20
-    """Episodes of each of these evaluations."""
+    """Settings of learning together: budget, the task's weight, interruption, exploration."""
+    selection: Selection = field(default_factory=Selection)
+    """Settings of how the selector chooses: cost of a call, greedy or sampling."""
+    guide: Guide | None = None
+    """A ready selector that guides one that learns."""
+    train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
+    """Values for arguments of ``train`` that its caller leaves out."""
     name: str = "hierarchy"
-    """What it is named where it is a skill of another hierarchy."""
+    """Its name where it is a skill of another hierarchy."""
     recorded = False
     """It is of a run that was loaded without its code, and knows less than was declared."""
 
@@ -128,22 +87,13 @@ class Declaration(Nestable):
         check_env(self.env)
         self.skills = checked_skills(self.skills, RESERVED)
         self.reflexes = checked_reflexes(self.reflexes)
-        for name in ("algorithm", "flat"):
-            check_algorithm(getattr(self, name), name, optional=name == "flat")
+        check_algorithm(self.algorithm, "algorithm")
+        check_groups(self)
         check_selection(self)
-        target_of(self.selector_target_return, None, "selector", "selector_target")
+        target_of(self.selection.target_return, None, "selector")
         check_fields(self)
         check_calls(self.call_steps, self.skills)
         check_nested(self)
-        cost: Any = self.call_cost
-        if isinstance(cost, bool) or not isinstance(cost, int | float) or not 0 <= cost < math.inf:
-            raise SkillweaveError(
-                f"call_cost is {short(cost)}; it must be a number of at least 0, in units of reward"
-            )
-        if not isinstance(self.together, Together):
-            raise SkillweaveError(
-                f"together is {short(self.together)}; write together=Together(task_weight=1.0)"
-            )
 
     @property
     def spec(self) -> EnvSpec:
@@ -176,11 +126,9 @@ class Declaration(Nestable):
             raise SkillweaveError(f"no skill {short(name)}; there are: {', '.join(found)}")
         return found[name]
 
-    def budget(self, skill: Skill) -> int:
-        """Training steps of a ``skill``, of a hierarchy all; 0 where its policy is ready."""
-        if (inner := inner_of(skill)) is not None:
-            return inner.total_steps
-        return 0 if skill.policy is not None else skill.steps or self.skill_steps
+    def budgets(self) -> dict[str, int]:
+        """Training steps of each stage, by its path."""
+        return budgets_of(self)
 
     @property
     def choices(self) -> int:
@@ -200,19 +148,25 @@ class Declaration(Nestable):
     @property
     def total_steps(self) -> int:
         """All training steps of skills and selector: the flat baseline's budget."""
-        selector = self.selector_steps if self.ready_selector is None else 0
-        apart = sum(self.budget(s) for s in self.skills) + selector
-        return (apart if self.learns_apart else 0) + (self.together_steps if self.weaves else 0)
+        return sum(self.budgets().values())
+
+    @property
+    def any_skill_learns(self) -> bool:
+        """Whether a skill learns, or where it is a hierarchy, anyone in it."""
+        inner = (inner_of(s) for s in self.skills)
+        return any(s.policy is None for s in self.skills) or any(
+            h is not None and (h.ready_selector is None or h.any_skill_learns) for h in inner
+        )
 
     @property
     def learns_apart(self) -> bool:
         """Whether there are stages in which one learns by itself."""
-        return self.learn != "together"
+        return self.learn != "together" or not self.any_skill_learns
 
     @property
-    def weaves(self) -> bool:
+    def learns_together(self) -> bool:
         """Whether there is a stage in which all learn together."""
-        return self.learn != "apart"
+        return self.learn != "apart" and self.any_skill_learns
 
     def scale(self, factor: float) -> None:
         """Multiply every training budget by ``factor``, in place.
@@ -222,32 +176,23 @@ class Declaration(Nestable):
         """
         if not 0.0 < factor < float("inf"):
             raise SkillweaveError(f"scale is {factor}; it must be positive and finite")
-        for _, inner in inner_hierarchies(self.skills):
-            inner.scale(factor)
-        for skill in self.skills:
-            if skill.steps is not None:
-                skill.steps = max(1, round(skill.steps * factor))
-        self.skill_steps = max(1, round(self.skill_steps * factor))
-        self.selector_steps = max(1, round(self.selector_steps * factor))
-        self.together_steps = max(1, round(self.together_steps * factor))
-        if self.flat_steps is not None:
-            self.flat_steps = max(1, round(self.flat_steps * factor))
+        scale_budgets(self, factor)
 
-    def plain_agent(self) -> PlainAgent:
-        """The flat baseline: one agent on the task itself, without skills and reflexes."""
-        if not (self.flat_steps or self.total_steps):
+    def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> PlainAgent:
+        """Return the flat baseline: one agent on the task itself, without skills and reflexes.
+
+        Args:
+            algorithm: its settings; None: those of ``train_defaults``, or of the skills.
+        """
+        check_algorithm(algorithm, "flat", optional=True)
+        steps = self.total_steps or self.steps
+        if not steps:
             raise SkillweaveError(
-                "nothing of this hierarchy is trained, so the flat baseline has no budget: give "
-                "flat_steps"
+                "nothing of this hierarchy is trained, so the flat baseline has no budget: set "
+                "steps"
             )
-        return PlainAgent(
-            self.env,
-            self.flat or seeing_all(self.algorithm),
-            self.flat_steps or self.total_steps,
-            cut_every=self.cut_every,
-            eval_every=self.eval_every,
-            eval_episodes=self.eval_episodes,
-        )
+        config = algorithm or self.train_defaults.flat or seeing_all(self.algorithm)
+        return PlainAgent(self.env, config, steps)
 
     def skill_set(
         self, policies: Sequence[Policy], skills: Sequence[Skill] | None = None
@@ -258,8 +203,9 @@ class Declaration(Nestable):
             tuple(policies),
             tuple(self.reflexes),
             self.call_steps,
-            self.greedy_skills is not False,
-            self.call_cost,
+            self.selection.greedy_skills is not False,
+            self.selection.call_cost,
+            greedy_selector=self.selection.greedy_selector is not False,
         )
 
     def check_spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:

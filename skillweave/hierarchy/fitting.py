@@ -11,7 +11,7 @@ from skillweave.hierarchy.guidance import fitted_guide
 from skillweave.hierarchy.nesting import every_skill, inner_hierarchies, inner_of
 from skillweave.skills import path_of, ready_policy
 from skillweave.skills.foreign_policy import fitted
-from skillweave.training.plain_agent import check_rollout
+from skillweave.training.checks import check_rollout
 from skillweave.training.stage import SELECTOR
 from skillweave.types import Policy
 
@@ -33,10 +33,10 @@ def check_settings(declared: Declaration, env: gym.Env[Any, Any], path: str = ""
     if isinstance(declared.selector, AlgorithmConfig):
         choices = gym.spaces.Discrete(declared.choices)
         check_spaces(declared.selector, choices, f"{path}{SELECTOR}: ")
-    if declared.flat is not None:
-        check_spaces(declared.flat, space, "flat: ")
+    if declared.train_defaults.flat is not None:
+        check_spaces(declared.train_defaults.flat, space, "flat: ")
     own = (s.algorithm for s in declared.skills)
-    for config in (declared.algorithm, declared.selector, declared.flat, *own):
+    for config in (declared.algorithm, declared.selector, declared.train_defaults.flat, *own):
         if isinstance(config, AlgorithmConfig):
             check_rollout(config, env.observation_space)
     for reflex in declared.reflexes:

@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 
 from skillweave.algorithms.config import PPO
-from skillweave.collecting.guide import Guide
+from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
-from skillweave.hierarchy.nesting import inner_of
 from skillweave.messages import short
 from skillweave.selectors import Automaton, ReadySelector, ready_selector
-from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import fitted, source_of
-from skillweave.training.plain_agent import check_algorithm
+from skillweave.training.checks import check_algorithm
 from skillweave.training.stage import SELECTOR
 from skillweave.types import SkillweaveError
 
@@ -36,62 +34,38 @@ def check_selection(declared: Declaration) -> None:
         check_algorithm(declared.selector, "selector", also="function, Automaton or tree")
         if declared.guide is not None:
             _check_guide(declared)
-        elif declared.guide_nats is not None:
-            raise SkillweaveError(
-                f"guide_nats is {short(declared.guide_nats)}, but there is no guide to stay near: "
-                "give one (guide=), or leave guide_nats out"
-            )
         return
     refused = {
-        "selector_target_return is given": declared.selector_target_return is not None,
-        "interrupt is True": declared.interrupt,
+        "selection.target_return is given": declared.selection.target_return is not None,
+        "together.interrupt is True": declared.together.interrupt,
         "call_steps are Lengths": isinstance(declared.call_steps, Lengths),
         "a guide is given": declared.guide is not None,
     }
     for what, asked in refused.items():
         if asked:
             raise SkillweaveError(f"{what}, but the selector is ready: it does not learn")
-    if declared.weaves and not any(_learns(s) for s in declared.skills):
-        raise SkillweaveError(
-            f"learn is {declared.learn!r}, but the selector and all skills are ready: nobody "
-            "learns. Leave out learn, or give a selector that learns: selector=PPO()"
-        )
-
-
-def _learns(skill: Skill) -> bool:
-    """Whether a skill learns, or where it is a hierarchy, anyone in it."""
-    if (inner := inner_of(skill)) is None:
-        return skill.policy is None
-    return inner.ready_selector is None or any(_learns(s) for s in inner.skills)
 
 
 def _check_guide(declared: Declaration) -> None:
     """Raise a SkillweaveError where a guide could not guide."""
-    nats: Any = declared.guide_nats
+    guide = declared.guide
+    assert guide is not None
     if ready_guide(declared) is None:
         raise SkillweaveError(
-            f"guide is {short(declared.guide)}; it must be a function of observations, an "
-            "Automaton or a tree"
+            f"Guide: selector is {short(guide.selector)}; it must be a function of observations, "
+            "an Automaton or a tree"
         )
-    if nats is not None and (isinstance(nats, bool) or not isinstance(nats, int | float)):
-        raise SkillweaveError(f"guide_nats is {short(nats)}; it must be a number, or None")
-    if nats is not None and not 0.0 < nats < float("inf"):
-        raise SkillweaveError(f"guide_nats is {short(nats)}; it must be positive and finite")
-    if nats is not None and not isinstance(declared.selector, PPO):
+    if guide.target_kl is not None and not isinstance(declared.selector, PPO):
         raise SkillweaveError(
-            f"guide_nats is {nats:g}, but the selector learns by "
+            f"the guide's target_kl is {guide.target_kl:g}, but the selector learns by "
             f"{type(declared.selector).__name__}: only PPO can be kept near a guide"
         )
-    if nats is None and not declared.guide_restricts:
-        raise SkillweaveError(
-            "the guide has no effect: guide_restricts is False, and guide_nats is None"
-        )
-    if not declared.guide_restricts or isinstance(declared.guide, Automaton):
+    if not guide.restrict or isinstance(guide.selector, Automaton):
         pass
     elif not isinstance(declared.call_steps, Lengths):
         raise SkillweaveError(
             "the guide names one skill at each decision, so a selector that it restricts has "
-            "nothing to choose: write guide_restricts=False and guide_nats=0.1, or let the "
+            "nothing to choose: write Guide(..., restrict=False, target_kl=0.1), or let the "
             "selector choose lengths, or give an Automaton whose states have several skills"
         )
     elif not isinstance(declared.selector, PPO):
@@ -99,21 +73,23 @@ def _check_guide(declared: Declaration) -> None:
             f"a selector that learns by {type(declared.selector).__name__} asks what may be called "
             "next, which a function or a tree says only at decisions: give an Automaton, or PPO"
         )
-    if declared.guide_restricts and declared.interrupt:
+    if guide.restrict and declared.together.interrupt:
         raise SkillweaveError(
-            "interrupt is True, but the guide restricts which skill may be called instead: give "
-            "one of them"
+            "together.interrupt is True, but the guide restricts which skill may be called "
+            "instead: give one of them"
         )
 
 
 def ready_guide(declared: Declaration) -> ReadySelector | None:
     """The guide, among the skills of the hierarchy; None: there is none."""
-    return ready_selector(declared.guide, tuple(s.name for s in declared.skills))
+    if declared.guide is None:
+        return None
+    return ready_selector(declared.guide.selector, tuple(s.name for s in declared.skills))
 
 
 def fitted_guide(
     declared: Declaration, observation_space: gym.Space[Any], path: str = ""
-) -> Guide | None:
+) -> ActiveGuide | None:
     """The guide of a selector that learns, on these observations; None: there is none.
 
     Args:
@@ -126,19 +102,20 @@ def fitted_guide(
         return None
     choices = gym.spaces.Discrete(len(declared.skills))
     own = fitted(found, observation_space, choices, f"{path}guide", declared.spec.name)
-    tells = declared.guide_nats is not None
-    return Guide(cast(ReadySelector, own), declared.guide_restricts, tells)
+    assert declared.guide is not None
+    tells = declared.guide.target_kl is not None
+    return ActiveGuide(cast(ReadySelector, own), declared.guide.restrict, tells)
 
 
 def restricting_guide(
     declared: Declaration, observation_space: gym.Space[Any], path: str = ""
-) -> Guide | None:
+) -> ActiveGuide | None:
     """The guide that a selector keeps to after it has learnt; None: there is none."""
     guide = fitted_guide(declared, observation_space, path)
     return replace(guide, tells=False) if guide is not None and guide.restricts else None
 
 
-def own_guide(declared: Declaration) -> Guide | None:
+def own_guide(declared: Declaration) -> ActiveGuide | None:
     """The guide of a selector that learns; None: there is none."""
     if declared.guide is None:
         return None
@@ -149,22 +126,22 @@ def own_guide(declared: Declaration) -> Guide | None:
         env.close()
 
 
-def who_guides(declared: Declaration) -> Guide | None:
+def who_guides(declared: Declaration) -> ActiveGuide | None:
     """Who is asked while the selector learns, or instead of it; None: nobody."""
     if declared.ready_selector is None:
         return own_guide(declared)
     ready = declared.ready_selectors()[SELECTOR]
-    return Guide(cast(ReadySelector, ready), decides=True)
+    return ActiveGuide(cast(ReadySelector, ready), decides=True)
 
 
 def guide_entry(declared: Declaration) -> dict[str, Any]:
     """What a run says of the guide of a trained selector; nothing where there is none."""
-    if (guide := ready_guide(declared)) is None:
+    if declared.guide is None or (guide := ready_guide(declared)) is None:
         return {}
     return {
         "guide": source_of(guide),
-        "guide_restricts": declared.guide_restricts,
-        "guide_nats": declared.guide_nats,
+        "guide_restrict": declared.guide.restrict,
+        "guide_kl": declared.guide.target_kl,
     }
 
 
@@ -175,8 +152,10 @@ def adopt_guide(declared: Declaration, told: Mapping[str, Any], where: str) -> N
         SkillweaveError: of the run and the hierarchy one has a guide, and the other has none.
     """
     check_guided(declared.guide is not None, "guide" in told, where)
-    declared.guide_restricts = told.get("guide_restricts", True)
-    declared.guide_nats = told.get("guide_nats")
+    if declared.guide is not None:
+        declared.guide = replace(
+            declared.guide, restrict=told["guide_restrict"], target_kl=told["guide_kl"]
+        )
 
 
 def check_guided(mine: bool, theirs: bool, where: str) -> None:

@@ -22,9 +22,9 @@ T = TypeVar("T")
 D = TypeVar("D", bound="Declaration")
 _ELSEWHERE = {
     "algorithm": "selector=",
-    "steps": "selector_steps= and skill_steps=",
-    "target_return": "selector_target_return=",
-    "target_success": "selector_target_return=",
+    "steps": "steps=",
+    "target_return": "selection=Selection(target_return=...)",
+    "target_success": "selection=Selection(target_return=...)",
 }
 """What of a skill a hierarchy says by itself, and where."""
 _ATTRIBUTES = ("call_steps", "max_steps", "color")

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from skillweave.collecting.calls import Interruption, SkillSet, Why
-from skillweave.collecting.guide import Guide
+from skillweave.collecting.guide import ActiveGuide
 from skillweave.selectors import LastCall, ReadySelector
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
@@ -31,7 +31,9 @@ class HierarchyPolicy:
         guide: a ready selector that restricts what the selector may choose.
     """
 
-    def __init__(self, selector: Policy, skills: SkillSet, guide: Guide | None = None) -> None:
+    def __init__(
+        self, selector: Policy, skills: SkillSet, guide: ActiveGuide | None = None
+    ) -> None:
         self.selector, self.skills, self.guide = selector, skills, guide
         self.observation_space = selector.observation_space
         self.action_space = skills.policies[0].action_space
@@ -53,7 +55,8 @@ class HierarchyPolicy:
             acts.append([cuts.margin, source_of(cuts.critic).get("sha256")])
         if self.guide is not None:
             acts.append(["guide", source_of(cast(Policy, self.guide.selector)).get("sha256")])
-        whole = json.dumps([acts, skills, reflexes, told.lengths or told.call_steps, told.greedy])
+        greedy = [told.greedy, told.greedy_selector]
+        whole = json.dumps([acts, skills, reflexes, told.lengths or told.call_steps, *greedy])
         return {"sha256": checksum(whole.encode())}
 
     def start(self, n: int) -> Memory:
@@ -78,8 +81,10 @@ class HierarchyPolicy:
 
         ``memory`` is of n environments; ``rng`` is the source of chance, where it samples.
 
-        ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills.
+        ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills. A selector
+        that was kept because it samples (``SkillSet.greedy_selector``) samples in any case.
         """
+        deterministic = deterministic and self.skills.greedy_selector
         memory = {k: v.copy() for k, v in memory.items()}
         rows = np.flatnonzero(memory["why"] != Why.RUNNING)
         if len(rows):

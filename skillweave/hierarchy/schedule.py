@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
 from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
 from skillweave.hierarchy.checks import check_target
-from skillweave.hierarchy.declaration import TOGETHER, Declaration
+from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import who_guides
-from skillweave.hierarchy.nesting import every_hierarchy, inner_hierarchies, inner_of
+from skillweave.hierarchy.nesting import below, every_hierarchy, inner_hierarchies, inner_of
 from skillweave.skills import Skill
 from skillweave.training.scene import (
     Scene,
@@ -19,62 +20,83 @@ from skillweave.training.scene import (
     skill_scene,
     woven_scene,
 )
-from skillweave.training.stage import CRITIC, SELECTOR, Policies, Stage, Together, target_of
+from skillweave.training.stage import (
+    CRITIC,
+    SELECTOR,
+    TOGETHER,
+    Policies,
+    Stage,
+    Together,
+    decides,
+    target_of,
+)
 from skillweave.types import SkillweaveError
 
 
-def stages_of(declaration: Declaration, seen_as: Skill | None = None) -> list[Stage]:
-    """Who learns when: all in hierarchies below, skills apart, then the selector; then together.
+def stages_of(
+    declaration: Declaration,
+    as_skill: Skill | None = None,
+    budgets: Mapping[str, int] | None = None,
+) -> list[Stage]:
+    """Return all stages in their order: hierarchies below, skills, selector, all together.
 
     Args:
-        seen_as: the skill that the hierarchy is, of another one; None: it is none.
+        as_skill: the skill that the hierarchy is, of another one; None: it is the outermost.
+        budgets: training steps by stage; None: the hierarchy's own.
     """
+    budgets = declaration.budgets() if budgets is None else budgets
     found = []
     if declaration.learns_apart:
         for skill, inner in inner_hierarchies(declaration.skills):
-            found += [stage.inside(skill.name) for stage in stages_of(inner, skill)]
-    return found + own_stages(declaration, seen_as)
+            stages = stages_of(inner, skill, below(budgets, skill.name))
+            found += [stage.inside(skill.name) for stage in stages]
+    return found + own_stages(declaration, as_skill, budgets)
 
 
-def own_stages(declaration: Declaration, seen_as: Skill | None = None) -> list[Stage]:
-    """The same without those of hierarchies below."""
-    apart = _apart(declaration, seen_as) if declaration.learns_apart else []
-    if not declaration.weaves:
+def own_stages(
+    declaration: Declaration,
+    as_skill: Skill | None = None,
+    budgets: Mapping[str, int] | None = None,
+) -> list[Stage]:
+    """Return the stages of a hierarchy without those of hierarchies below."""
+    budgets = declaration.budgets() if budgets is None else budgets
+    apart = _apart(declaration, as_skill, budgets) if declaration.learns_apart else []
+    if not declaration.learns_together:
         return apart
-    together = _together(declaration, seen_as)
-    if seen_as is None or _plays_alone(declaration):  # else no episode can tell
-        left = any(own.greedy_skills is None for _, own in every_hierarchy(declaration))
+    together = _together(declaration, as_skill, budgets[TOGETHER])
+    if as_skill is None or _plays_alone(declaration):  # else its episodes cannot be evaluated
+        choices = (own.selection for _, own in every_hierarchy(declaration))
+        left = any(None in (c.greedy_skills, c.greedy_selector) for c in choices)
         together = replace(together, compared=bool(apart), greedy_judged=left)
     return [*apart, together]
 
 
-def _together(declaration: Declaration, seen_as: Skill | None) -> Stage:
-    """The stage in which skills and selectors learn from the same steps."""
+def _together(declaration: Declaration, as_skill: Skill | None, budget: int) -> Stage:
+    """Return the stage in which skills and selectors learn from the same steps."""
     how = declaration.together
 
     def scene(policies: Policies) -> WovenScene:
         skills, guide = learning_set(declaration, policies), who_guides(declaration)
-        margins, nats = _margins(declaration), _nats(declaration)
-        return woven_scene(declaration.spec, skills, guide, seen_as, margins, nats)
+        margins, guide_kl = _margins(declaration), _guide_kl(declaration)
+        return woven_scene(declaration.spec, skills, guide, as_skill, margins, guide_kl)
 
     ready = declaration.ready_selector is not None
-    config = declaration.algorithm if ready else _with_floor(declaration.selector, how)
-    beside = _learners(declaration, how)
-    if how.task_weight or declaration.interrupt:
-        beside |= _critic(config, declaration.interrupt)
-    target = target_of(declaration.selector_target_return, None, TOGETHER)
+    config = declaration.algorithm if ready else _with_epsilon(declaration.selector, how)
+    beside, weights = _learners(declaration, how), _task_weights(declaration)
+    if how.interrupt or any(weights.get(k, how.task_weight) for k in beside if not decides(k)):
+        beside |= _critic(config, how.interrupt)
     return Stage(
         TOGETHER,
         "together",
         config,
-        declaration.together_steps,
+        budget,
         scene,
-        target,
-        beside,
-        how,
-        declaration.interrupt,
-        ready,
-        declaration.guide_nats,
+        target=target_of(declaration.selection.target_return, None, TOGETHER),
+        beside=beside,
+        together=how,
+        task_weights=weights,
+        ready=ready,
+        guide_kl=None if declaration.guide is None else declaration.guide.target_kl,
     )
 
 
@@ -98,9 +120,22 @@ def _learners(declaration: Declaration, how: Together) -> dict[str, AlgorithmCon
         own = _learners(inner, how)
         selects: Any = inner.algorithm
         if isinstance(inner.selector, AlgorithmConfig):
-            own[SELECTOR] = selects = _with_floor(inner.selector, how)
-        own |= _critic(selects, deciding=True) if inner.interrupt else {}
+            own[SELECTOR] = selects = _with_epsilon(inner.selector, how)
+        own |= _critic(selects, deciding=True) if inner.together.interrupt else {}
         found |= {f"{skill.name}/{name}": config for name, config in own.items()}
+    return found
+
+
+def _task_weights(declaration: Declaration, inherited: float | None = None) -> dict[str, float]:
+    """Return the task's weight of skills that set one, or are in a hierarchy that does, by path."""
+    found: dict[str, float] = {}
+    for skill in declaration.skills:
+        weight = inherited if skill.task_weight is None else skill.task_weight
+        if (inner := inner_of(skill)) is not None:
+            below_it = _task_weights(inner, weight)
+            found |= {f"{skill.name}/{name}": value for name, value in below_it.items()}
+        elif weight is not None and skill.policy is None:
+            found[skill.name] = weight
     return found
 
 
@@ -108,35 +143,36 @@ def _margins(declaration: Declaration) -> dict[str, float]:
     """By the paths of critics in hierarchies below, where calls are cut there."""
     found: dict[str, float] = {}
     for skill, inner in inner_hierarchies(declaration.skills):
-        own = ({CRITIC: inner.together.margin} if inner.interrupt else {}) | _margins(inner)
+        how = inner.together
+        own = ({CRITIC: how.margin} if how.interrupt else {}) | _margins(inner)
         found |= {f"{skill.name}/{name}": margin for name, margin in own.items()}
     return found
 
 
-def _nats(declaration: Declaration) -> dict[str, float]:
-    """By the paths of selectors in hierarchies below, how far they may be from their guides."""
+def _guide_kl(declaration: Declaration) -> dict[str, float]:
+    """By the paths of selectors in hierarchies below, the KL within which they stay of guides."""
     found: dict[str, float] = {}
     for skill, inner in inner_hierarchies(declaration.skills):
-        own = _nats(inner)
-        if inner.guide_nats is not None:
-            own[SELECTOR] = inner.guide_nats
-        found |= {f"{skill.name}/{name}": nats for name, nats in own.items()}
+        own = _guide_kl(inner)
+        if inner.guide is not None and inner.guide.target_kl is not None:
+            own[SELECTOR] = inner.guide.target_kl
+        found |= {f"{skill.name}/{name}": kl for name, kl in own.items()}
     return found
 
 
-def _with_floor(config: Any, how: Together) -> Any:
-    """A selector's settings, with the floor of learning together where it names none."""
-    if not isinstance(config, PPO) or config.floor:
+def _with_epsilon(config: Any, how: Together) -> Any:
+    """A selector's settings, with the epsilon of learning together where it names none."""
+    if not isinstance(config, PPO) or config.epsilon:
         return config
-    usual, falls = PPO(), ("floor_final", "floor_fraction")
+    usual, falls = PPO(), ("epsilon_final", "epsilon_fraction")
     for name in falls:
         if getattr(config, name) != getattr(usual, name):
             raise SkillweaveError(
-                f"selector.{name} is {getattr(config, name)}, but it has no floor of its own, and "
-                f"one that learns together has that of Together: set together.{name}, or "
-                "selector.floor, too"
+                f"selector.{name} is {getattr(config, name)}, but selector.epsilon is 0, and "
+                f"a selector that learns together then uses Together's: set together.{name}, or "
+                "selector.epsilon, too"
             )
-    return replace(config, **{name: getattr(how, name) for name in ("floor", *falls)})
+    return replace(config, **{name: getattr(how, name) for name in ("epsilon", *falls)})
 
 
 def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
@@ -144,8 +180,8 @@ def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
     shared = {f: getattr(own, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(own, PPO):
         same = (
-            "n_steps", "gae_lambda", "network", "overlap", "floor", "floor_final",
-            "floor_fraction", "min_advantage_std",
+            "n_steps", "gae_lambda", "network", "overlap", "epsilon", "epsilon_final",
+            "epsilon_fraction", "min_advantage_std",
         )  # fmt: skip
         shared |= {f: getattr(own, f) for f in same}
     if "network" in shared:  # the critic remembers nothing
@@ -153,12 +189,14 @@ def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
     return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs, deciding=deciding)}
 
 
-def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
-    """The skills that are to be trained, each apart, then the selector if it is not ready."""
-    reflexes = declaration.reflexes if declaration.reflexes_in_training else ()
+def _apart(
+    declaration: Declaration, as_skill: Skill | None, budgets: Mapping[str, int]
+) -> list[Stage]:
+    """Return the stages of skills that train, each apart, then of the selector if it does."""
+    search = declaration.apart
 
     def skill_stage(skill: Skill) -> Stage:
-        config, budget = skill.algorithm or declaration.algorithm, declaration.budget(skill)
+        config, budget = skill.algorithm or declaration.algorithm, budgets[skill.name]
         target = check_target(skill)
 
         def scene(policies: Policies) -> Scene:
@@ -168,11 +206,11 @@ def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
             return skill_scene(
                 declaration.spec,
                 skill,
-                reflexes,
+                declaration.reflexes,
                 led_by,
-                declaration.start_calls or 0,
-                declaration.search_steps,
-                declaration.episode_calls,
+                search.start_calls or 0,
+                search.search_steps,
+                search.episode_calls,
             )
 
         return Stage(skill.name, "skill", config, budget, scene, target)
@@ -180,18 +218,22 @@ def _apart(declaration: Declaration, seen_as: Skill | None) -> list[Stage]:
     def calls(policies: Policies) -> Scene:
         skills = declaration.skill_set([policy_of(s, policies) for s in declaration.skills])
         guide = who_guides(declaration)
-        if declaration.interrupt:
-            return woven_scene(declaration.spec, skills, guide, seen_as)
-        return selector_scene(declaration.spec, skills, guide, seen_as)
+        if declaration.together.interrupt:
+            return woven_scene(declaration.spec, skills, guide, as_skill)
+        return selector_scene(declaration.spec, skills, guide, as_skill)
 
     first = [skill_stage(s) for s in declaration.skills if s.policy is None]
     if not isinstance(config := declaration.selector, AlgorithmConfig):
         return first
-    budget = declaration.selector_steps
-    target = target_of(declaration.selector_target_return, None, SELECTOR)
-    nats = declaration.guide_nats
-    last = Stage(SELECTOR, "selector", config, budget, calls, target, guide_nats=nats)
-    if declaration.interrupt:
-        how, beside = declaration.together, _critic(config, deciding=True)
-        last = replace(last, beside=beside, together=how, interrupt=True)
+    last = Stage(
+        SELECTOR,
+        "selector",
+        config,
+        budgets[SELECTOR],
+        calls,
+        target_of(declaration.selection.target_return, None, SELECTOR),
+        guide_kl=None if declaration.guide is None else declaration.guide.target_kl,
+    )
+    if declaration.together.interrupt:
+        last = replace(last, beside=_critic(config, deciding=True), together=declaration.together)
     return [*first, last]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.collecting.lengths import calls_to_json
 from skillweave.hierarchy.assembly import assembled, can_act
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import guide_entry, ready_guide
-from skillweave.hierarchy.judging import judged, settled
 from skillweave.hierarchy.nesting import (
     check_nested,
     every_hierarchy,
@@ -17,14 +17,15 @@ from skillweave.hierarchy.nesting import (
     inner_of,
 )
 from skillweave.hierarchy.schedule import own_stages, stages_of
+from skillweave.hierarchy.select_best import select_best, settled
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.command_words import command_words
 from skillweave.runs.copies import keep_policy, recorded_policy
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import UNSAID
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
+from skillweave.training.defaults import TrainDefaults
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.training.stage import SELECTOR, Policies
 from skillweave.training.stage_log import Listener
@@ -34,24 +35,36 @@ from skillweave.training.woven import agents_of
 from skillweave.types import Policy, SkillweaveError
 
 
-def manifest(declaration: Declaration, *, seed: int, flat: bool) -> dict[str, Any]:
-    """What a new run's ``run.json`` says."""
-    if flat:
-        return declaration.plain_agent().manifest(seed)
+def manifest(
+    declaration: Declaration,
+    *,
+    seed: int,
+    flat: bool | AlgorithmConfig = False,
+    how: TrainDefaults | None = None,
+) -> dict[str, Any]:
+    """Return the content of a new run's ``run.json``.
+
+    Args:
+        flat: of the flat baseline: with its own settings, or with these.
+        how: evaluation and checkpoints; None: the declaration's defaults.
+    """
+    how = how or declaration.train_defaults
+    if flat is not False:
+        return declaration.plain_agent(None if flat is True else flat).manifest(seed, how)
     check_nested(declaration)
     return {
         "kind": "hierarchy",
         "env": declaration.spec.name,
         "env_kwargs": declaration.spec.kwargs,
         "seed": seed,
-        "cut_every": declaration.cut_every,
-        "eval_every": declaration.eval_every,
-        "eval_episodes": declaration.eval_episodes,
+        "checkpoint_every": how.checkpoint_every,
+        "eval_every": how.eval_every,
+        "eval_episodes": how.eval_episodes,
         "skills": [
-            _skill_entry(path, s, woven=_is_woven(declaration, path))
+            _skill_entry(path, s, together=_learns_together(declaration, path))
             for path, s in every_skill(declaration.skills)
         ],
-        **_hierarchy_entry(declaration, woven=declaration.weaves),
+        **_hierarchy_entry(declaration, together=declaration.learns_together),
         "resume_needs_recipe": not declaration.trains_from_data,
         "needs_recipe": not declaration.is_data,
         "stages": [stage.entry() for stage in stages_of(declaration)],
@@ -68,7 +81,7 @@ def train(
     """Train, or finish training, what the run says; returns the policy."""
     if run.manifest["kind"] == "agent":
         agent = declaration if isinstance(declaration, PlainAgent) else declaration.plain_agent()
-        (stage,) = agent.stages(run.manifest["stages"][0]["name"])
+        (stage,) = agent.stages()
         return train_stages([stage], run, listeners, {}, make_learner)[stage.name]
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
@@ -85,20 +98,20 @@ def _trained(
     known: Policies,
     make_learner: MakeLearner,
     nodes: tuple[str, ...] = (),
-    seen_as: Skill | None = None,
+    as_skill: Skill | None = None,
 ) -> Policies:
     """By path, everyone who can act after the stages of a hierarchy and of those below it.
 
     Args:
         known: who can act before.
         nodes: the names on the way to the hierarchy, where it is a skill of another one.
-        seen_as: that skill.
+        as_skill: that skill.
     """
     if declaration.learns_apart:
         for skill, inner in inner_hierarchies(declaration.skills):
             where = (*nodes, skill.name)
             known = _trained(inner, run, listeners, known, make_learner, where, skill)
-    stages = own_stages(settled(declaration, run, nodes), seen_as)
+    stages = own_stages(settled(declaration, run, nodes), as_skill)
     for name in reversed(nodes):
         stages = [stage.inside(name) for stage in stages]
     apart = [s for s in stages if s.kind != "together"]
@@ -106,7 +119,7 @@ def _trained(
     if len(apart) == len(stages):
         return before
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
-    return judged(declaration, run, listeners, before, after, nodes)
+    return select_best(declaration, run, listeners, before, after, nodes)
 
 
 def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
@@ -150,7 +163,7 @@ def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
         where = f"{run.path}: the selector" + ("" if name == SELECTOR else f" {name}")
         found[name] = as_recorded(policy, told.get(SELECTOR), lambda: None, where)
     for path, own in every_hierarchy(declaration):
-        if own.guide_restricts and (guide := ready_guide(own)) is not None:
+        if own.guide is not None and own.guide.restrict and (guide := ready_guide(own)) is not None:
             where = f"{run.path}: the guide" + (f" of {path}" if path else "")
             as_recorded(guide, _told_of(run, path).get("guide"), lambda: None, where)
     return found
@@ -170,16 +183,16 @@ def _selector_entry(declaration: Declaration) -> dict[str, Any]:
     return guide_entry(declaration) if selector is None else {SELECTOR: source_of(selector)}
 
 
-def _is_woven(declaration: Declaration, path: str) -> bool:
+def _learns_together(declaration: Declaration, path: str) -> bool:
     """Whether a skill that is a hierarchy learns together with its own skills at any time."""
     return any(
-        own.weaves
+        own.learns_together
         for node, own in every_hierarchy(declaration)
         if not node or f"{path}/".startswith(f"{node}/")
     )
 
 
-def _skill_entry(path: str, skill: Skill, *, woven: bool) -> dict[str, Any]:
+def _skill_entry(path: str, skill: Skill, *, together: bool) -> dict[str, Any]:
     inner = inner_of(skill)
     policy = ready_policy(skill) if inner is None else None
     entry: dict[str, Any] = {"name": path, "max_steps": skill.max_steps}
@@ -187,26 +200,29 @@ def _skill_entry(path: str, skill: Skill, *, woven: bool) -> dict[str, Any]:
     if skill.call_steps is not None:
         entry["call_steps"] = skill.call_steps
     if inner is not None:
-        entry["hierarchy"] = _hierarchy_entry(inner, woven=woven)
+        entry["hierarchy"] = _hierarchy_entry(inner, together=together)
     return entry if policy is None else entry | {"policy": source_of(policy)}
 
 
-def _hierarchy_entry(declaration: Declaration, *, woven: bool) -> dict[str, Any]:
+def _hierarchy_entry(declaration: Declaration, *, together: bool) -> dict[str, Any]:
     """What a run says of a hierarchy, be it itself or one below.
 
     Args:
-        woven: all in it learn together at any time; else its skills are greedy, if nobody says it.
+        together: all in it learn together at any time; else skills and selector are greedy by
+            default.
     """
-    greedy = declaration.greedy_skills
+    selection, apart = declaration.selection, declaration.apart
+    skills, selector = selection.greedy_skills, selection.greedy_selector
     return {
         **calls_to_json(declaration.call_steps),
         "learn": declaration.learn,
-        "interrupt": declaration.together.margin if declaration.interrupt else None,
-        "greedy_skills": True if greedy is None and not woven else greedy,
-        "reflexes_in_training": declaration.reflexes_in_training,
+        "interrupt": declaration.together.margin if declaration.together.interrupt else None,
+        "greedy_skills": True if skills is None and not together else skills,
+        "greedy_selector": True if selector is None and not together else selector,
         "reflexes": [r.name for r in declaration.reflexes],
-        "start_calls": declaration.start_calls,
-        "search_steps": declaration.search_steps,
-        **{k: v for k, usual in UNSAID.items() if (v := getattr(declaration, k)) != usual},
+        "start_calls": apart.start_calls,
+        "search_steps": apart.search_steps,
+        "episode_calls": apart.episode_calls,
+        "call_cost": selection.call_cost,
         **_selector_entry(declaration),
     }

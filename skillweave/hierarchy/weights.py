@@ -98,13 +98,20 @@ def _hierarchies_of(
 
 def _how(declaration: Declaration, policy: HierarchyPolicy) -> dict[str, Any]:
     """How a hierarchy calls its skills."""
-    guide = ready_guide(declaration) if declaration.guide_restricts else None
+    guide = _restricting(declaration)
     return {
         **calls_to_json(declaration.call_steps),
-        "interrupt": declaration.together.margin if declaration.interrupt else None,
+        "interrupt": declaration.together.margin if declaration.together.interrupt else None,
         "greedy_skills": policy.skills.greedy,
+        "greedy_selector": policy.skills.greedy_selector,
         **({} if guide is None else {"guide": source_of(guide)}),
     }
+
+
+def _restricting(declaration: Declaration) -> ReadySelector | None:
+    """Return the guide that restricts the selector; None: there is none."""
+    guide = declaration.guide
+    return ready_guide(declaration) if guide is not None and guide.restrict else None
 
 
 class InnerHeader(TypedDict):
@@ -114,6 +121,7 @@ class InnerHeader(TypedDict):
     call_lengths: NotRequired[list[Positive]]
     interrupt: NotRequired[float | None]
     greedy_skills: bool
+    greedy_selector: bool
     guide: NotRequired[Source]
     """Of the ready selector that restricts the trained one."""
 
@@ -123,13 +131,13 @@ class HierarchyHeader(InnerHeader):
 
     kind: str
     env: str
-    env_kwargs: NotRequired[dict[str, Any]]
-    recipe: NotRequired[str | None]
+    env_kwargs: dict[str, Any]
+    recipe: str | None
     skills: list[str]
     parts: dict[str, dict[str, Any]]
-    ready: NotRequired[dict[str, Source]]
+    ready: dict[str, Source]
     """Of skills by path, and of selectors."""
-    hierarchies: NotRequired[dict[str, InnerHeader]]
+    hierarchies: dict[str, InnerHeader]
     """By path, skills that are hierarchies; their own skills are among all ``skills``."""
 
 
@@ -142,7 +150,7 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors, header = read_tensors(path)
     if header.get("kind") == "agent" and "algorithm" in header:
         fit(AgentHeader, header, str(path))
-        if (stage := header.get("stage", AGENT)) not in (AGENT, "flat"):  # its older name
+        if (stage := header.get("stage", AGENT)) != AGENT:
             raise SkillweaveError(
                 f"{path} holds the policy of stage {shown(stage)} alone; write the whole "
                 "hierarchy's weights: skillweave weights RUN"
@@ -184,7 +192,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
         return read_agent(declaration.spec, tensors, header, path)
     skills = dict(every_skill(declaration.skills))
     names, inner = list(skills), {name for name, _ in every_hierarchy(declaration) if name}
-    told = header.get("hierarchies", {})
+    told = header["hierarchies"]
     if header["skills"] != names or header["env"] != declaration.spec.name or set(told) != inner:
         theirs = ", ".join(header["skills"])
         raise SkillweaveError(
@@ -203,7 +211,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
         return None if content is None else content.contiguous().numpy().tobytes()
 
     found: dict[str, Policy] = {}
-    ready, recorded = declaration.ready_policies(), header.get("ready", {})
+    ready, recorded = declaration.ready_policies(), header["ready"]
     for name, policy in ready.items():
         read, where = partial(copied, name), f"{path}: skill {name!r}"
         found[name] = as_recorded(policy, recorded.get(name), read, where)
@@ -212,7 +220,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
         how = told[name] if name else header
         adopt_calls(own, how)
         check_selector(own.ready_selector is not None, node + SELECTOR in recorded, where)
-        for other in [SELECTOR, *([CRITIC] if own.interrupt else [])]:
+        for other in [SELECTOR, *([CRITIC] if own.together.interrupt else [])]:
             if node + other not in recorded:
                 found[node + other] = part(node + other)
         _check_guide(own, how.get("guide"), where)
@@ -228,7 +236,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
 
 def _check_guide(declaration: Declaration, told: dict[str, Any] | None, where: str) -> None:
     """Raise a SkillweaveError where the selector was trained under another guide."""
-    guide = ready_guide(declaration) if declaration.guide_restricts else None
+    guide = _restricting(declaration)
     check_guided(guide is not None, told is not None, where)
     if guide is not None:
         as_recorded(guide, told, lambda: None, f"{where}: the guide")
@@ -237,9 +245,10 @@ def _check_guide(declaration: Declaration, told: dict[str, Any] | None, where: s
 def adopt_calls(declaration: Declaration, told: Mapping[str, Any]) -> None:
     """Take over how a hierarchy calls its skills."""
     declaration.call_steps = calls_from_json(told)
-    declaration.greedy_skills = told["greedy_skills"]
+    kinds = {name: told[name] for name in ("greedy_skills", "greedy_selector")}
+    declaration.selection = replace(declaration.selection, **kinds)
     margin = told.get("interrupt")
-    declaration.interrupt = margin is not None
+    declaration.together = replace(declaration.together, interrupt=margin is not None)
     if margin is not None:
         declaration.together = replace(declaration.together, margin=margin)
 

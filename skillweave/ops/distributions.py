@@ -32,16 +32,16 @@ def mask_logits(
     return logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
 
 
-def with_floor(logits: Tensor, mask: Tensor | None, floor: Tensor) -> Tensor:
+def with_epsilon(logits: Tensor, mask: Tensor | None, epsilon: Tensor) -> Tensor:
     """Logits (..., A) of ``(1 − ε)·softmax + ε·uniform`` over what ``mask`` (..., A) allows.
 
     Args:
-        floor: ε, of a shape that broadcasts with (..., A).
+        epsilon: ε, of a shape that broadcasts with (..., A).
     """
     allowed = torch.ones_like(logits) if mask is None else mask.to(logits.dtype)
     uniform = allowed / allowed.sum(-1, keepdim=True)
     share = mask_logits(logits, mask).softmax(-1)
-    return mask_logits(torch.lerp(share, uniform, floor).clamp_min(1e-30).log(), mask)
+    return mask_logits(torch.lerp(share, uniform, epsilon).clamp_min(1e-30).log(), mask)
 
 
 def categorical_kl(logits: Tensor, other: Tensor) -> Tensor:

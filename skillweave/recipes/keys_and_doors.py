@@ -13,11 +13,12 @@ Needs MiniGrid: ``pip install 'skillweave[minigrid]'``; with EnvPool it trains t
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from skillweave import PPO, Array, Hierarchy, Network, Skill, Step, Together
+from skillweave import PPO, Apart, Array, Hierarchy, Network, Selection, Skill, Step, Together
 from skillweave.recipes._looking import LookAround
 from skillweave.recipes._rooms import (
     BALL,
@@ -241,17 +242,23 @@ STEPS = {
 """Most of them look for where a skill may start."""
 
 
+APART = Apart(
+    skill_steps=100_000,
+    selector_steps=200_000,
+    start_calls=4,
+    search_steps=64,  # not every kind of room has something for every skill
+)
+
+
 def declare(rooms: str = "small", **how: Any) -> Hierarchy:
     """The hierarchy in these rooms; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": None,
-        "start_calls": 4,
-        "search_steps": 64,  # not every kind of room has something for every skill
-        "greedy_skills": False,
+        "learn": "apart",
+        "apart": APART,
+        "selection": Selection(greedy_skills=False),
         "algorithm": WORKER,
         "selector": SELECTOR,
-        "skill_steps": 100_000,
-        "selector_steps": 200_000,
     } | how
     found = Hierarchy(spec(rooms), [s() for s in SKILLS], **settings)
     for name, steps in STEPS.items():
@@ -261,7 +268,7 @@ def declare(rooms: str = "small", **how: Any) -> Hierarchy:
 
 def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """The hierarchy in these rooms with skills that are there already, by name."""
-    found = declare(rooms, **({"selector_steps": 1_500_000} | how))
+    found = declare(rooms, **({"apart": replace(APART, selector_steps=1_500_000)} | how))
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found
@@ -274,8 +281,7 @@ def going_on(rooms: str, **how: Any) -> Hierarchy:
     """
     again: dict[str, Any] = {
         "learn": "together",
-        "together_steps": 750_000,
-        "together": Together(task_weight=1.0, floor=0.1, floor_final=0.0),
+        "together": Together(steps=750_000, task_weight=1.0, epsilon=0.1, epsilon_final=0.0),
     }
     return declare(rooms, **(again | how))
 

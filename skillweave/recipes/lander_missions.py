@@ -20,7 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import PPO, Array, Hierarchy, Network, Skill, SkillweaveError, Step
+from skillweave import (
+    PPO,
+    Apart,
+    Array,
+    Hierarchy,
+    Network,
+    Selection,
+    Skill,
+    SkillweaveError,
+    Step,
+)
 from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
 
 X, Y, VX, VY, ANGLE, SPIN, LEGS = 0, 1, 2, 3, 4, 5, slice(6, 8)
@@ -198,12 +208,12 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
     """The hierarchy on a mission; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": None,
-        "start_calls": 2,
-        "greedy_skills": False,  # greedy ones may stay beside their point, and never arrive
+        "learn": "apart",
+        "apart": Apart(skill_steps=400_000, selector_steps=600_000, start_calls=2),
+        # Greedy skills may stay beside their point, and never arrive.
+        "selection": Selection(greedy_skills=False),
         "algorithm": PILOT,
         "selector": SELECTOR,
-        "skill_steps": 400_000,
-        "selector_steps": 600_000,
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
     found.skill("hover").steps = 300_000
@@ -215,7 +225,7 @@ def with_skills(
     mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
 ) -> Hierarchy:
     """The hierarchy on a mission with skills that are there already, by name."""
-    found = declare(mission, gusts, **{"selector_steps": 300_000} | how)
+    found = declare(mission, gusts, **{"apart": Apart(selector_steps=300_000)} | how)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found

@@ -11,7 +11,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from skillweave import PPO, Array, Hierarchy, Network, Reflex, Skill, Step
+from skillweave import (
+    PPO,
+    Apart,
+    Array,
+    Hierarchy,
+    Network,
+    Reflex,
+    Skill,
+    Step,
+    TrainDefaults,
+)
 
 X, Y, ANGLE, LEFT_LEG, RIGHT_LEG = 0, 1, 4, 6, 7
 
@@ -106,9 +116,9 @@ hierarchy = Hierarchy(
     reflexes=[Reflex(landed, action=0, name="engines off")],
     algorithm=HOLDING,
     selector=SELECTOR,
-    flat=FLAT,
-    skill_steps=250_000,
-    selector_steps=600_000,
+    learn="apart",
+    apart=Apart(skill_steps=250_000, selector_steps=600_000),
+    train_defaults=TrainDefaults(flat=FLAT),
 )
 hierarchy.skill("landing").algorithm = LANDING
 hierarchy.skill("landing").steps = 2_800_000

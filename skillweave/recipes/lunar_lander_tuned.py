@@ -10,7 +10,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
+from skillweave import (
+    PPO,
+    Apart,
+    Array,
+    Hierarchy,
+    Network,
+    Skill,
+    Step,
+)
 
 X, Y, VX, VY, ANGLE, SPIN = 0, 1, 2, 3, 4, 5
 MAIN_ENGINE = 2
@@ -100,7 +108,7 @@ hierarchy = Hierarchy(
     call_steps=8,
     algorithm=LEARNER,
     selector=replace(LEARNER, gamma=0.999, gae_lambda=0.98, n_steps=256, normalize_obs=False),
-    skill_steps=400_000,
-    selector_steps=800_000,
+    learn="apart",
+    apart=Apart(skill_steps=400_000, selector_steps=800_000),
 )
 hierarchy.skill("touchdown").steps = 1_600_000

@@ -20,7 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import PPO, Array, Hierarchy, Network, Skill, Step, register_encoder
+from skillweave import (
+    PPO,
+    Apart,
+    Array,
+    Hierarchy,
+    Network,
+    Skill,
+    Step,
+    TrainDefaults,
+    register_encoder,
+)
 from skillweave.recipes._mazes import GOAL, PLACE, SPEED, spec
 
 SLOW, GAIN = 0.3, 0.1
@@ -191,16 +201,16 @@ def declare(maze: str = "large", **how: Any) -> Hierarchy:
         "call_steps": 25,
         "algorithm": BALL,
         "selector": SELECTOR,
-        "flat": FLAT,
-        "skill_steps": 30_000,
-        "selector_steps": 768_000,
+        "learn": "apart",
+        "apart": Apart(skill_steps=30_000, selector_steps=768_000),
+        "train_defaults": TrainDefaults(flat=FLAT),
     } | how
     return Hierarchy(spec(maze), [s() for s in SKILLS], **settings)
 
 
 def with_skills(maze: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """The hierarchy on a maze with skills that are there already, by name."""
-    settings = {"selector": FURTHER_SELECTOR, "selector_steps": 200_000} | how
+    settings = {"selector": FURTHER_SELECTOR, "apart": Apart(selector_steps=200_000)} | how
     found = declare(maze, **settings)
     for skill in found.skills:
         skill.policy = skills[skill.name]

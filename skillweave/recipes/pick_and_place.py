@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import skillweave as sw
-from skillweave import PPO, Array, Hierarchy, Network, Skill, Step
+from skillweave import PPO, Apart, Array, Guide, Hierarchy, Network, Skill, Step
 from skillweave.recipes._arm import CALM, Disturbances, spec
 from skillweave.recipes._arm import is_held as is_grasped
 
@@ -226,8 +226,8 @@ def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
         "call_steps": 10,
         "algorithm": LEARNER,
         "selector": SELECTOR,
-        "skill_steps": 20_000,
-        "selector_steps": 60_000,
+        "learn": "apart",
+        "apart": Apart(skill_steps=20_000, selector_steps=60_000),
     } | how
     skills = [Above(), Descend(), Close(), Carry(), Recover()]
     return Hierarchy(spec(disturbances), skills, **settings)
@@ -235,8 +235,8 @@ def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
 
 def anchored(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
     """The same; while the selector learns, it is kept near the behaviour tree."""
-    near = {"guide": behaviour_tree, "guide_restricts": False, "guide_nats": 0.1}
-    return declare(disturbances, **near | how)
+    near = Guide(behaviour_tree, restrict=False, target_kl=0.1)
+    return declare(disturbances, **{"guide": near} | how)
 
 
 def by_hand(selector: Any, disturbances: Disturbances = CALM, call_steps: int = 1) -> Hierarchy:

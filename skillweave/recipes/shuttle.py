@@ -130,7 +130,9 @@ same on every machine."""
 # are, so that skills keep knowing how to begin elsewhere than where the task asks for them. After a
 # sixth of the steps the selector knows its task. While calls are drawn by lot, points are seldom
 # passed, and that is where skills learn to brake: so the share falls fast.
-FLOOR = Together(floor=0.95, floor_final=0.05, floor_fraction=0.4)
+TOGETHER = Together(
+    steps=3_000_000, task_weight=0.0, epsilon=0.95, epsilon_final=0.05, epsilon_fraction=0.4
+)
 
 FURTHER_CALL_STEPS = 100
 """Skills that are there already end by themselves where a leg is done. By lot, calls of 40 steps
@@ -141,8 +143,8 @@ FURTHER_SELECTOR = replace(
     n_steps=512,
     batch_size=64,
     update_epochs=10,
-    floor=0.5,
-    floor_final=0.0,
+    epsilon=0.5,
+    epsilon_final=0.0,
 )
 """Fewer environments: a rollout holds about seven calls of each, one after another."""
 
@@ -152,8 +154,7 @@ def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
     settings: dict[str, Any] = {
         "call_steps": 40,
         "learn": "together",
-        "together_steps": 3_000_000,
-        "together": FLOOR,
+        "together": TOGETHER,
         "algorithm": RUNNER,
         "selector": SELECTOR,
     } | how

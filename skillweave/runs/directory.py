@@ -161,7 +161,7 @@ class RunDirectory:
     def unjudged(self) -> bool:
         """Whether nobody has found out yet which hierarchy is the best that was learnt."""
         stages = self.manifest["stages"]
-        return any("kept" not in s and to_be_judged(s, self.manifest) for s in stages)
+        return any("kept" not in s and to_be_judged(s) for s in stages)
 
     def save_checkpoint(
         self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None

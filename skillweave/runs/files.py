@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from skillweave.reading import check_file, parse_json, read_file, shown
-from skillweave.runs.older import header_today
 from skillweave.types import SkillweaveError
 
 SCHEMA = 1
@@ -142,7 +141,7 @@ def read_json(
     if check is not None:
         check(data)
     found = data.pop("sha256", None)
-    if found is not None and found != _json_digest(data):  # files of older versions have none
+    if found != _json_digest(data):
         raise SkillweaveError(
             f"{path} is damaged: its contents do not match its checksum (edited by hand?)"
         )
@@ -202,7 +201,7 @@ def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
         raise SkillweaveError(f"{path} is damaged: its contents do not match its checksum")
     # Copies: in the file tensors are aligned to 4 bytes only, and matrix products of such differ in
     # the last bit, so that a resumed run would drift.
-    return {k: v.clone() for k, v in tensors.items()}, header_today(header), sha256
+    return {k: v.clone() for k, v in tensors.items()}, header, sha256
 
 
 def check_unchanged(path: Path, found: str, written: str) -> None:
@@ -220,7 +219,7 @@ def read_header(path: Path) -> dict[str, Any]:
     Raises:
         SkillweaveError: as ``read_tensors``.
     """
-    return header_today(_opened(path, with_tensors=False)[0])
+    return _opened(path, with_tensors=False)[0]
 
 
 def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.reading import check_file, fit, load_json, shown
-from skillweave.runs.older import header_today
 from skillweave.types import SkillweaveError
 
 
@@ -84,7 +83,6 @@ class JsonLines:
                     raise SkillweaveError(
                         f"{self.path} is damaged in line {number}: {shown(record)} is no object"
                     )
-                record = header_today(record)
                 if self._schema is not None:
                     fit(self._schema, record, f"{self.path}, line {number}")
                 yield record

@@ -6,35 +6,44 @@ from collections.abc import Mapping
 from typing import Any, Literal, NotRequired, TypedDict
 
 EPISODES = 100
-"""Of each hierarchy, to find out which is the best."""
+"""Episodes of each hierarchy that is compared."""
+
+Candidate = Literal["before", "greedy", "skills_sample", "selector_samples", "both_sample"]
+"""A hierarchy that a stage could end with."""
+
+SAMPLING: dict[str, tuple[bool, bool]] = {
+    "greedy": (False, False),
+    "skills_sample": (True, False),
+    "selector_samples": (False, True),
+    "both_sample": (True, True),
+}
+"""By candidate, whether skills sample and whether the selector does."""
+_WORDS = {
+    "before": "before learning together",
+    "greedy": "greedy",
+    "skills_sample": "with skills that sample",
+    "selector_samples": "with a selector that samples",
+    "both_sample": "with skills and a selector that sample",
+}
 
 
 class Kept(TypedDict):
-    """Which hierarchy a stage ended with, by their mean returns."""
+    """Which hierarchy a stage ended with, and the mean returns of those that were compared."""
 
     before: NotRequired[float]
-    after: float
-    sampled: NotRequired[float]
-    """That after learning together, with skills that sample instead of greedy ones."""
-    kept: Literal["before", "after", "sampled"]
+    greedy: NotRequired[float]
+    skills_sample: NotRequired[float]
+    selector_samples: NotRequired[float]
+    both_sample: NotRequired[float]
+    kept: Candidate
 
 
 def kept_words(kept: Mapping[str, Any]) -> str:
-    """A sentence on the hierarchies that were compared, and on which was kept."""
-    judged = "sampled" in kept
-    named = {
-        "before": "before learning together",
-        "after": "after it with greedy skills" if judged else "after it",
-        "sampled": "after it with skills that sample",
-    }
-    if "before" not in kept:
-        named |= {"after": "with greedy skills", "sampled": "with skills that sample"}
-    returns = ", ".join(f"{words} {kept[k]:.1f}" for k, words in named.items() if k in kept)
-    return f"mean return {returns} ({EPISODES} episodes each): kept what was {named[kept['kept']]}"
+    """Return a sentence on the hierarchies that were compared, and on which was kept."""
+    returns = ", ".join(f"{words} {kept[k]:.4g}" for k, words in _WORDS.items() if k in kept)
+    return f"mean return {returns} ({EPISODES} episodes each); kept: {_WORDS[kept['kept']]}"
 
 
-def to_be_judged(entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> bool:
+def to_be_judged(entry: Mapping[str, Any]) -> bool:
     """Whether a stage of a run is to end with the best of several hierarchies."""
-    both = manifest.get("learn") == "apart, then together"  # older runs say no more
-    compared = entry.get("compared", both) or entry.get("greedy_judged", False)
-    return entry["kind"] == "together" and bool(compared)
+    return entry["kind"] == "together" and bool(entry["compared"] or entry["greedy_judged"])

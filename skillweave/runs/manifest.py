@@ -1,6 +1,6 @@
 """What ``run.json`` and the headers of checkpoints hold: the schema that reading them goes by.
 
-To add a field, add a line; ``NotRequired`` where older runs do not have it.
+To add a field, add a line; ``NotRequired`` where not every run has it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
 from skillweave.runs.files import read_json
 from skillweave.runs.kept import Kept
-from skillweave.runs.older import manifest_today
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 from skillweave.types import SkillweaveError
@@ -41,27 +40,23 @@ class NestedEntry(TypedDict):
 
     call_steps: Positive | None
     call_lengths: NotRequired[list[Positive]]
-    interrupt: NotRequired[float | None]
-    """By how much deciding anew must be worth more for a call to be cut."""
-    learn: NotRequired[Literal["apart", "together", "apart, then together"]]
+    interrupt: float | None
+    """By how much a new decision must be worth more to interrupt a call."""
+    learn: Literal["apart", "together", "apart, then together"]
     greedy_skills: bool | None
-    """None: found out at the end of learning together, and written there (``kept``)."""
+    """None: measured at the end of learning together, and written there (``kept``)."""
+    greedy_selector: bool | None
     selector: NotRequired[Source]
     """Of a ready selector; absent where it is trained."""
     guide: NotRequired[Source]
     """Of the ready selector that a trained one keeps to."""
-    guide_restricts: NotRequired[bool]
-    guide_nats: NotRequired[float | None]
-    reflexes: NotRequired[list[str]]
-    reflexes_in_training: NotRequired[bool]
-    start_calls: NotRequired[int | None]
-    search_steps: NotRequired[int | None]
-    episode_calls: NotRequired[Positive]
-    call_cost: NotRequired[float]
-
-
-UNSAID = {"episode_calls": 1, "call_cost": 0.0}
-"""Fields of a ``NestedEntry`` that are absent where they have these values."""
+    guide_restrict: NotRequired[bool]
+    guide_kl: NotRequired[float | None]
+    reflexes: list[str]
+    start_calls: int | None
+    search_steps: int | None
+    episode_calls: Positive
+    call_cost: float
 
 
 class SkillEntry(TypedDict):
@@ -108,8 +103,8 @@ class Start(TypedDict):
     """Environment steps that it learnt from there."""
     run: str | None
     """That run's ``id``."""
-    copy: NotRequired[str]
-    """Checksum of this run's copy; older runs do not say it."""
+    copy: str
+    """Checksum of this run's copy."""
 
 
 class StageEntry(TypedDict):
@@ -146,14 +141,14 @@ class StageEntry(TypedDict):
     """How skills and selector learn together."""
     algorithms: NotRequired[dict[NodePath, dict[str, Any]]]
     """Of the skills that learn together with the selector."""
-    interrupt: NotRequired[bool]
-    """The selector cuts calls."""
-    guide_nats: NotRequired[float]
-    """How far the selector may be from its guide."""
+    task_weights: NotRequired[dict[NodePath, float]]
+    """Of skills whose ``task_weight`` is not that of ``together``."""
+    guide_kl: NotRequired[float]
+    """The KL within which the selector stays of its guide."""
     compared: NotRequired[bool]
     """What is learnt together is kept only if it is better than what was there before."""
     greedy_judged: NotRequired[bool]
-    """Whether skills are greedy after it is found out at its end."""
+    """At its end, evaluate whether skills and selector should act greedily or sample."""
     kept: NotRequired[Kept]
     """What was found out at its end."""
     starts: NotRequired[dict[NodePath, Start]]
@@ -167,15 +162,15 @@ class Manifest(TypedDict):
     env: Annotated[str, Asked("at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
     seed: Count
-    cut_every: Positive
+    checkpoint_every: Positive
     needs_recipe: bool
     stages: list[StageEntry]
     created: str
     versions: dict[str, str]
     id: NotRequired[str]
-    eval_every: NotRequired[Positive | None]
-    eval_episodes: NotRequired[Positive]
-    resume_needs_recipe: NotRequired[bool]
+    eval_every: Positive | None
+    eval_episodes: Positive
+    resume_needs_recipe: bool
     recipe: NotRequired[str | None]
     track: NotRequired[list[str]]
 
@@ -239,8 +234,7 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
 def read_manifest(run: Path) -> dict[str, Any]:
     """The content of a run's ``run.json``, checked."""
     file = run / "run.json"
-    told = read_json(file, lambda data: check_manifest(manifest_today(data), str(file)))
-    return manifest_today(told)
+    return read_json(file, lambda data: check_manifest(data, str(file)))
 
 
 def identity(manifest: Mapping[str, Any]) -> str:

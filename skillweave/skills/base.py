@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -25,16 +26,21 @@ class Skill:
 
     Sutton, Precup & Singh 1999, "Between MDPs and semi-MDPs".
 
-    Subclass it and define ``reward``; all else is optional. Every method is batched: arrays
-    over N environments in, one array (N,) out, so the same class runs on one environment and on
-    a thousand. Methods must be functions of their arguments: keep no state of an environment in
-    ``self`` (``step`` has the observation before and after).
+    Subclass it and define ``reward``; all else is optional. Where skills and selector learn
+    together (the default), a skill also follows the task's advantage, with ``task_weight``.
+
+    Every method is batched: arrays over N environments in, one array (N,) out, so the same class
+    runs on one environment and on a thousand. Methods must be functions of their arguments: keep no
+    state of an environment in ``self`` (``step`` has the observation before and after).
 
     Attributes:
         name: used in messages, files and captions; default: the class name in lower case.
         max_steps: the skill stops after so many steps; None: only by ``termination``.
         call_steps: its calls last at most so long, wherever it is trained; None: the hierarchy's.
-        steps: training budget in environment steps; None: the hierarchy's ``skill_steps``.
+        steps: training steps where it learns apart; None: its share of ``Hierarchy.steps``.
+        task_weight: weight of the task's advantage beside its own reward where skills learn
+            together; None: ``Together.task_weight`` (1). 0: it follows its own reward alone, as a
+            skill should that other hierarchies will use.
         algorithm: settings of the algorithm that trains it (its network is among them);
             None: the hierarchy's.
         target_return: its training ends early at this mean return of the periodic evaluation (the
@@ -52,6 +58,7 @@ class Skill:
     max_steps: int | None = None
     call_steps: int | None = None
     steps: int | None = None
+    task_weight: float | None = None
     algorithm: Any = None
     target_return: float | None = None
     target_success: float | None = None
@@ -107,6 +114,16 @@ class Skill:
                 raise SkillweaveError(
                     f"{where}: {field} is {short(value)}; it must be at least 1, or None"
                 )
+        weight: Any = self.task_weight
+        if weight is not None and (
+            isinstance(weight, bool)
+            or not isinstance(weight, int | float)
+            or not 0.0 <= weight < math.inf
+        ):
+            raise SkillweaveError(
+                f"{where}: task_weight is {short(weight)}; it must be a number of at least 0, or "
+                "None"
+            )
         if self.color is not None and not _is_color(self.color):
             raise SkillweaveError(
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "

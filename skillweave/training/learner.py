@@ -141,12 +141,12 @@ class RolloutLearner:
             self.anchor.coef = coef.to(self.anchor.coef.device)
 
 
-def keep_to_guide(learner: Learner, nats: float | None) -> None:
-    """Let a selector stay near its guide, so many nats of KL; None: it need not."""
-    if nats is not None and isinstance(learner, RolloutLearner):
+def keep_to_guide(learner: Learner, target_kl: float | None) -> None:
+    """Keep the selector within ``target_kl`` of its guide; None disables this."""
+    if target_kl is not None and isinstance(learner, RolloutLearner):
         (stack,) = learner.stacks
         coef = torch.ones(stack.members, device=stack.state.params.device)
-        learner.anchor = Anchor(None, coef, nats)
+        learner.anchor = Anchor(None, coef, target_kl)
 
 
 def adapted(coef: Tensor, kl: Tensor, nats: float) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from skillweave.buffers.replay import ReplayStore, replay_store
-from skillweave.collecting.acting import Bouts, Request
+from skillweave.collecting.acting import ActionRepeat, Request
 from skillweave.experience import Experience
 from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
@@ -76,15 +76,17 @@ class ReplayLearner:
             self._gamma(),
             seeds,
             at_random,
-            bouts=self._bouts(update * rows, progress),
+            action_repeat=self._action_repeat(update * rows, progress),
         )
 
-    def _bouts(self, at: int, progress: float) -> Bouts | None:
+    def _action_repeat(self, at: int, progress: float) -> ActionRepeat | None:
         """When to take one action again and again, from row ``at`` on."""
         cfg = self.config
-        if not cfg.bouts:
+        if not cfg.action_repeat:
             return None
-        return Bouts(at, cfg.bouts * (1.0 - progress), cfg.bout_steps, self._seeds / "bouts")
+        return ActionRepeat(
+            at, cfg.action_repeat * (1.0 - progress), cfg.action_repeat_steps, self._seeds / "bouts"
+        )
 
     def take(self, experience: Experience) -> None:
         """Put rows into the store, and keep the running scales of observations and returns."""

@@ -12,7 +12,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.guide import AskedElsewhere, Guide
+from skillweave.collecting.guide import ActiveGuide, AskedElsewhere
 from skillweave.collecting.levels import CRITIC, SELECTOR
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
@@ -83,20 +83,20 @@ def skill_scene(
 
 
 def selector_scene(
-    spec: EnvSpec, skills: SkillSet, guide: Guide | None = None, seen_as: Skill | None = None
+    spec: EnvSpec, skills: SkillSet, guide: ActiveGuide | None = None, as_skill: Skill | None = None
 ) -> Scene:
     """The environments in which a selector calls skills.
 
     Args:
         guide: a ready selector that is asked wherever it decides.
-        seen_as: the skill that all of it is, in another hierarchy; None: the task itself.
+        as_skill: the skill that all of it is, in another hierarchy; None: the task itself.
     """
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return DecisionCollector(engine, acting, skills, shared, guide, seen_as)
+        return DecisionCollector(engine, acting, skills, shared, guide, as_skill)
 
     observation_space, _ = _spaces(spec)
     choices = gym.spaces.Discrete(skills.choices)
@@ -112,14 +112,14 @@ class WovenScene(Scene):
     skill_space: gym.Space[Any] = field(kw_only=True)
     """What skills choose from."""
     spec: EnvSpec = field(kw_only=True)
-    guide: Guide | None = field(kw_only=True)
+    guide: ActiveGuide | None = field(kw_only=True)
     """A ready selector, which is asked wherever the selector decides, or decides itself."""
-    seen_as: Skill | None = field(kw_only=True)
+    as_skill: Skill | None = field(kw_only=True)
     """The skill that all of it is, in another hierarchy."""
     margins: Mapping[str, float] = field(kw_only=True)
     """By the paths of critics in hierarchies below: where calls are cut there."""
-    nats: Mapping[str, float] = field(kw_only=True)
-    """By the paths of selectors in hierarchies below: how far they may be from their guides."""
+    guide_kl: Mapping[str, float] = field(kw_only=True)
+    """By the paths of selectors in hierarchies below: their largest KL from their guides."""
 
     def chooses_from(self, path: str) -> gym.Space[Any]:
         """The actions of a skill, a selector or a critic of skills, by its path."""
@@ -137,7 +137,8 @@ class WovenScene(Scene):
     def is_greedy(self, path: str) -> bool:
         """Whether a learner does not explore where its hierarchy is evaluated, by its path."""
         *nodes, name = path.split("/")
-        return name == SELECTOR or self.level(nodes).greedy
+        level = self.level(nodes)
+        return level.greedy_selector if name == SELECTOR else level.greedy
 
     def level(self, nodes: Sequence[str]) -> SkillSet:
         """The skills of a hierarchy below, by the names on the way to it."""
@@ -163,24 +164,24 @@ class WovenScene(Scene):
         """
         decides: Any = acting or AskedElsewhere(engine.num_envs)
         return WovenCollector(
-            engine, decides, self.skills, learners, margins, self.guide, self.seen_as
+            engine, decides, self.skills, learners, margins, self.guide, self.as_skill
         )
 
 
 def woven_scene(
     spec: EnvSpec,
     skills: SkillSet,
-    guide: Guide | None = None,
-    seen_as: Skill | None = None,
+    guide: ActiveGuide | None = None,
+    as_skill: Skill | None = None,
     margins: Mapping[str, float] | None = None,
-    nats: Mapping[str, float] | None = None,
+    guide_kl: Mapping[str, float] | None = None,
 ) -> WovenScene:
     """The environments in which a selector calls skills, and some of these learn too."""
     plain = skill_scene(spec)
     return WovenScene(
         spec.name, plain.observation_space, gym.spaces.Discrete(skills.choices), plain.collector,
         skills.usual_steps or CALL, skills=skills, skill_space=plain.action_space, spec=spec,
-        guide=guide, seen_as=seen_as, margins=margins or {}, nats=nats or {},
+        guide=guide, as_skill=as_skill, margins=margins or {}, guide_kl=guide_kl or {},
     )  # fmt: skip
 
 

@@ -14,11 +14,21 @@ from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
 from skillweave.ops.device import resolve_device
 from skillweave.reading import LARGEST_FLOAT
+from skillweave.training.checks import check_fields
 from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy, SkillweaveError
 
 SELECTOR, CRITIC = levels.SELECTOR, levels.CRITIC
+TOGETHER = "together"
+"""Name of the stage in which all learn together."""
+
+
+def decides(path: str) -> bool:
+    """Whether it is the path of a selector or a critic of skills: they are no skills."""
+    return path.rpartition("/")[2] in (SELECTOR, CRITIC)
+
+
 Policies = Mapping[str, Policy]
 """By name, everyone who can act already: ready skills, and who learnt in earlier stages."""
 
@@ -85,38 +95,46 @@ def target_of(
 
 @dataclass(frozen=True)
 class Together:
-    """How skills and selector learn together, from the same steps.
+    """Settings of a selector and skills that learn from the same steps.
 
     Raises:
         SkillweaveError: a value is out of its range.
     """
 
-    floor: float = 1.0
-    """The least share of calls that are drawn uniformly from those allowed, at the start. A
-    selector with a floor of its own has its own ``floor_final`` and ``floor_fraction``, too."""
-    floor_final: float = 0.1
-    """The share that it falls to, linearly."""
-    floor_fraction: float = 1.0
-    """Share of the budget over which the floor falls."""
-    task_weight: float = 0.0
-    """β: what the task's advantage counts beside a skill's own in the end, growing from 0 linearly;
-    for skills that learn by PPO."""
+    steps: int | None = None
+    """Training steps of this stage; None: its share of ``Hierarchy.steps``."""
+    interrupt: bool = False
+    """The selector interrupts a call where a new decision is worth clearly more (``margin``); also
+    where the selector learns apart."""
+    task_weight: float = 1.0
+    """Weight of the task's advantage beside a skill's own, which has weight 1. It grows linearly
+    from 0. A skill can set its own (``Skill.task_weight``; 0: its own reward alone). For skills
+    that learn by PPO; skills with other algorithms follow their own reward alone."""
+    epsilon: float = 1.0
+    """Least share of calls chosen uniformly from the allowed ones, at the start. A selector with an
+    ``epsilon`` of its own also uses its own ``epsilon_final`` and ``epsilon_fraction``."""
+    epsilon_final: float = 0.1
+    """The value that epsilon falls to, linearly."""
+    epsilon_fraction: float = 1.0
+    """Share of the budget over which epsilon falls."""
     margin: float = 0.2
-    """A call is cut where it is worth so much more to decide anew, in deviations of the return."""
-    anchor_nats: float | None = 0.05
-    """How far, in nats of KL, skills that were trained before by PPO may move; None: freely. A
-    skill whose calls succeeded in a share p of its own stage, at its end, may move 1/p times as
-    far."""
+    """Interrupt a call where a new decision is worth this much more, in standard deviations of the
+    return."""
+    reference_kl: float | None = 0.05
+    """Keep skills that PPO trained before within this KL of their earlier policy; None disables
+    this. A skill whose calls succeeded in a share p of its own stage, at its end, may move 1/p
+    times as far."""
     quota: float = 0.25
     """A skill learns when it has acted in this share of a rollout's rows, or more."""
 
     def __post_init__(self) -> None:
-        for name in ("floor", "floor_final", "floor_fraction", "quota"):
+        for name in ("epsilon", "epsilon_final", "epsilon_fraction", "quota"):
             number(self, name, high=1.0)
         number(self, "task_weight")
+        check_fields(self)
         number(self, "margin")
-        if self.anchor_nats is not None:
-            positive(self, "anchor_nats")
+        if self.reference_kl is not None:
+            positive(self, "reference_kl")
 
 
 @dataclass(frozen=True)
@@ -137,18 +155,18 @@ class Stage:
     """Who learns beside the selector from the same steps, and by which algorithm."""
     together: Together | None = None
     """How they learn together; None: one learns alone."""
-    interrupt: bool = False
-    """The selector cuts calls."""
+    task_weights: Mapping[str, float] = field(default_factory=dict)
+    """By path, the weights of skills that differ from ``together.task_weight``."""
     ready: bool = False
     """The selector does not learn: ``config`` says how many environments there are."""
-    guide_nats: float | None = None
-    """How far the selector may be from a ready one, in nats of KL; None: as far as it likes."""
+    guide_kl: float | None = None
+    """Keep the selector within this KL of its guide; None disables this."""
     node: str = ""
     """The path of the hierarchy that it is of: empty, or ``inner/`` for example."""
     compared: bool = False
     """What is learnt is kept only if it is better than what was there before."""
     greedy_judged: bool = False
-    """Whether skills are greedy afterwards, or sample, is found out at its end."""
+    """At its end, evaluate whether skills and selector should act greedily or sample."""
 
     def inside(self, name: str) -> Stage:
         """This stage in a hierarchy that is the skill ``name`` of another one."""
@@ -158,9 +176,13 @@ class Stage:
             return self.scene(own)
 
         path = f"{name}/"
-        beside = {path + k: v for k, v in self.beside.items()}
         return replace(
-            self, name=path + self.name, node=path + self.node, beside=beside, scene=scene
+            self,
+            name=path + self.name,
+            node=path + self.node,
+            beside={path + k: v for k, v in self.beside.items()},
+            task_weights={path + k: v for k, v in self.task_weights.items()},
+            scene=scene,
         )
 
     def entry(self) -> dict[str, Any]:
@@ -179,9 +201,9 @@ class Stage:
         if self.together is not None:
             entry["together"] = asdict(self.together)
             entry["algorithms"] = {k: config_to_json(v) for k, v in self.beside.items()}
-            entry["interrupt"] = self.interrupt
-        if self.guide_nats is not None:
-            entry["guide_nats"] = self.guide_nats
+            entry["task_weights"] = dict(self.task_weights)
+        if self.guide_kl is not None:
+            entry["guide_kl"] = self.guide_kl
         if self.kind == "together":
             entry["compared"] = self.compared
             entry["greedy_judged"] = self.greedy_judged

@@ -91,7 +91,7 @@ class OneAgent:
             stack, config.num_envs, stage.seeds, row_steps=stage.scene.row_steps,
             goes_on_at=log.at["steps"],
         )  # fmt: skip
-        keep_to_guide(found, stage.entry.get("guide_nats"))
+        keep_to_guide(found, stage.entry.get("guide_kl"))
         if self.start is not None and isinstance(found, ReplayLearner):
             found.act_from_the_start()
         return found
@@ -152,7 +152,7 @@ class OneAgent:
         try:
             train(
                 self.learner, self.collectors, self.episodes, self.stage.seeds, self.stage.budget,
-                resume_from=at, cut_every=int(self.stage.run.manifest["cut_every"]),
+                resume_from=at, cut_every=int(self.stage.run.manifest["checkpoint_every"]),
                 on_tick=on_tick,
             )  # fmt: skip
         except _TargetReached:

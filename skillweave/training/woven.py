@@ -31,11 +31,11 @@ from skillweave.training.episodes import Tick
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
-from skillweave.training.stage import CRITIC, SELECTOR, Together
+from skillweave.training.stage import CRITIC, SELECTOR, Together, decides
 from skillweave.training.stage_log import StageLog, success_rate
 from skillweave.training.stage_run import StageRun, begin_as
 from skillweave.training.trainer import OneAgent
-from skillweave.training.woven_learner import WovenLearner, decides
+from skillweave.training.woven_learner import WovenLearner
 from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
 
@@ -105,15 +105,15 @@ class WovenAgents(OneAgent):
 
     def _margins(self) -> dict[str, float]:
         """By the paths of critics, where calls are cut."""
-        own = {CRITIC: self.together.margin} if self.stage.entry.get("interrupt") else {}
+        own = {CRITIC: self.together.margin} if self.together.interrupt else {}
         return own | dict(self.scene.margins)
 
-    def _nats(self, name: str) -> float | None:
-        """How far one who learns may be from a guide; None: there is none to stay near."""
+    def _guide_kl(self, name: str) -> float | None:
+        """Return the KL within which a learner stays of its guide; None: without limit."""
         if name == self.first:
-            nats: float | None = self.stage.entry.get("guide_nats")
-            return nats
-        return self.scene.nats.get(self._below(name))
+            kl: float | None = self.stage.entry.get("guide_kl")
+            return kl
+        return self.scene.guide_kl.get(self._below(name))
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """All learners, from a checkpoint, from what they learnt in earlier stages, or fresh."""
@@ -131,9 +131,10 @@ class WovenAgents(OneAgent):
             part = self._part(name, stack, log, learnt_before=before is not None)
             if anchor is not None:
                 part.anchor = anchor  # type: ignore[attr-defined]
-            keep_to_guide(part, self._nats(name))
+            keep_to_guide(part, self._guide_kl(name))
             parts[name] = part
-        found = WovenLearner(parts, self.node, self.together)
+        weights = self.stage.entry["task_weights"]
+        found = WovenLearner(parts, self.node, self.together.task_weight, weights)
         if extra:
             told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
             if not ((told >= 0) & (told < 2**53)).all():
@@ -168,7 +169,7 @@ class WovenAgents(OneAgent):
     ) -> Anchor | None:
         """What a skill that was trained before is to stay near: this state."""
         rollouts = algorithm.store == "rollout"
-        if self.together.anchor_nats is None or decides(name) or not rollouts:
+        if self.together.reference_kl is None or decides(name) or not rollouts:
             return None
         if not self._stages_of(name):
             return None  # it starts from another run, to learn what this one asks for
@@ -176,12 +177,12 @@ class WovenAgents(OneAgent):
         if rate == 0.0:
             log.tell(
                 f"skill {name!r} did not succeed any more when its own stage ended, so it moves "
-                "freely here (together.anchor_nats is not used for it)"
+                "freely here (together.reference_kl is not used for it)"
             )
             return None
         params = algorithm.acting_params(state, device=device)
         # Who seldom succeeded has little to lose, and much to learn.
-        return Anchor(params, torch.ones(1, device=device), self.together.anchor_nats / rate)
+        return Anchor(params, torch.ones(1, device=device), self.together.reference_kl / rate)
 
     def _part(self, name: str, stack: Stack, log: StageLog, *, learnt_before: bool) -> Learner:
         """The learner of the selector, or of a skill."""
@@ -223,8 +224,8 @@ class WovenAgents(OneAgent):
             if rows and not updates:
                 log.tell(
                     f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "
-                    "to learn from once: lower together.quota, raise together.floor, or give more "
-                    "steps"
+                    "to learn from once: lower together.quota, raise together.epsilon, or give "
+                    "more steps"
                 )
             elif not rows:
                 log.tell(

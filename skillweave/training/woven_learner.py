@@ -13,7 +13,7 @@ from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Experience
 from skillweave.training.learner import Learner, Stack
-from skillweave.training.stage import CRITIC, SELECTOR, Together
+from skillweave.training.stage import CRITIC, SELECTOR, decides
 from skillweave.types import Array, prefixed, unprefixed
 
 
@@ -23,11 +23,20 @@ class WovenLearner:
     Args:
         parts: by path, the selector first unless it is ready, then all others who learn.
         node: the path of the hierarchy: empty, or ``inner/`` for example.
-        how: how much the task counts, and how far skills may move from their anchors.
+        task_weight: the weight of the task's advantage for skills, at the end of the stage.
+        weights: by path, skills with another weight.
     """
 
-    def __init__(self, parts: Mapping[str, Learner], node: str, how: Together) -> None:
-        self.parts, self._how, self._weight = dict(parts), how, 0.0
+    def __init__(
+        self,
+        parts: Mapping[str, Learner],
+        node: str,
+        task_weight: float = 0.0,
+        weights: Mapping[str, float] | None = None,
+    ) -> None:
+        self.parts, self._progress = dict(parts), 0.0
+        weights = weights or {}
+        self._weights = {k: weights.get(k, task_weight) for k in parts if not decides(k)}
         self._selector, self._critic = node + SELECTOR, node + CRITIC
         self.counts = {name: [0, 0] for name in parts}
         """By path, in how many rows each has acted, and how often it has learnt from them."""
@@ -42,7 +51,7 @@ class WovenLearner:
 
         Where the selector is ready, as many as the skill asks for that asks for most.
         """
-        self._weight = self._how.task_weight * progress
+        self._progress = progress
         asked = tuple(p.request(update, steps, progress) for p in self.parts.values())
         if self._selector in self.parts:
             return replace(asked[0], parts=asked[1:])
@@ -55,11 +64,11 @@ class WovenLearner:
         if self._selector in self.parts:
             found = (replace(experience, parts=()), *found)
         own = dict(zip(self.parts, found, strict=True))
-        if self._how.task_weight > 0.0:
-            advantage = self._weight * self._task_advantage(own[self._critic])
-            for name, rows in own.items():
-                if not decides(name):
-                    rows.advantage = advantage
+        if any(self._weights.values()):
+            advantage = self._progress * self._task_advantage(own[self._critic])
+            for name, weight in self._weights.items():
+                if weight:
+                    own[name].advantage = weight * advantage
         for name, rows in own.items():
             self.counts[name][0] += int(
                 rows.reward.size if rows.valid is None else rows.valid.sum()
@@ -130,8 +139,3 @@ def how_it_acted(name: str, rows: Experience) -> dict[str, Tensor]:
         if valid.any():
             found["reward"] = rows.reward[valid].mean()
     return {key: torch.tensor([float(value)]) for key, value in found.items()}
-
-
-def decides(path: str) -> bool:
-    """Whether it is the path of a selector or a critic of skills: they are no skills."""
-    return path.rpartition("/")[2] in (SELECTOR, CRITIC)

@@ -44,8 +44,8 @@ RANGES: list[tuple[type, str, object, str]] = [
     (OffPolicy, "buffer_size", 0, "at least 1"),
     *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN, SAC)),
     (TD3, "buffer_size", 31, r"at least 32 \(num_envs·\(n_step\+1\)\)"),
-    *((OffPolicy, "bouts", bad, "between 0 and 1") for bad in (-0.1, 1.1, NAN)),
-    (OffPolicy, "bout_steps", 0, "at least 1"),
+    *((OffPolicy, "action_repeat", bad, "between 0 and 1") for bad in (-0.1, 1.1, NAN)),
+    (OffPolicy, "action_repeat_steps", 0, "at least 1"),
     (OffPolicy, "learning_starts", -1, "at least 0 and finite"),
     (OffPolicy, "learning_rate_schedule", "kl", "one of constant, linear"),
     (OffPolicy, "network", None, r"a Network\(\)"),
@@ -255,10 +255,10 @@ def test_the_slow_networks_turn_comes_beyond_what_a_float_can_count():
 
 @pytest.mark.parametrize("kind", [DQN, SAC, TD3])
 def test_a_run_that_began_before_there_were_bouts_goes_on_without_them(kind):
-    told = config_to_json(kind(bouts=0.5))
-    assert config_from_json(told).bouts == 0.5
-    del told["bouts"]
-    assert config_from_json(told).bouts == 0.0
+    told = config_to_json(kind(action_repeat=0.5))
+    assert config_from_json(told).action_repeat == 0.5
+    del told["action_repeat"]
+    assert config_from_json(told).action_repeat == 0.0
 
 
 def test_a_run_of_td3_from_before_large_outputs_cost_anything_goes_on_as_it_was():

@@ -1,4 +1,4 @@
-"""What a stage adds to PPO: the floor under discrete actions, the anchor, the task's advantage."""
+"""What a stage adds to PPO: epsilon of discrete actions, the anchor, the task's advantage."""
 
 from dataclasses import replace
 
@@ -11,10 +11,10 @@ from toys import Toy, learn
 
 from skillweave import PPO, Network, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.algorithms.ppo_samples import Terms, floor_now, samples_of
+from skillweave.algorithms.ppo_samples import Terms, epsilon_now, samples_of
 from skillweave.experience import Anchor, Rollout
 from skillweave.networks.heads import ActionHead
-from skillweave.ops.distributions import with_floor
+from skillweave.ops.distributions import with_epsilon
 from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec
 from skillweave.training.learner import adapted
@@ -26,42 +26,42 @@ SMALL = Network(hidden=(8,))
 def test_a_floor_is_shared_among_what_is_allowed():
     logits = torch.tensor([[2.0, 0.0, 1.0, 5.0]])
     mask = torch.tensor([[True, True, True, False]])
-    found = with_floor(logits, mask, torch.tensor([[0.3]])).softmax(-1)
+    found = with_epsilon(logits, mask, torch.tensor([[0.3]])).softmax(-1)
     own = logits[0, :3].softmax(-1)
     torch.testing.assert_close(found[0, :3], 0.7 * own + 0.1)
     assert found[0, 3] < 1e-6
 
 
 def test_the_floor_falls_over_the_budget():
-    config, like = PPO(floor=0.5, floor_final=0.1), torch.zeros(2)
-    assert floor_now(config, 0.25, like).flatten().tolist() == pytest.approx([0.4, 0.4])
-    fast = replace(config, floor_fraction=0.4)
+    config, like = PPO(epsilon=0.5, epsilon_final=0.1), torch.zeros(2)
+    assert epsilon_now(config, 0.25, like).flatten().tolist() == pytest.approx([0.4, 0.4])
+    fast = replace(config, epsilon_fraction=0.4)
     for progress, share in ((0.0, 0.5), (0.1, 0.4), (0.4, 0.1), (1.0, 0.1)):
-        assert floor_now(fast, progress, like).flatten().tolist() == pytest.approx([share] * 2)
-    at_once = replace(config, floor_fraction=0.0)
-    assert floor_now(at_once, 0.0, like).flatten().tolist() == [0.5, 0.5]
-    assert floor_now(at_once, 0.01, like).flatten().tolist() == pytest.approx([0.1, 0.1])
-    assert floor_now(PPO(floor=0.5), 0.9, like).flatten().tolist() == [0.5, 0.5]
-    assert floor_now(PPO(), 0.5, like) is None
+        assert epsilon_now(fast, progress, like).flatten().tolist() == pytest.approx([share] * 2)
+    at_once = replace(config, epsilon_fraction=0.0)
+    assert epsilon_now(at_once, 0.0, like).flatten().tolist() == [0.5, 0.5]
+    assert epsilon_now(at_once, 0.01, like).flatten().tolist() == pytest.approx([0.1, 0.1])
+    assert epsilon_now(PPO(epsilon=0.5), 0.9, like).flatten().tolist() == [0.5, 0.5]
+    assert epsilon_now(PPO(), 0.5, like) is None
 
 
 def test_who_acts_has_the_floor_and_who_is_greedy_has_not():
-    algorithm = make_algorithm(PPO(floor=0.8, network=SMALL), SEEN, gym.spaces.Discrete(4))
+    algorithm = make_algorithm(PPO(epsilon=0.8, network=SMALL), SEEN, gym.spaces.Discrete(4))
     state = algorithm.init([Seeds(0)])
     obs = torch.zeros(1, 1, 3)
     _, head, _ = algorithm.act(algorithm.acting_params(state, 0.0), obs, None, None)
     assert head.softmax(-1).min() >= 0.2 - 1e-6
     greedy = algorithm.acting_params_of(algorithm.weights(state))
-    assert "floor" not in greedy.extra
+    assert "epsilon" not in greedy.extra
 
 
 def test_a_floor_needs_discrete_actions():
-    with pytest.raises(SkillweaveError, match="floor needs discrete actions"):
-        make_algorithm(PPO(floor=0.1), SEEN, SEEN)
-    with pytest.raises(SkillweaveError, match="floor"):
-        PPO(floor=1.5)
-    with pytest.raises(SkillweaveError, match="floor_fraction"):
-        PPO(floor_fraction=1.5)
+    with pytest.raises(SkillweaveError, match="epsilon needs discrete actions"):
+        make_algorithm(PPO(epsilon=0.1), SEEN, SEEN)
+    with pytest.raises(SkillweaveError, match="epsilon"):
+        PPO(epsilon=1.5)
+    with pytest.raises(SkillweaveError, match="epsilon_fraction"):
+        PPO(epsilon_fraction=1.5)
 
 
 def test_divergence_of_heads_is_that_of_their_distributions():
@@ -111,7 +111,7 @@ def rollout_of(algorithm, state, seed=0, **more):
 
 def test_with_a_floor_samples_are_weighted_and_the_clip_counts_from_the_policy_itself():
     """A mixture that is nearly uniform hardly changes where the policy collapses."""
-    config = PPO(floor=0.9, network=SMALL, normalize_obs=False)
+    config = PPO(epsilon=0.9, network=SMALL, normalize_obs=False)
     algorithm = make_algorithm(config, SEEN, gym.spaces.Discrete(4))
     state = algorithm.init([Seeds(0)])
     rollout = rollout_of(algorithm, state)

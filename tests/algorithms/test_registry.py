@@ -17,6 +17,7 @@ from skillweave import (
     PPO,
     SAC,
     Algorithm,
+    Apart,
     Evolution,
     Hierarchy,
     Mutations,
@@ -120,9 +121,14 @@ def test_it_trains_a_plain_agent(tmp_path):
 def test_it_trains_skills_selectors_and_populations(tmp_path):
     config = own(num_envs=4, n_steps=16)
     hierarchy = Hierarchy(
-        "CartPole-v1", [Left(), replace_name(Left(), "again")], call_steps=4, algorithm=config,
-        selector=config, skill_steps=256, selector_steps=256,
-    )  # fmt: skip
+        "CartPole-v1",
+        [Left(), replace_name(Left(), "again")],
+        call_steps=4,
+        algorithm=config,
+        selector=config,
+        apart=Apart(skill_steps=256, selector_steps=256),
+        learn="apart",
+    )
     changes = Mutations(none=0.3, activation=0.0)
     search = Evolution(population=2, generations=2, episodes=1, mutations=changes)
     evolve = {"left": search, "selector": search}

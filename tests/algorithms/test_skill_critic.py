@@ -72,7 +72,7 @@ def test_it_learns_what_each_skill_is_worth():
 
 
 def test_while_skills_are_tried_they_differ_less_in_worth_so_that_few_calls_are_cut():
-    algorithm, state = critic(floor=1.0, floor_final=0.2)
+    algorithm, state = critic(epsilon=1.0, epsilon_final=0.2)
     obs = torch.eye(3)[None]
     assert not algorithm.act(algorithm.learning_params(state), obs, None, None)[1].any()
     state.params.normal_(generator=torch.Generator().manual_seed(0))  # as if it had learnt

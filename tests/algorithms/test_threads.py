@@ -11,7 +11,13 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from toys import Echo, learn
 
-from skillweave import Evolution, Hierarchy, Skill
+from skillweave import (
+    Apart,
+    Evolution,
+    Hierarchy,
+    Skill,
+    TrainDefaults,
+)
 from skillweave.algorithms.config import DQN, PPO, SAC, TD3, AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.networks.config import CNN, RNN, Network
@@ -90,9 +96,15 @@ def trained(path: Path) -> dict[str, bytes]:
     """Every policy's file of a small hierarchy, one skill of which is evolved."""
     algorithm: AlgorithmConfig = PPO(num_envs=4, n_steps=16, batch_size=32, network=WIDE)
     hierarchy = Hierarchy(
-        "CartPole-v1", [Left(), Upright()], call_steps=4, algorithm=algorithm,
-        selector=algorithm, skill_steps=256, selector_steps=512, eval_every=128, eval_episodes=2,
-    )  # fmt: skip
+        "CartPole-v1",
+        [Left(), Upright()],
+        call_steps=4,
+        algorithm=algorithm,
+        selector=algorithm,
+        apart=Apart(skill_steps=256, selector_steps=512),
+        train_defaults=TrainDefaults(eval_every=128, eval_episodes=2),
+        learn="apart",
+    )
     search = Evolution(population=2, generations=2, episodes=2)
     hierarchy.train(path, quiet=True, evolve={"left": search})
     # Checkpoints hold times.

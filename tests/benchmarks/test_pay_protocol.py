@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from declaring import plainly
 
 from benchmarks.pay import __main__ as command
 from benchmarks.pay import agents
@@ -40,7 +41,7 @@ from skillweave import (
     SkillweaveError,
     Step,
 )
-from skillweave.hierarchy import judging
+from skillweave.hierarchy import select_best
 
 TINY = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
 
@@ -87,7 +88,7 @@ class Left(Right):
 
 def declare(task, **how):
     options = {"call_steps": 2, "algorithm": TINY, "selector": TINY} | how
-    return Hierarchy(task.env, [Right(), Left()], **options)
+    return Hierarchy(task.env, [Right(), Left()], **plainly(options))
 
 
 def further(task, skills):
@@ -360,7 +361,7 @@ def test_skills_act_on_every_task_as_they_did_where_they_were_learnt(
     monkeypatch.setattr(Bench, "_score", noted)
     monkeypatch.setattr(Run, "evaluate", asked)
     if found_out:
-        monkeypatch.setattr(judging, "evaluate", judged)
+        monkeypatch.setattr(select_best, "evaluate", judged)
     Bench(replace(suite(), source=source), Results(tmp_path), seed=0).run("hierarchy")
     assert len(found) == 8  # hierarchy, long calls, F4 and always right, on two tasks
     assert set(found.values()) == {greedy}

@@ -49,12 +49,12 @@ EVERY = (*CHAINS, "lander")
 @pytest.mark.parametrize(
     ("case", "tasks", "usual", "changed"),
     [
-        ("low floor", CHAINS, "together", {"floor": 0.3, "floor_final": 0.02}),
-        ("no floor", EVERY, "together", {"floor": 0.0, "floor_final": 0.0}),
+        ("low epsilon", CHAINS, "together", {"epsilon": 0.3, "epsilon_final": 0.02}),
+        ("no epsilon", EVERY, "together", {"epsilon": 0.0, "epsilon_final": 0.0}),
         ("task advantage", EVERY, "together", {"task_weight": 1.0}),
         ("no task advantage", ("lander",), "together", {"task_weight": 0.0}),
-        ("anchor", ("lander",), "together", {"anchor_nats": 0.05}),
-        ("then, no anchor", CHAINS, "then", {"anchor_nats": None}),
+        ("anchor", ("lander",), "together", {"reference_kl": 0.05}),
+        ("then, no anchor", CHAINS, "then", {"reference_kl": None}),
     ],
 )
 def test_a_case_changes_what_it_names_and_nothing_else(
@@ -74,7 +74,7 @@ def test_a_case_changes_what_it_names_and_nothing_else(
     [
         ("8x8", "anchor", "'anchor' is the same as 'together' on 8x8"),
         ("16x16", "no call cost", "'no call cost' is the same as 'together' on 16x16"),
-        ("lander", "low floor", "'low floor' is the same as 'together' on lander"),
+        ("lander", "low epsilon", "'low epsilon' is the same as 'together' on lander"),
         ("lander", "then, no anchor", "is the same as 'then' on lander"),
         ("lander", "no imitation", "'landing' has an algorithm of its own"),
         ("lander", "limit ends", "skills that learn apart have no calls"),

@@ -41,7 +41,7 @@ class Left(Skill):
 
 
 def declared() -> Hierarchy:
-    return Hierarchy("CartPole-v1", [Left()])
+    return Hierarchy("CartPole-v1", [Left()], learn="apart")
 
 
 def test_settings_become_a_plan_for_each_stage():

@@ -1,4 +1,4 @@
-"""Bouts: an environment takes one random action again and again."""
+"""ActionRepeat: an environment takes one random action again and again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from skillweave import DQN, SAC, TD3, Network
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.acting import Acting, Bouts, Request
+from skillweave.collecting.acting import Acting, ActionRepeat, Request
 from skillweave.seeding import Seeds
 from skillweave.training.learner import Stack
 from skillweave.training.replay_learner import learner_of
@@ -28,8 +28,8 @@ def acting_of(config, space):
 
 def played(acting, params, at, rows, chance=0.5, mask=None, **how):
     """What is done in rows ``at`` to ``at + rows``, (T, N, …)."""
-    bouts = Bouts(at, chance, LONGEST, Seeds(1))
-    request = Request(rows, (params,), np.ones(1), Seeds(2), bouts=bouts, **how)
+    action_repeat = ActionRepeat(at, chance, LONGEST, Seeds(1))
+    request = Request(rows, (params,), np.ones(1), Seeds(2), action_repeat=action_repeat, **how)
     acting.begin(request)
     return np.stack([acting.all(OBS, mask, None).action.copy() for _ in range(rows)])
 
@@ -93,8 +93,8 @@ def test_members_of_a_stack_have_the_bouts_that_they_have_alone():
     two = algorithm.acting_params(algorithm.init([Seeds(m) for m in (1, 2)]), 1.0)
     obs, found = np.zeros((3 * N, 3), np.float32), []
     for acting, params in zip(stacks, ((three,), (members[0], two)), strict=True):
-        bouts = Bouts(0, 1.0, LONGEST, Seeds(1))
-        acting.begin(Request(LONGEST, params, np.ones(3), Seeds(2), bouts=bouts))
+        action_repeat = ActionRepeat(0, 1.0, LONGEST, Seeds(1))
+        acting.begin(Request(LONGEST, params, np.ones(3), Seeds(2), action_repeat=action_repeat))
         found.append(np.stack([acting.all(obs, None, None).action for _ in range(LONGEST)]))
     np.testing.assert_allclose(*found, atol=1e-6)
     alone = played(Acting([(algorithm, 1)], N), members[0], 0, LONGEST, chance=1.0)
@@ -103,17 +103,20 @@ def test_members_of_a_stack_have_the_bouts_that_they_have_alone():
 
 
 def test_a_learner_counts_rows_from_the_start_of_its_stage_and_asks_for_fewer_bouts_in_the_end():
-    config = SAC(num_envs=4, train_freq=3, bouts=0.4, bout_steps=7, network=NET)
+    config = SAC(num_envs=4, train_freq=3, action_repeat=0.4, action_repeat_steps=7, network=NET)
     algorithm = make_algorithm(config, SPACE, STEER)
     stack = Stack(algorithm, algorithm.init([Seeds(0)]))
     learner = learner_of(stack, 4, Seeds(5))
-    asked = [learner.request(u, 0, progress).bouts for u, progress in ((0, 0.0), (1, 0.5), (9, 1))]
+    asked = [
+        learner.request(u, 0, progress).action_repeat
+        for u, progress in ((0, 0.0), (1, 0.5), (9, 1))
+    ]
     assert [b.at for b in asked] == [0, 3, 27]
     assert [b.chance for b in asked] == pytest.approx([0.4, 0.2, 0.0])
     assert {(b.longest, b.seeds) for b in asked} == {(7, asked[0].seeds)}
-    never = make_algorithm(SAC(bouts=0.0, network=NET), SPACE, STEER)
+    never = make_algorithm(SAC(action_repeat=0.0, network=NET), SPACE, STEER)
     quiet = learner_of(Stack(never, never.init([Seeds(0)])), 8, Seeds(5))
-    assert quiet.request(0, 0, 0.0).bouts is None
+    assert quiet.request(0, 0, 0.0).action_repeat is None
 
 
 def test_a_forbidden_action_is_not_taken():
@@ -127,7 +130,11 @@ def test_a_forbidden_action_is_not_taken():
 def test_collectors_have_bouts_of_their_own(steering):
     acting, params = steering
     request = Request(
-        2 * LONGEST, (params,), np.ones(1), Seeds(2), bouts=Bouts(0, 0.5, LONGEST, Seeds(1))
+        2 * LONGEST,
+        (params,),
+        np.ones(1),
+        Seeds(2),
+        action_repeat=ActionRepeat(0, 0.5, LONGEST, Seeds(1)),
     )
     done = []
     for number in (0, 1, 0):

@@ -13,7 +13,7 @@ from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import side_by_side
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.guide import SMOOTHED, AskedElsewhere, Guide, as_logits
+from skillweave.collecting.guide import SMOOTHED, ActiveGuide, AskedElsewhere, as_logits
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import make_engine
 from skillweave.seeding import Seeds
@@ -55,7 +55,7 @@ def collector_of(guide, call_steps=2):
 
 @pytest.mark.parametrize("call_steps", [2, Lengths(1, 3)])
 def test_only_what_the_automatons_state_allows_is_called(call_steps):
-    collector, seen = collector_of(Guide(bound(AUTOMATON)), call_steps), set()
+    collector, seen = collector_of(ActiveGuide(bound(AUTOMATON)), call_steps), set()
     lengths = collector.skills.choices // 4
     for request in itertools.islice(requests(60), 3):
         found = collector.collect(request).experience
@@ -71,7 +71,7 @@ def test_only_what_the_automatons_state_allows_is_called(call_steps):
 
 
 def test_who_is_not_restricted_is_told_what_the_guide_would_do():
-    collector = collector_of(Guide(bound(AUTOMATON), restricts=False, tells=True))
+    collector = collector_of(ActiveGuide(bound(AUTOMATON), restricts=False, tells=True))
     found = collector.collect(next(requests(80))).experience
     valid = np.ones(found.reward.shape, bool) if found.valid is None else found.valid
     key = found.obs[..., KEY] == 1
@@ -90,7 +90,7 @@ def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy
     for greedy in (False, True):
         collector = DecisionCollector(
             make_engine(SPEC, N), AskedElsewhere(N), skills,
-            guide=Guide(bound(AUTOMATON), decides=True),
+            guide=ActiveGuide(bound(AUTOMATON), decides=True),
         )  # fmt: skip
         collector.start(Seeds(2))
         request = next(requests(80))
@@ -119,7 +119,7 @@ def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts()
     skills = (Leave(), Wait(), type("Again", (Leave,), {"name": "get_key"})())
     skill_set = SkillSet(skills, tuple(s.policy for s in skills), call_steps=1)
     names = tuple(s.name for s in skills)
-    guide = Guide(bound(clock, names), decides=True)
+    guide = ActiveGuide(bound(clock, names), decides=True)
     collector = DecisionCollector(make_engine(SPEC, N), AskedElsewhere(N), skill_set, guide=guide)
     collector.start(Seeds(2))
     found = collector.collect(next(requests(60))).experience
@@ -134,7 +134,7 @@ def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts()
 def test_collectors_agree_on_what_they_tell_also_where_no_call_has_ended(tells):
     found = []
     for call_steps, rows in ((30, 1), (1, 2)):
-        collector = collector_of(Guide(bound(AUTOMATON), tells=tells), call_steps)
+        collector = collector_of(ActiveGuide(bound(AUTOMATON), tells=tells), call_steps)
         if rows == 1:  # it waits for two steps
             collector.acting.some = lambda ids, *seen: Acted(np.full(len(ids), 3), None, None)
         found.append(collector.collect(next(requests(rows))))

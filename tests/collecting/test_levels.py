@@ -324,7 +324,7 @@ class Early(Skill):
 def test_apart_a_hierarchy_is_judged_as_the_skill_that_it_is(call_steps):
     skills = SkillSet((Early(),), (Early.policy,), call_steps=call_steps)
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
-    collector = DecisionCollector(engine, Choices(N, 1), skills, seen_as=Paid())
+    collector = DecisionCollector(engine, Choices(N, 1), skills, as_skill=Paid())
     collector.start(Seeds(7))
     rows = collector.collect(next(requests(60, GAMMA))).experience
     for n in range(N):

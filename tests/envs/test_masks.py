@@ -8,7 +8,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave import DQN, PPO, SAC, Hierarchy, Network, Skill, SkillweaveError, evaluate
+from skillweave import (
+    DQN,
+    PPO,
+    SAC,
+    Apart,
+    Hierarchy,
+    Network,
+    Selection,
+    Skill,
+    SkillweaveError,
+    TrainDefaults,
+    evaluate,
+)
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
@@ -232,10 +244,16 @@ def test_learnt_skills_selectors_and_flat_agents_never_take_what_is_forbidden(al
     # Gate raises an error at the first forbidden action: in training, looks, evaluation, videos.
     pytest.importorskip("PIL")
     hierarchy = Hierarchy(
-        Gate, [Late(), type("Any", (Skill,), {"max_steps": 2})()], algorithm=algorithm,
-        selector=LEARNERS[0], call_steps=3, skill_steps=300, selector_steps=300, eval_every=200,
-        eval_episodes=2, greedy_skills=False,
-    )  # fmt: skip
+        Gate,
+        [Late(), type("Any", (Skill,), {"max_steps": 2})()],
+        algorithm=algorithm,
+        selector=LEARNERS[0],
+        call_steps=3,
+        apart=Apart(skill_steps=300, selector_steps=300),
+        selection=Selection(greedy_skills=False),
+        train_defaults=TrainDefaults(eval_every=200, eval_episodes=2),
+        learn="apart",
+    )
     run = hierarchy.train(tmp_path / "run", quiet=True)
     for how in ({"deterministic": False}, {"skill": "any"}, {}):
         assert run.evaluate(6, **how).mean > 0
@@ -258,9 +276,14 @@ def test_a_hierarchy_learns_to_drive_gymnasiums_taxi_by_its_masks(tmp_path):
     spec = EnvSpec("Taxi-v4", {"max_episode_steps": 20}, (Strict,))
     fast = type("Fast", (Skill,), {"max_steps": 3})()
     hierarchy = Hierarchy(
-        spec, [fast, type("Plain", (Skill,), {})()], algorithm=LEARNERS[1], selector=LEARNERS[0],
-        call_steps=5, skill_steps=300, selector_steps=300,
-    )  # fmt: skip
+        spec,
+        [fast, type("Plain", (Skill,), {})()],
+        algorithm=LEARNERS[1],
+        selector=LEARNERS[0],
+        call_steps=5,
+        apart=Apart(skill_steps=300, selector_steps=300),
+        learn="apart",
+    )
     run = hierarchy.train(tmp_path / "run", quiet=True)
     # every step costs 1; only a forbidden passenger's move costs 10
     for skill in (None, "fast"):

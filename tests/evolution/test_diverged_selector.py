@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from small_runs import interrupt_at_checkpoint
 
-from skillweave import PPO, EnvSpec, Evolution, Hierarchy, Network, Skill
+from skillweave import (
+    PPO,
+    Apart,
+    EnvSpec,
+    Evolution,
+    Hierarchy,
+    Network,
+    Skill,
+)
 from skillweave.evolution.part import Part
 from skillweave.runs.files import read_tensors
 
@@ -26,7 +34,14 @@ class Stay(Skill):
 def declare():
     ppo = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network((8,)))
     env = EnvSpec("CartPole-v1", engine="sync", workers=1)
-    return Hierarchy(env, [Go(), Stay()], call_steps=9, selector=ppo, selector_steps=1200)
+    return Hierarchy(
+        env,
+        [Go(), Stay()],
+        call_steps=9,
+        selector=ppo,
+        apart=Apart(selector_steps=1200),
+        learn="apart",
+    )
 
 
 @pytest.mark.parametrize("checkpoint", [1, 2])

@@ -19,6 +19,7 @@ from skillweave import (
     SAC,
     TD3,
     Agent,
+    Apart,
     EnvSpec,
     Evolution,
     Heir,
@@ -198,7 +199,12 @@ def test_a_killed_population_of_selectors_ends_with_the_very_same_weights(
 ):
     # Generations end in the middle of calls, which are up to 7 steps long.
     hierarchy = Hierarchy(
-        spec("ppo"), [Still(), Moving()], selector=config, selector_steps=256, call_steps=7
+        spec("ppo"),
+        [Still(), Moving()],
+        selector=config,
+        call_steps=7,
+        apart=Apart(selector_steps=256),
+        learn="apart",
     )
     evolve = {"selector": Evolution(3, 4, 2, mutations=EVERYTHING)}
     whole = hierarchy.train(tmp_path / "whole", quiet=True, evolve=evolve)
@@ -452,9 +458,14 @@ class Right(Skill):
 
 def test_skills_and_selector_evolve_each_by_its_own_plan(tmp_path):
     hierarchy = Hierarchy(
-        spec("ppo"), [Left(), Right()], algorithm=CONFIGS["ppo"], selector=CONFIGS["dqn"],
-        skill_steps=64, selector_steps=96, call_steps=2,
-    )  # fmt: skip
+        spec("ppo"),
+        [Left(), Right()],
+        algorithm=CONFIGS["ppo"],
+        selector=CONFIGS["dqn"],
+        call_steps=2,
+        apart=Apart(skill_steps=64, selector_steps=96),
+        learn="apart",
+    )
     plan = {"right": Evolution(3, 2, 2), "selector": Evolution(2, 3, 2), "left": None}
     run = hierarchy.train(tmp_path / "run", quiet=True, evolve=plan)
     stages = {p["name"]: p for p in run.info()["stages"]}
@@ -478,7 +489,7 @@ def test_skills_and_selector_evolve_each_by_its_own_plan(tmp_path):
     ],
 )
 def test_a_plan_that_does_not_fit_is_refused_before_anything_is_written(plan, said, tmp_path):
-    hierarchy = Hierarchy(spec("ppo"), [Left(), Right()], algorithm=CONFIGS["ppo"])
+    hierarchy = Hierarchy(spec("ppo"), [Left(), Right()], algorithm=CONFIGS["ppo"], learn="apart")
     with pytest.raises(SkillweaveError, match=said):
         hierarchy.train(tmp_path / "run", quiet=True, evolve=plan)
     assert not (tmp_path / "run").exists()

@@ -53,9 +53,11 @@ def test_a_run_acts_and_forgets_when_told(tmp_path: Path) -> None:
         policy = from_function(lambda obs: np.zeros(len(obs), np.int64))
 
     hierarchy = Hierarchy(
-        EnvSpec(Walk, engine="sync"), [Down(), Up()],
+        EnvSpec(Walk, engine="sync"),
+        [Down(), Up()],
         selector=lambda obs, last: np.where(last.skill == 0, 1, 0),
-    )  # fmt: skip
+        learn="apart",
+    )
     run = hierarchy.train(tmp_path / "run", quiet=True)
     obs = np.zeros(4, np.float32)
     assert [run.act(obs) for _ in range(5)] == [0, 0, 0, 2, 2]

@@ -6,9 +6,21 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from declaring import plainly
 from gymnasium.spaces import Box, Dict, Discrete, Text
 
-from skillweave import DQN, PPO, SAC, EnvSpec, Hierarchy, Reflex, Skill, SkillweaveError, recipes
+from skillweave import (
+    DQN,
+    PPO,
+    SAC,
+    Apart,
+    EnvSpec,
+    Hierarchy,
+    Reflex,
+    Skill,
+    SkillweaveError,
+    recipes,
+)
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Run
 from skillweave.cli.overrides import apply_overrides, list_settings
@@ -43,7 +55,7 @@ class Ready(Skill):
 
 
 def declare(*skills, env="CartPole-v1", **more) -> Hierarchy:
-    return Hierarchy(env, skills or [Center(), Lean()], **more)
+    return Hierarchy(env, skills or [Center(), Lean()], **plainly(more))
 
 
 def named(name: str, **attributes) -> Skill:
@@ -59,7 +71,7 @@ def test_a_target_is_told_by_the_name_of_its_setting() -> None:
 
 
 WRONG = {
-    "no skills": (lambda: Hierarchy("CartPole-v1", []), "at least one skill"),
+    "no skills": (lambda: Hierarchy("CartPole-v1", [], learn="apart"), "at least one skill"),
     "no name": (lambda: declare(named("")), "Custom.*no name"),
     "a name that is no file name": (lambda: declare(named("a/b")), "'a/b'.*Custom.*letters"),
     "two of one name": (lambda: declare(Center(), Center()), "two skills.*'center'"),
@@ -91,7 +103,10 @@ def test_a_wrong_declaration_names_the_skill_and_the_field(case):
 
 
 NOT_CHECKED = {
-    "one skill without a list": (lambda: Hierarchy("CartPole-v1", Center()), "skills"),
+    "one skill without a list": (
+        lambda: Hierarchy("CartPole-v1", Center(), learn="apart"),
+        "skills",
+    ),
     "a reflex that is only a function": (lambda: declare(reflexes=[zeros]), "not a Reflex"),
     "skill_steps='many'": (lambda: declare(skill_steps="many"), "skill_steps is 'many'"),
     "settings as a class": (lambda: declare(algorithm=PPO), "algorithm"),
@@ -524,7 +539,9 @@ def test_a_hierarchy_as_a_skill_needs_a_proper_name(tmp_path, name):
 @pytest.mark.parametrize("flat", [True, False])
 def test_a_budget_that_ends_before_learning_begins_is_refused(tmp_path, flat):
     late = DQN(learning_starts=500)
-    h = Hierarchy("CartPole-v1", [Plain()], algorithm=late, skill_steps=500, flat_steps=500)
+    h = Hierarchy(
+        "CartPole-v1", [Plain()], algorithm=late, apart=Apart(skill_steps=500), learn="apart"
+    )
     name = "agent" if flat else "plain"
     says = f"stage '{name}': its budget is 500 steps, but it begins to learn only after 500"
     with pytest.raises(SkillweaveError, match=says):
@@ -560,20 +577,25 @@ def test_absurd_spaces_are_refused_with_their_size_before_anything_is_made(tmp_p
         observation_space = space if which == "observation" else gym.spaces.Discrete(2)
         action_space = space if which == "action" else gym.spaces.Discrete(2)
 
-    h = Hierarchy(Absurd, [Plain()])
+    h = Hierarchy(Absurd, [Plain()], learn="apart")
     with pytest.raises(SkillweaveError, match=rf"{which} space .* is \d.*,000 are supported.*GB"):
         h.train(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 def test_a_rollout_that_does_not_fit_into_memory_is_refused(tmp_path):
-    h = Hierarchy("CartPole-v1", [Plain()], algorithm=PPO(n_steps=10**12))
+    h = Hierarchy("CartPole-v1", [Plain()], algorithm=PPO(n_steps=10**12), learn="apart")
     with pytest.raises(SkillweaveError, match=r"a rollout of .*lower num_envs or n_steps"):
         h.train(tmp_path / "run")
 
 
 def test_a_fixed_action_of_a_reflex_is_checked_before_training(tmp_path):
-    h = Hierarchy("CartPole-v1", [Plain()], reflexes=[Reflex(lambda obs: obs[:, 0] > 9, 2, "far")])
+    h = Hierarchy(
+        "CartPole-v1",
+        [Plain()],
+        reflexes=[Reflex(lambda obs: obs[:, 0] > 9, 2, "far")],
+        learn="apart",
+    )
     with pytest.raises(SkillweaveError, match="reflex 'far': action returned 2, which is no"):
         h.train(tmp_path / "run")
 
@@ -595,7 +617,7 @@ def test_a_fixed_action_of_a_reflex_is_checked_before_training(tmp_path):
 def test_a_wrong_argument_of_train_is_told(tmp_path, wrong, says):
     given = {"run_dir": tmp_path / "run", **wrong}
     with pytest.raises(SkillweaveError, match=says):
-        Hierarchy("CartPole-v1", [Plain()]).train(given.pop("run_dir"), **given)
+        Hierarchy("CartPole-v1", [Plain()], learn="apart").train(given.pop("run_dir"), **given)
     assert not (tmp_path / "run").exists()
 
 
@@ -614,4 +636,4 @@ def test_a_wrong_argument_of_train_is_told(tmp_path, wrong, says):
 )
 def test_a_field_of_another_kind_is_told(wrong, says):
     with pytest.raises(SkillweaveError, match=says):
-        Hierarchy(**{"env": "CartPole-v1", "skills": [Plain()], **wrong})
+        Hierarchy(**plainly({"env": "CartPole-v1", "skills": [Plain()], **wrong}))

@@ -7,10 +7,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from declaring import plainly
 from gymnasium.spaces import Box, MultiDiscrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, sb3_zip
 
-from skillweave import PPO, Hierarchy, Skill, SkillweaveError, from_onnx, from_sb3, from_torch
+from skillweave import (
+    PPO,
+    Apart,
+    Hierarchy,
+    Skill,
+    SkillweaveError,
+    from_onnx,
+    from_sb3,
+    from_torch,
+)
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.types import Memoryless
 
@@ -26,7 +36,9 @@ def skill(name, policy, **attributes):
 
 
 def declare(*skills, env="CartPole-v1", **more):
-    return Hierarchy(env, skills, selector=SMALL, selector_steps=500, call_steps=5, **more)
+    return Hierarchy(
+        env, skills, selector=SMALL, call_steps=5, apart=Apart(selector_steps=500), **plainly(more)
+    )
 
 
 def all_kinds(folder):

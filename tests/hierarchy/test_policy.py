@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from declaring import plainly
 from reference_calls import (
     EPISODE,
     POSITION,
@@ -264,7 +265,10 @@ def play_one(one: One, seeds: Iterator[int], steps: int) -> list[tuple[int, int]
 
 def nested() -> tuple[HierarchyPolicy, One]:
     """Three levels: top of (middle, Left); middle of (bottom, Zigzag); bottom of three scripts."""
-    bottom_kinds, declared = (Counter, Right, Left), Hierarchy(Walk, [Left(), Right()])
+    bottom_kinds, declared = (
+        (Counter, Right, Left),
+        Hierarchy(Walk, [Left(), Right()], learn="apart"),
+    )
     bottom = hierarchy(*bottom_kinds, call_steps=2)
     as_bottom = Run(declared, None, bottom).as_skill("bottom", max_steps=3)
     middle = hierarchy(as_bottom, Zigzag, call_steps=5)
@@ -295,7 +299,9 @@ def test_a_hierarchy_of_hierarchies_acts_as_scalar_ones_side_by_side_do(seed):
 
 def test_a_hierarchy_as_a_skill_of_options_env_acts_as_the_scalar_one():
     inner = hierarchy(Counter, Right, Left, call_steps=2)
-    skill = Run(Hierarchy(Walk, [Left()]), None, inner).as_skill("inner", max_steps=5)
+    skill = Run(Hierarchy(Walk, [Left()], learn="apart"), None, inner).as_skill(
+        "inner", max_steps=5
+    )
     keeper = Keeper()
     engine = make_engine(EnvSpec(keeper, engine="sync"), N)
     env = OptionsEnv(engine, skill_set(skill, Left, call_steps=9), 0.99)
@@ -345,14 +351,14 @@ class Remote(Skill):
 
 def alone(skill: Skill, others: tuple, **more) -> Run:
     """A run of a hierarchy in which a selector never chooses ``skill``, which comes last."""
-    declared = Hierarchy(Walk, [*others, skill], **more)
+    declared = Hierarchy(Walk, [*others, skill], **plainly(more))
     skills = declared.skill_set([s.policy for s in declared.skills])
     return Run(declared, None, HierarchyPolicy(Chooser(len(skills.skills)), skills))
 
 
 def always(skill: Skill, **more) -> HierarchyPolicy:
     """A selector that has no choice."""
-    declared = Hierarchy(Walk, [skill], **more)
+    declared = Hierarchy(Walk, [skill], **plainly(more))
     return HierarchyPolicy(Chooser(1), declared.skill_set([skill.policy]))
 
 
@@ -394,7 +400,7 @@ def test_a_film_of_a_skill_alone_shows_its_reflexes_too(tmp_path):
             return np.zeros((8, 8, 3), np.uint8)
 
     anywhere = Reflex(lambda obs: np.ones(len(obs), bool), action=2)
-    declared = Hierarchy(Shown, [Left(), Zigzag()], reflexes=[anywhere])
+    declared = Hierarchy(Shown, [Left(), Zigzag()], reflexes=[anywhere], learn="apart")
     policy = HierarchyPolicy(Chooser(2), declared.skill_set([Left.policy, Zigzag.policy]))
     told = Run(declared, tmp_path / "run", policy).render(
         tmp_path / "a.gif", episodes=3, skill="left"

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from declaring import plainly
 from small_runs import ON, Balance, Left, Push, assert_same, interrupt_at_checkpoint
 from small_runs import Left as SmallLeft
 
@@ -28,7 +29,7 @@ def declare(**how):
         "selector_steps": 200,
         "cut_every": 100,
     }
-    return Hierarchy(**options | how)
+    return Hierarchy(**plainly(options | how))
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch
+from declaring import plainly
 
 from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm, state_from
@@ -24,7 +25,7 @@ NAMES = "left", "right", "stay"
 def declare(names: tuple[str, ...] = NAMES) -> Hierarchy:
     skills = [type(name, (Skill,), {"name": name})() for name in names]
     how: dict[str, Any] = {"skill_steps": 32, "selector_steps": 64, "call_steps": 4}
-    return Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, **how)
+    return Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, **plainly(how))
 
 
 @pytest.fixture(scope="module")

@@ -56,7 +56,7 @@ def test_a_flat_baseline_sees_the_whole_observation():
     # Else it would not know what the task is, and any hierarchy would win.
     part = Network((8,), sees=(0, 1))
     config = PPO(network=part, critic=replace(part, hidden=(9,)))
-    hierarchy = Hierarchy("CartPole-v1", [Upright()], algorithm=config)
+    hierarchy = Hierarchy("CartPole-v1", [Upright()], algorithm=config, learn="apart")
     found = hierarchy.plain_agent().algorithm
     assert (found.network, found.critic) == (Network((8,)), Network((9,)))
     assert hierarchy.algorithm is config

@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from declaring import plainly
 from ready_selectors import chain
 from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, got_key, has_key
 from small_runs import OFF, ON, SMALL, Whole, lines
 
 from skillweave import (
     PPO,
+    Apart,
     Automaton,
     Evolution,
     Hierarchy,
@@ -21,6 +23,7 @@ from skillweave import (
     SkillweaveError,
     Step,
     Together,
+    TrainDefaults,
     evaluate,
     tree,
 )
@@ -103,7 +106,7 @@ def declare(*skills, **how):
         "cut_every": 75,
         "greedy_skills": True,  # chance is another one with another number of environments
     }
-    return Hierarchy(**options | how)
+    return Hierarchy(**plainly(options | how))
 
 
 KINDS = {
@@ -216,9 +219,14 @@ def test_a_selector_near_its_guide_does_what_the_guide_does(tmp_path):
         # What the task pays says nothing here: no call is worth more than another.
         skills = [Wait(), type("Other", (Wait,), {"name": "other"})()]
         hierarchy = Hierarchy(
-            SPEC, skills, selector=PPO(num_envs=4, n_steps=32, network=SMALL, learning_rate=1e-2),
-            selector_steps=6_000, call_steps=2, cut_every=100_000, **how,
-        )  # fmt: skip
+            SPEC,
+            skills,
+            selector=PPO(num_envs=4, n_steps=32, network=SMALL, learning_rate=1e-2),
+            call_steps=2,
+            apart=Apart(selector_steps=6_000),
+            train_defaults=TrainDefaults(checkpoint_every=100_000),
+            **plainly(how),
+        )
         run = hierarchy.train(tmp_path / str(len(how)), seed=1, quiet=True)
         told = [line for line in lines(run.path) if "anchor_kl" in line]
         found = run.evaluate(20, deterministic=False).skill_steps

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from declaring import plainly
 from ready_selectors.chain import (
     KEY,
     PLACE,
@@ -52,7 +53,7 @@ SELECTORS = {
 def declare(selector: Any, *more: Skill, **settings: Any) -> Hierarchy:
     skills = [GetKey(), OpenDoor(), Leave(), Wait(), *more]
     settings = {"call_steps": 3, "algorithm": SMALL, "skill_steps": 64} | settings
-    return Hierarchy(SPEC, skills, selector=selector, **settings)
+    return Hierarchy(SPEC, skills, selector=selector, **plainly(settings))
 
 
 @pytest.mark.parametrize("kind", SELECTORS)
@@ -78,7 +79,7 @@ def test_many_environments_at_once_are_each_as_alone(kind, nested, tmp_path):
             return np.where(waits, 1, 0)
 
         inner = run.as_skill("inner", call_steps=5)
-        outer = Hierarchy(SPEC, [inner, Wait()], selector=choose, call_steps=None)
+        outer = Hierarchy(SPEC, [inner, Wait()], selector=choose, call_steps=None, learn="apart")
         policy = outer.train(tmp_path / "outer", quiet=True).policy
     alone = evaluate(policy, SPEC, episodes=12, num_envs=1)
     together = evaluate(policy, SPEC, episodes=12, num_envs=5)
@@ -94,7 +95,7 @@ def test_as_a_skill_under_a_selector_that_is_trained(kind, tmp_path):
 
     def outer() -> Hierarchy:
         steps = {"call_steps": 4, "selector_steps": 128, "cut_every": 32}
-        return Hierarchy(SPEC, [inner, Wait()], selector=SMALL, **steps)
+        return Hierarchy(SPEC, [inner, Wait()], selector=SMALL, **plainly(steps))
 
     run = outer().train(tmp_path / "outer", quiet=True)
     assert outer().load(run.path).evaluate(8) == run.evaluate(8)

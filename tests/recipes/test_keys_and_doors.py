@@ -228,6 +228,6 @@ def test_who_goes_on_learns_together_by_the_advantage_of_the_task_too():
     found = rooms.going_on("multi-room")
     assert (found.learn, found.total_steps) == ("together", 750_000)
     how = found.together
-    assert (how.task_weight, how.floor, how.floor_final) == (1.0, 0.1, 0.0)
+    assert (how.task_weight, how.epsilon, how.epsilon_final) == (1.0, 0.1, 0.0)
     assert rooms.going_on("multi-room", together_steps=4096).total_steps == 4096
     assert [s.name for s in found.skills if s.policy is not None] == ["explore"]

@@ -210,7 +210,7 @@ def test_skills_see_all_but_the_leg():
 def test_calls_by_lot_become_few_long_before_the_end():
     (stage,) = training.stages_of(shuttle.declare())
     config = stage.config
-    assert (config.floor, config.floor_final, config.floor_fraction) == (0.95, 0.05, 0.4)
+    assert (config.epsilon, config.epsilon_final, config.epsilon_fraction) == (0.95, 0.05, 0.4)
 
 
 def test_the_protocol_trains_in_as_many_processes_as_the_recipe():

@@ -92,4 +92,4 @@ CALLS = [
 
 
 def declare(env: Any = Walkway) -> Hierarchy:
-    return Hierarchy(EnvSpec(env, engine="sync"), [Go(), Stay()], selector=choose)
+    return Hierarchy(EnvSpec(env, engine="sync"), [Go(), Stay()], selector=choose, learn="apart")

@@ -63,7 +63,9 @@ def test_a_missing_package_is_said_before_anything_is_written(
 
     uninstall("wandb", monkeypatch)
     with pytest.raises(MissingExtra):
-        Hierarchy("CartPole-v1", [Balance()]).train(tmp_path / "run", track=["wandb"])
+        Hierarchy("CartPole-v1", [Balance()], learn="apart").train(
+            tmp_path / "run", track=["wandb"]
+        )
     assert not (tmp_path / "run").exists()
 
 

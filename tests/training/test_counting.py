@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from declaring import plainly
 
 import skillweave as sw
 from skillweave.envs import engine as engines
@@ -61,7 +62,7 @@ def reported(run: sw.Run) -> int:
 def hierarchy(**settings) -> sw.Hierarchy:
     given = {"algorithm": SMALL, "selector": SMALL, "skill_steps": 600, "selector_steps": 600}
     spec = sw.EnvSpec(Walk, engine="sync")
-    return sw.Hierarchy(spec, [Late(), Always()], call_steps=3, **{**given, **settings})
+    return sw.Hierarchy(spec, [Late(), Always()], call_steps=3, **plainly({**given, **settings}))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +125,7 @@ def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
         def policy(self, obs):
             return np.ones(len(obs), np.int64)
 
-    declared = sw.Hierarchy(sw.EnvSpec(Walk, engine="sync"), [Zero(), One()])
+    declared = sw.Hierarchy(sw.EnvSpec(Walk, engine="sync"), [Zero(), One()], learn="apart")
     declared.selector_steps //= 20  # a twentieth of the default budget
     run = declared.train(tmp_path / "run", quiet=True)
     updates = sum(1 for _ in RunDirectory.open(run.path).metrics())
@@ -139,7 +140,13 @@ def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_t
 ):
     # Episodes of 20 steps; cuts every 5 to 16 steps of an environment, generations as short.
     spec, task = sw.EnvSpec(Walk, engine="sync"), Always()
-    declared = sw.Hierarchy(spec, [task], algorithm=algorithm, flat_steps=640, cut_every=20)
+    declared = sw.Hierarchy(
+        spec,
+        [task],
+        algorithm=algorithm,
+        train_defaults=sw.TrainDefaults(checkpoint_every=20),
+        learn="apart",
+    )
     run = declared.train(tmp_path / "run", flat=True, quiet=True, evolve=evolve)
     lines = list(RunDirectory.open(run.path).metrics())
     ended = [line for line in lines if "length" in line]

@@ -10,7 +10,16 @@ import pytest
 import torch
 from toys import Calls, Clockwork, Countdown, Echo, Toy
 
-from skillweave import DQN, PPO, Hierarchy, Network, Skill, SkillweaveError
+from skillweave import (
+    DQN,
+    PPO,
+    Apart,
+    Hierarchy,
+    Network,
+    Skill,
+    SkillweaveError,
+    TrainDefaults,
+)
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
@@ -109,9 +118,15 @@ def test_a_run_is_evaluated_at_every_level_and_that_changes_nothing(tmp_path, al
     weights = []
     for every in (1000, None):
         hierarchy = Hierarchy(
-            "CartPole-v1", [Balance()], algorithm=algorithm, selector=algorithm, call_steps=5,
-            skill_steps=2200, selector_steps=2200, eval_every=every, eval_episodes=3,
-        )  # fmt: skip
+            "CartPole-v1",
+            [Balance()],
+            algorithm=algorithm,
+            selector=algorithm,
+            call_steps=5,
+            apart=Apart(skill_steps=2200, selector_steps=2200),
+            train_defaults=TrainDefaults(eval_every=every, eval_episodes=3),
+            learn="apart",
+        )
         run = hierarchy.train(tmp_path / str(every), quiet=True)
         lines = list(RunDirectory.open(run.path).metrics())
         for stage in ("balance", "selector"):
@@ -127,6 +142,13 @@ def test_a_run_is_evaluated_at_every_level_and_that_changes_nothing(tmp_path, al
 
 def test_a_wrong_number_is_named():
     with pytest.raises(SkillweaveError, match="eval_every is 0"):
-        Hierarchy("CartPole-v1", [Balance()], eval_every=0)
+        Hierarchy(
+            "CartPole-v1", [Balance()], train_defaults=TrainDefaults(eval_every=0), learn="apart"
+        )
     with pytest.raises(SkillweaveError, match="eval_episodes is None"):
-        Hierarchy("CartPole-v1", [Balance()], eval_episodes=None)
+        Hierarchy(
+            "CartPole-v1",
+            [Balance()],
+            train_defaults=TrainDefaults(eval_episodes=None),
+            learn="apart",
+        )

@@ -1,8 +1,17 @@
 """A replay buffer that cannot be made is refused before there is a run directory."""
 
 import pytest
+from declaring import plainly
 
-from skillweave import DQN, SAC, Evolution, Hierarchy, Network, train_agent
+from skillweave import (
+    DQN,
+    SAC,
+    Apart,
+    Evolution,
+    Hierarchy,
+    Network,
+    train_agent,
+)
 from skillweave.skills import Skill
 from skillweave.types import SkillweaveError
 
@@ -22,7 +31,9 @@ class Left(Skill):
     ],
 )
 def test_a_hierarchy_whose_buffer_is_larger_than_the_memory_makes_no_run(tmp_path, how, says):
-    hierarchy = Hierarchy("CartPole-v1", [Left()], skill_steps=100, selector_steps=100, **how)
+    hierarchy = Hierarchy(
+        "CartPole-v1", [Left()], apart=Apart(skill_steps=100, selector_steps=100), **plainly(how)
+    )
     with pytest.raises(SkillweaveError, match=says):
         hierarchy.train(tmp_path / "run", quiet=True)
     assert list(tmp_path.iterdir()) == []

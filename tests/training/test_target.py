@@ -15,14 +15,17 @@ from skillweave import (
     DQN,
     PPO,
     Agent,
+    Apart,
     Array,
     EnvSpec,
     Evolution,
     Hierarchy,
     Network,
+    Selection,
     Skill,
     SkillweaveError,
     Step,
+    TrainDefaults,
     train_agent,
 )
 from skillweave.envs import engine as engines
@@ -164,10 +167,16 @@ def test_skills_and_selector_have_targets_of_their_own(
     sure = type("Sure", (Start,), {"target_success": 1.0})()
     plain = type("Plain", (Skill,), {"max_steps": 3})()
     h = Hierarchy(
-        WALK, [quick, sure, plain], call_steps=3, algorithm=SMALL, selector=SMALL,
-        skill_steps=320, selector_steps=320, selector_target_return=10.0, eval_every=50,
-        eval_episodes=2,
-    )  # fmt: skip
+        WALK,
+        [quick, sure, plain],
+        call_steps=3,
+        algorithm=SMALL,
+        selector=SMALL,
+        apart=Apart(skill_steps=320, selector_steps=320),
+        selection=Selection(target_return=10.0),
+        train_defaults=TrainDefaults(eval_every=50, eval_episodes=2),
+        learn="apart",
+    )
     run = h.train(tmp_path / "run")
     found = {s["name"]: s for s in run.info()["stages"]}
     assert {k: v["reached"]["value"] for k, v in found.items() if "reached" in v} == {
@@ -234,17 +243,17 @@ def test_a_target_that_cannot_be_is_refused_before_anything_is_written(
 def test_a_skill_without_success_has_no_target_success() -> None:
     blind = type("Blind", (Skill,), {"target_success": 0.5})()
     with pytest.raises(SkillweaveError, match=r"skill 'blind'.*define success\(\)"):
-        Hierarchy(WALK, [blind])
+        Hierarchy(WALK, [blind], learn="apart")
     odd = type("Odd", (Skill,), {"target_return": "much"})()
     with pytest.raises(SkillweaveError, match="skill 'odd': target_return is 'much'"):
-        Hierarchy(WALK, [odd])
+        Hierarchy(WALK, [odd], learn="apart")
 
 
 # The stage itself
 
 
 def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> None:
-    h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL)
+    h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL, learn="apart")
     content = training.manifest(h, seed=0, flat=True)
     plan(content["stages"], Evolution(2, 2, 1))
     run = RunDirectory.create(tmp_path / "run", content | {"recipe": None})
@@ -256,7 +265,7 @@ def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> Non
 
 
 def test_a_stage_says_who_learns_and_who_decides(tmp_path: Path) -> None:
-    h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL)
+    h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL, learn="apart")
     entries = training.manifest(h, seed=0, flat=False)["stages"]
     keys = ("name", "kind", "learns", "decides")
     assert [tuple(e[k] for k in keys) for e in entries] == [
@@ -282,14 +291,19 @@ def test_an_agent_is_loaded_without_a_hierarchy(tmp_path: Path) -> None:
     for what in (lambda: run.hierarchy, lambda: run.evaluate(1, skill="x")):
         with pytest.raises(SkillweaveError, match="plain agent"):
             what()
-    flat = Hierarchy("CartPole-v1", [Start()], algorithm=SMALL).load(run.path)
+    flat = Hierarchy("CartPole-v1", [Start()], algorithm=SMALL, learn="apart").load(run.path)
     assert isinstance(flat.declaration, Agent)
     json.dumps(run.info())
 
 
 def test_a_hierarchys_run_is_no_agents(tmp_path: Path) -> None:
     h = Hierarchy(
-        WALK, [Start()], algorithm=SMALL, selector=SMALL, skill_steps=16, selector_steps=16
+        WALK,
+        [Start()],
+        algorithm=SMALL,
+        selector=SMALL,
+        apart=Apart(skill_steps=16, selector_steps=16),
+        learn="apart",
     )
     h.train(tmp_path / "run", quiet=True)
     with pytest.raises(SkillweaveError, match="the run of a hierarchy, not of a plain agent"):

@@ -9,7 +9,6 @@ from skillweave.reporting.report.skills_table import number
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import kept_words
-from skillweave.runs.manifest import UNSAID
 from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
@@ -105,17 +104,25 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     """Every setting in a run's manifest by its dotted name; not its seed, nor what came of it."""
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
     told = (
-        "kind", "learn", "call_steps", "call_lengths", "interrupt", "greedy_skills", "start_calls",
-        "search_steps", "reflexes", "reflexes_in_training", "cut_every", "eval_every",
+        "kind",
+        "learn",
+        "call_steps",
+        "call_lengths",
+        "interrupt",
+        "greedy_skills",
+        "greedy_selector",
+        "start_calls",
+        "search_steps",
+        "episode_calls",
+        "call_cost",
+        "reflexes",
+        "checkpoint_every",
+        "eval_every",
         "eval_episodes",
-    )  # fmt: skip
+    )
     found |= {k: m[k] for k in told if k in m}
-    if m["kind"] == "hierarchy":
-        found |= UNSAID | {k: m[k] for k in UNSAID if k in m}
     for skill in m.get("skills", ()):
         own = {k: v for k, v in skill.items() if k != "name"}
-        if "hierarchy" in own:
-            own["hierarchy"] = UNSAID | own["hierarchy"]
         found |= flat(f"skills.{skill['name']}", own)
     for entry in m["stages"]:
         own = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}

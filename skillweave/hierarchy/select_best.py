@@ -1,0 +1,171 @@
+"""Which hierarchy a run ends with, of those it could end with: episodes of all of them decide.
+
+The episodes are played by the engine of training, in one process: in a pool, where there is one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from skillweave.hierarchy.assembly import assembled
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.nesting import below, copied, every_hierarchy
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.kept import EPISODES, SAMPLING, kept_words, to_be_judged
+from skillweave.training.evaluation import Evaluation, evaluate
+from skillweave.training.stage import TOGETHER, Policies
+from skillweave.training.stage_log import Listener
+
+SEEDS = 1_000
+"""Seeds of these episodes start here: people use smaller ones."""
+CLEARLY = 2.0
+"""Standard errors by which a sampling selector must be better to be kept in place of a greedy one,
+which users expect."""
+
+
+def select_best(
+    declaration: Declaration,
+    run: RunDirectory,
+    listeners: tuple[Listener, ...],
+    before: Policies,
+    after: Policies,
+    nodes: tuple[str, ...] = (),
+) -> Policies:
+    """Return the best of a hierarchy's policies before and after learning together.
+
+    The run records which was kept.
+
+    Args:
+        nodes: the names on the way to the hierarchy, where it is a skill of another one.
+    """
+    entry = run.stage("/".join((*nodes, TOGETHER)))
+    if "kept" not in entry and to_be_judged(entry):
+        for listener in listeners:
+            listener.message(
+                f"{entry['name']}: {EPISODES} episodes of each kind are played, to find out "
+                "whether skills and selector should be greedy"
+            )
+        scores = _scores(declaration, run, before, after, nodes)
+        entry["kept"] = {name: score.mean for name, score in scores.items()} | {
+            "kept": _best(scores)
+        }
+        entry["evaluation_steps"] += sum(sum(score.lengths) for score in scores.values())
+        run.save()
+        for listener in listeners:
+            listener.message(f"{entry['name']}: {kept_words(entry['kept'])}")
+    return before if entry.get("kept", {}).get("kept") == "before" else after
+
+
+def _scores(
+    declaration: Declaration,
+    run: RunDirectory,
+    before: Policies,
+    after: Policies,
+    nodes: tuple[str, ...],
+) -> dict[str, Evaluation]:
+    """Return the evaluations of all candidates, by name."""
+    entry = run.stage("/".join((*nodes, TOGETHER)))
+    spec, seed = declaration.spec, SEEDS + int(run.manifest["seed"])
+    learnt = _inside(after, nodes)
+
+    def score(hierarchy: Declaration, policies: Policies) -> Evaluation:
+        policy = assembled(hierarchy, policies)
+        return evaluate(policy, spec, episodes=EPISODES, seed=seed, engine=spec.engine)
+
+    def sampling(name: str) -> Evaluation:
+        return score(with_sampling(declaration, *SAMPLING[name]), learnt)
+
+    found = {"greedy": sampling("greedy")}
+    skills_open, selector_open = _open_choices(declaration)
+    if entry["greedy_judged"] and skills_open:
+        found["skills_sample"] = sampling("skills_sample")
+    if entry["greedy_judged"] and selector_open:
+        better = max(found, key=lambda name: found[name].mean)  # of equals the first
+        name = "selector_samples" if better == "greedy" else "both_sample"
+        found[name] = sampling(name)
+    if entry["compared"]:
+        found["before"] = score(settled(declaration, run, nodes), _inside(before, nodes))
+    return found
+
+
+def _best(scores: Mapping[str, Evaluation]) -> str:
+    """Return the candidate with the best mean; a selector samples only if it is clearly better."""
+    greedy = {k: v for k, v in scores.items() if k == "before" or not SAMPLING[k][1]}
+    best = max(greedy, key=lambda name: greedy[name].mean)  # of equals the first
+    for name in scores.keys() - greedy.keys():
+        one, other = np.array(scores[name].returns), np.array(scores[best].returns)
+        error = math.sqrt(one.var() / len(one) + other.var() / len(other))
+        if one.mean() - other.mean() > CLEARLY * error:
+            return name
+    return best
+
+
+def _open_choices(declaration: Declaration) -> tuple[bool, bool]:
+    """Return whether greedy skills, and a greedy selector, are left open anywhere."""
+    choices = [own.selection for _, own in every_hierarchy(declaration)]
+    trained = any(own.ready_selector is None for _, own in every_hierarchy(declaration))
+    return (
+        any(c.greedy_skills is None for c in choices),
+        trained and any(c.greedy_selector is None for c in choices),
+    )
+
+
+def settled(
+    declaration: Declaration, run: RunDirectory, nodes: tuple[str, ...] = ()
+) -> Declaration:
+    """Return a copy in which it is decided for all whether they are greedy, as the run records it.
+
+    Args:
+        nodes: the names on the way to the hierarchy, where it is a skill of another one.
+    """
+    found = copied(declaration)
+    for path, own in every_hierarchy(found):
+        names = (*nodes, *(path.split("/") if path else ()))
+        _decide(own, *_sampling(run, names))
+    return found
+
+
+def with_sampling(declaration: Declaration, skills: bool, selector: bool) -> Declaration:
+    """Return a copy whose ``skills`` and ``selector`` sample wherever it leaves that open."""
+    found = copied(declaration)
+    for _, own in every_hierarchy(found):
+        _decide(own, skills, selector)
+    return found
+
+
+def _decide(declared: Declaration, skills: bool, selector: bool) -> None:
+    """Set whether skills and selector sample, where a hierarchy leaves that open; in place."""
+    choice = declared.selection
+    declared.selection = replace(
+        choice,
+        greedy_skills=not skills if choice.greedy_skills is None else choice.greedy_skills,
+        greedy_selector=not selector if choice.greedy_selector is None else choice.greedy_selector,
+    )
+
+
+def _sampling(run: RunDirectory, names: tuple[str, ...]) -> tuple[bool, bool]:
+    """Return whether skills and selector sample, by the latest stage in which all learnt."""
+    stages: dict[str, Mapping[str, Any]] = {s["name"]: s for s in run.manifest["stages"]}
+    for depth in range(len(names) + 1):
+        entry = stages.get("/".join((*names[:depth], TOGETHER)))
+        if entry is None or entry["status"] != "done":
+            continue
+        if "kept" not in entry:
+            if to_be_judged(entry):
+                continue
+            return True, False  # not evaluated: skills act as they did while the selector learnt
+        if (kept := entry["kept"]["kept"]) != "before":
+            return SAMPLING[kept]
+    return False, False
+
+
+def _inside(policies: Policies, nodes: tuple[str, ...]) -> Policies:
+    """Return those of a hierarchy below."""
+    for name in nodes:
+        policies = below(policies, name)
+    return policies
