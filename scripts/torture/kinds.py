@@ -157,6 +157,7 @@ def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
         call_steps=6,
         algorithm=skill,
         selector=selector,
+        learn="apart",
         apart=Apart(skill_steps=steps, selector_steps=steps),
         train_defaults=TrainDefaults(checkpoint_every=steps // 4),
     )
@@ -226,13 +227,22 @@ KINDS: dict[str, Kind] = {
     ),
     "search for a start": Kind(
         lambda: Hierarchy(
-            IN_PYTHON, [Leaning(), Balance()], call_steps=4, algorithm=PPO(**LEARNS, network=NET), selector=DQN(**REPLAYS | {"update_ratio": 0.02}), reflexes=[Reflex(leans_left, 0)], apart=Apart(skill_steps=600, selector_steps=600), train_defaults=TrainDefaults(checkpoint_every=150, eval_every=200, eval_episodes=2)),
+            IN_PYTHON,
+            [Leaning(), Balance()],
+            call_steps=4,
+            algorithm=PPO(**LEARNS, network=NET),
+            selector=DQN(**REPLAYS | {"update_ratio": 0.02}),
+            reflexes=[Reflex(leans_left, 0)],
+            learn="apart",
+            apart=Apart(skill_steps=600, selector_steps=600),
+            train_defaults=TrainDefaults(checkpoint_every=150, eval_every=200, eval_episodes=2),
+        ),
     ),
     "populations of skills and selector": Kind(
         lambda: Hierarchy(
             IN_PYTHON, [Leaning(), Balance()], call_steps=4, algorithm=PPO(
                 **LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))
-            ), selector=DQN(**REPLAYS), apart=Apart(skill_steps=300, selector_steps=300)),
+            ), selector=DQN(**REPLAYS), learn="apart", apart=Apart(skill_steps=300, selector_steps=300)),
         evolve=Evolution(**EVOLVES | {"population": 2, "generations": 2}),
     ),
     "together": Kind(lambda: together(1200)),

@@ -280,6 +280,7 @@ def _with_onnx(folder: Path) -> Hierarchy:
         [Model(), Balance()],
         algorithm=ppo,
         selector=ppo,
+        learn="apart",
         apart=Apart(skill_steps=64, selector_steps=64),
     )
 
