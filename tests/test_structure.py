@@ -19,7 +19,16 @@ ROOT = Path(__file__).parents[1] / "skillweave"
 MODULES = sorted(ROOT.rglob("*.py"))
 
 # The table of docs/architecture.md: what a room may import. `seeding` is open to all.
-BASE = {"types", "tracebacks", "notebooks", "messages", "reading", "experience", "shapes"}
+BASE = {
+    "types",
+    "tracebacks",
+    "notebooks",
+    "messages",
+    "arguments",
+    "reading",
+    "experience",
+    "shapes",
+}
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
 LEARNING |= {"collecting", "selectors"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "recipes", "api"}
@@ -31,6 +40,7 @@ ROOMS: dict[str, set[str]] = {
     "types": {"tracebacks"},
     "shapes": set(),
     "messages": {"types", "tracebacks"},
+    "arguments": {"types", "messages"},
     "reading": {"types", "messages"},
     "experience": {"types"},
     "ops": BASE,
@@ -57,11 +67,12 @@ ROOMS: dict[str, set[str]] = {
 }
 # Modules that are stricter than their room: settings, which help and errors read, need no torch.
 LEAVES: dict[str, set[str]] = {
-    "networks.config": {"types", "messages"},
+    "networks.config": {"types", "messages", "arguments"},
     "reading": {"types", "messages"},
     "algorithms.config": {
         "types",
         "messages",
+        "arguments",
         "reading",
         "networks.config",
         "algorithms.config_checks",
@@ -69,11 +80,22 @@ LEAVES: dict[str, set[str]] = {
         "algorithms.config_on_policy",
     },
     "algorithms.config_checks": {"types", "messages", "networks.config"},
-    "algorithms.config_off_policy": {"types", "networks.config", "algorithms.config_checks"},
-    "algorithms.config_on_policy": {"types", "networks.config", "algorithms.config_checks"},
+    "algorithms.config_off_policy": {
+        "types",
+        "arguments",
+        "networks.config",
+        "algorithms.config_checks",
+    },
+    "algorithms.config_on_policy": {
+        "types",
+        "arguments",
+        "networks.config",
+        "algorithms.config_checks",
+    },
     "evolution.config": {
         "types",
         "messages",
+        "arguments",
         "reading",
         "networks.config",
         "algorithms.config",

@@ -19,12 +19,14 @@ from skillweave.algorithms.config_checks import (
     positive,
     whole,
 )
+from skillweave.arguments import checked_names
 from skillweave.networks.config import Network
 from skillweave.types import SkillweaveError
 
 Schedule = Literal["constant", "linear"]
 
 
+@checked_names
 @dataclass(frozen=True)
 class OffPolicy:
     """What the algorithms that learn from a replay buffer have in common."""
@@ -114,6 +116,7 @@ class OffPolicy:
         )
 
 
+@checked_names
 @dataclass(frozen=True)
 class DQN(OffPolicy):
     """Deep Q-learning (Mnih et al. 2015) and its extensions; all of them are ``DQN.rainbow()``.
@@ -181,6 +184,7 @@ class DQN(OffPolicy):
         return cls(**{**everything, **settings})
 
 
+@checked_names
 @dataclass(frozen=True)
 class ActorCritic(OffPolicy):
     """What TD3 and SAC have in common, and where their defaults are not DQN's."""
@@ -203,6 +207,7 @@ class ActorCritic(OffPolicy):
     """The critics' network; None: as the actor's."""
 
 
+@checked_names
 @dataclass(frozen=True)
 class TD3(ActorCritic):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
@@ -251,6 +256,7 @@ class TD3(ActorCritic):
         return cls(**{**plain, **settings})
 
 
+@checked_names
 @dataclass(frozen=True)
 class SAC(ActorCritic):
     """Soft actor-critic (Haarnoja et al. 2018b); for discrete actions Christodoulou 2019."""

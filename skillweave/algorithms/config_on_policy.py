@@ -16,9 +16,11 @@ from skillweave.algorithms.config_checks import (
     positive,
     whole,
 )
+from skillweave.arguments import checked_names
 from skillweave.networks.config import Network
 
 
+@checked_names
 @dataclass(frozen=True)
 class OnPolicy:
     """What the algorithms that learn from their own latest rollout have in common.
@@ -55,6 +57,7 @@ class OnPolicy:
         one_of(self, "device", ("cpu", "cuda", "auto"))
 
 
+@checked_names
 @dataclass(frozen=True)
 class PPO(OnPolicy):
     """Proximal policy optimisation (Schulman et al. 2017).
@@ -138,6 +141,7 @@ class PPO(OnPolicy):
         check(self, "batch_size", self.batch_size <= most, says)
 
 
+@checked_names
 @dataclass(frozen=True)
 class SelfImitationPPO(PPO):
     """PPO that learns again from what it once did well (Oh et al. 2018, "Self-Imitation Learning").
@@ -168,6 +172,7 @@ class SelfImitationPPO(PPO):
         check(self, "network", self.network.rnn is None, "without rnn: kept rows have no memory")
 
 
+@checked_names
 @dataclass(frozen=True)
 class SkillCritic(OnPolicy):
     """What each skill is worth to the task, Q(s, skill), learnt from every step of all."""

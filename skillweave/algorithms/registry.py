@@ -16,11 +16,13 @@ from skillweave.algorithms.config import (
     add_registration,
     registration_of,
 )
+from skillweave.arguments import checked_names
 from skillweave.types import SkillweaveError
 
 _SETTINGS: dict[str, type[Any]] = {"rollout": OnPolicy, "replay": OffPolicy}
 
 
+@checked_names
 def register_algorithm(config_type: type[Any], algorithm_type: type[Algorithm]) -> None:
     """Make an algorithm known, under the name of its settings.
 

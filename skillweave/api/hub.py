@@ -9,6 +9,7 @@ from typing import Any
 
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.declared import declared_by
+from skillweave.arguments import checked_names
 from skillweave.messages import as_path, short
 from skillweave.reporting.card import write_card
 from skillweave.reporting.plots import plot_run
@@ -50,6 +51,7 @@ def push_run(path: Path, name: str, private: bool = False) -> dict[str, Any]:
     return {**told, "files": list(files), "missing": missing}
 
 
+@checked_names
 def from_hub(
     name: str, hierarchy: Hierarchy | Agent | None = None, *, revision: str | None = None
 ) -> Run:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from skillweave.api import Hierarchy, Run
+from skillweave.arguments import checked_names
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -10,6 +11,7 @@ from skillweave.messages import short, whole_number
 from skillweave.types import SkillweaveError
 
 
+@checked_names
 def make_options_env(
     hierarchy: Hierarchy | Run, num_envs: int, gamma: float, *, seed: int = 0
 ) -> OptionsEnv:

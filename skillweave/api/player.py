@@ -8,11 +8,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
 
+@checked_names
 class Player:
     """A policy that acts in one environment and keeps its memory.
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from skillweave.api.labels import labels_of
 from skillweave.api.player import Player
+from skillweave.arguments import checked_names
 from skillweave.envs.make import EngineName
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
@@ -53,6 +54,7 @@ class Run:
             raise SkillweaveError("this is the run of a plain agent: it has no hierarchy")
         return self.declaration
 
+    @checked_names
     def evaluate(
         self,
         episodes: int = 100,
@@ -101,6 +103,7 @@ class Run:
             save_evaluation(RunDirectory.open(self.path), found, seed, deterministic)
         return found
 
+    @checked_names
     def render(
         self,
         path: str | Path,
@@ -144,6 +147,7 @@ class Run:
             track_film(RunDirectory.open(self.path), path)
         return told
 
+    @checked_names
     def act(self, obs: Any, **told: Any) -> Any:
         """The greedy action for one observation.
 
@@ -160,11 +164,13 @@ class Run:
             self._player = self.player()
         return self._player.act(obs, **told)
 
+    @checked_names
     def reset(self) -> None:
         """For ``act``: a new episode begins."""
         if self._player is not None:
             self._player.reset()
 
+    @checked_names
     def player(self, *, deterministic: bool = True, seed: int = 0) -> Player:
         """The policy for one environment, with a memory of its own.
 
@@ -177,6 +183,7 @@ class Run:
         """
         return Player(self.policy, deterministic=deterministic, seed=seed)
 
+    @checked_names
     def export(self, path: str | Path) -> Export:
         """Write ONNX files, ``policy.json`` and ``runner.py``, which needs only onnxruntime.
 
@@ -194,6 +201,7 @@ class Run:
         """
         return write_export(as_path(path, "path"), self.policy, self.declaration.spec.name)
 
+    @checked_names
     def report(
         self,
         path: str | Path | None = None,
@@ -230,6 +238,7 @@ class Run:
             deterministic=deterministic,
         )
 
+    @checked_names
     def save_weights(self, path: str | Path) -> Path:
         """Write every policy into one file for ``Hierarchy.load_weights``.
 
@@ -243,6 +252,7 @@ class Run:
         write_weights(path, self.declaration, self.policy)
         return path
 
+    @checked_names
     def push(self, name: str, *, private: bool = False) -> dict[str, Any]:
         """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
 
@@ -265,6 +275,7 @@ class Run:
 
         return push_run(self.path, name, private)
 
+    @checked_names
     def as_skill(self, name: str, **attributes: Any) -> Skill:
         """All of it as one skill of another hierarchy.
 
@@ -279,6 +290,7 @@ class Run:
         skill: Skill = kind()
         return skill
 
+    @checked_names
     def info(self) -> dict[str, Any]:
         """The manifest of its run, and under ``evaluation`` the latest one that was saved."""
         run = RunDirectory.open(self.path)

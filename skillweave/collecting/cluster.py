@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from skillweave.arguments import checked_names
 from skillweave.collecting.group import Collectors, MakeCollector, share_of
 from skillweave.collecting.where import Where
 from skillweave.collecting.workers import MakeStanding, Workers
@@ -22,6 +23,7 @@ PATIENCE = 5.0
 """Seconds that an address has to answer."""
 
 
+@checked_names
 @dataclass(frozen=True)
 class Ray:
     """Collectors as actors of Ray, on this machine or on a cluster.

@@ -6,10 +6,12 @@ from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.types import SkillweaveError
 
 
+@checked_names
 class Lengths:
     """How long a call may last, where the selector chooses it together with the skill.
 

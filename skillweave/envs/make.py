@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 import gymnasium as gym
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
@@ -31,6 +32,7 @@ PIECE_SECONDS = 0.1
 EngineName = Literal["auto", "envpool", "sync"]
 
 
+@checked_names
 @dataclass(frozen=True)
 class EnvSpec:
     """An environment to make as often as needed.

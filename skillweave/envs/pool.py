@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 
+from skillweave.arguments import checked_names
 from skillweave.messages import close_matches, short
 from skillweave.types import Array, MissingExtra, SkillweaveError
 
@@ -53,6 +54,7 @@ class MakePool(Protocol):
         ...
 
 
+@checked_names
 class PoolWrapper:
     """A pool seen otherwise: override ``see``, or ``reset`` and ``step``.
 
@@ -105,6 +107,7 @@ class PoolWrapper:
         return self.see(obs, ids), reward, terminated, truncated, info
 
 
+@checked_names
 def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) -> Any:
     """A pool of EnvPool's environments.
 

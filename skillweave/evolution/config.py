@@ -9,6 +9,7 @@ from typing import Any, Literal, TypedDict, get_args
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.config_checks import check, number, one_of, whole
+from skillweave.arguments import checked_names
 from skillweave.networks.config import Activation
 from skillweave.reading import fit
 from skillweave.types import SkillweaveError
@@ -18,6 +19,7 @@ KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")
 """The kinds of mutation; ``Mutations`` has a probability of each."""
 
 
+@checked_names
 @dataclass(frozen=True)
 class Range:
     """Where a setting may lie, and how it moves there.
@@ -88,6 +90,7 @@ _MUTATED = ("learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "ta
 """Those that do where nothing else is said: they never part a stack."""
 
 
+@checked_names
 @dataclass(frozen=True)
 class Mutations:
     """What happens to an heir: one kind of change, by these probabilities.
@@ -183,6 +186,7 @@ class Mutations:
         return dict(self.ranges)
 
 
+@checked_names
 @dataclass(frozen=True)
 class Tournament:
     """Each heir's parent is the best of a few members drawn at random.
@@ -200,6 +204,7 @@ class Tournament:
         whole(self, "size")
 
 
+@checked_names
 @dataclass(frozen=True)
 class Truncation:
     """The worst members become heirs of the best; all others go on (Jaderberg et al. 2017).
@@ -215,6 +220,7 @@ class Truncation:
         check(self, "share", 0.0 < self.share <= 0.5, "more than 0 and at most 0.5")
 
 
+@checked_names
 @dataclass(frozen=True)
 class Evolution:
     """A population in place of one agent: it trains, is compared, selected and mutated.

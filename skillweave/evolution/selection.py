@@ -7,10 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.evolution.config import Evolution, Tournament, Truncation
 from skillweave.types import Array, SkillweaveError
 
 
+@checked_names
 @dataclass(frozen=True)
 class Heir:
     """A place in the next generation: which member it comes from, and whether it may change."""

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.collecting.calls import Interruption, SkillSet, Why
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.selectors import LastCall, ReadySelector
@@ -18,6 +19,7 @@ from skillweave.types import Array, Memory, Policy, Step, unprefixed
 _SELECTOR = "selector."
 
 
+@checked_names
 class HierarchyPolicy:
     """Decides where a call is over, lets the skill act elsewhere.
 

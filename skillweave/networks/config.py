@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar, get_args
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.types import SkillweaveError
 
@@ -14,6 +15,7 @@ WIDEST = 65_536
 Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
 
 
+@checked_names
 @dataclass(frozen=True)
 class CNN:
     """How images become features; ``CNN()`` is Nature's (Mnih et al. 2015).
@@ -66,6 +68,7 @@ class CNN:
         return cls("plain", (16,), (3,), (1,))
 
 
+@checked_names
 @dataclass(frozen=True)
 class RNN:
     """A memory after the hidden layers.
@@ -87,6 +90,7 @@ class RNN:
             )
 
 
+@checked_names
 @dataclass(frozen=True)
 class Network:
     """Images through a CNN, everything else as it is, then hidden layers, then a memory.

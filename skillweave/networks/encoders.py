@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from skillweave.arguments import checked_names
 from skillweave.networks.config import CNN, Activation
 from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
 from skillweave.spaces import ObsCodec
@@ -49,6 +50,7 @@ class Encoder(Protocol):
 _REGISTERED: dict[str, Callable[[ObsCodec], Encoder]] = {}
 
 
+@checked_names
 def register_encoder(name: str, make: Callable[[ObsCodec], Encoder]) -> None:
     """Make a custom encoder known, for ``Network(encoder=name)``.
 

@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.collecting.calls import Why
 from skillweave.collecting.guide import LastCall
 from skillweave.messages import short
@@ -27,6 +28,7 @@ Choices = str | Sequence[str] | set[str] | frozenset[str]
 ENDS = ("success", "failure")
 
 
+@checked_names
 class Automaton(ReadySelector):
     """States, each with the skills that are called in it, and transitions between them.
 

@@ -31,6 +31,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, ClassVar
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.selectors.base import function_name
 from skillweave.types import Array, SkillweaveError
@@ -44,6 +45,7 @@ class Status(IntEnum):
     FAILURE = 2
 
 
+@checked_names
 class Condition:
     """A function of observations (n, *obs_shape) to (n,) bool: SUCCESS where it holds.
 
@@ -63,6 +65,7 @@ class Condition:
         self.function, self.name = function, name or function_name(function)
 
 
+@checked_names
 class Composite:
     """A node with children: a ``Sequence`` or a ``Fallback``.
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import Space
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.skills.answers import answer
 from skillweave.skills.outputs import as_array, called, checked_actions
@@ -169,6 +170,7 @@ class RecordedSkill(Skill):
     """A skill of a run that was loaded without its code: its reward and success are not known."""
 
 
+@checked_names
 class Reflex:
     """A rule that overrides the running skill's action while its condition holds.
 

@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from gymnasium import Space
 
+from skillweave.arguments import checked_names
 from skillweave.messages import shortened
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import Foreign, checksum
@@ -127,6 +128,7 @@ class OnnxPolicy(Foreign):
         return found
 
 
+@checked_names
 def from_onnx(
     path: str | Path,
     *,

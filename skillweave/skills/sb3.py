@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short, shortened
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import Foreign, checksum
@@ -92,6 +93,7 @@ class SB3Policy(Foreign):
         return found
 
 
+@checked_names
 def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = False) -> SB3Policy:
     """A Stable-Baselines3 model as a skill's policy.
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.skills.foreign_policy import Foreign, qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
@@ -48,6 +49,7 @@ class ScriptedPolicy(Foreign):
         return {"kind": self.kind, "name": qualified(self.function)}
 
 
+@checked_names
 def from_function(
     function: Callable[[Array], Any], *, observation_space: Any = None, action_space: Any = None
 ) -> ScriptedPolicy:

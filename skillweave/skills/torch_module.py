@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from gymnasium import Space
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign, checksum, qualified
 from skillweave.skills.outputs import decoded
@@ -82,6 +83,7 @@ class TorchPolicy(Foreign):
         return found
 
 
+@checked_names
 def from_torch(
     module: nn.Module, *, observation_space: Any = None, action_space: Any = None
 ) -> TorchPolicy:

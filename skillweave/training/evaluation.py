@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.messages import whole_number
@@ -139,6 +140,7 @@ def interquartile_means(values: Array) -> Array:
     return found
 
 
+@checked_names
 def evaluate(
     policy: Policy,
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
