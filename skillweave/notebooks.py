@@ -11,9 +11,6 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
-_LEFT = "text-align: left; white-space: nowrap; padding: 2px 8px"
-_RIGHT = "text-align: right; white-space: nowrap; padding: 2px 8px"
-
 
 class Markup(str):
     """HTML that is put into a table as it is."""
@@ -75,10 +72,10 @@ class Area:
 
 
 def _row(cells: Sequence[object], left: int, tag: str) -> str:
-    parts = [
-        f'<{tag} style="{_LEFT if i < left else _RIGHT}">{_html(cell)}</{tag}>'
-        for i, cell in enumerate(cells)
-    ]
+    parts = []
+    for i, cell in enumerate(cells):
+        side = "left" if i < left else "right"
+        parts.append(f'<{tag} style="text-align: {side}">{_html(cell)}</{tag}>')
     return f"<tr>{''.join(parts)}</tr>"
 
 

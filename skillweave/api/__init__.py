@@ -12,6 +12,7 @@ from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
+from skillweave.api.notebook_tables import agent_html, agent_line, hierarchy_html, hierarchy_line
 from skillweave.api.run import Run
 from skillweave.api.running import begin, declared_of, evolving, go_on
 from skillweave.api.starting import StartFrom
@@ -35,6 +36,13 @@ class Agent(PlainAgent):
     """One plain agent that learns an environment's own reward: declared, trained and watched."""
 
     recipe: str | None = None
+
+    def __repr__(self) -> str:
+        return agent_line(self)
+
+    def _repr_html_(self) -> str:
+        """Return a table of what it declares, for notebooks."""
+        return agent_html(self)
 
     def train(
         self,
@@ -127,6 +135,13 @@ class Hierarchy(Declaration):
 
     recipe: str | None = None
     """Where it was declared: a shipped recipe's name or a file; written into runs."""
+
+    def __repr__(self) -> str:
+        return hierarchy_line(self)
+
+    def _repr_html_(self) -> str:
+        """Return tables of what it declares, for notebooks."""
+        return hierarchy_html(self)
 
     def train(
         self,

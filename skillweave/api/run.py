@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skillweave.api.labels import labels_of
+from skillweave.api.notebook_tables import run_html
 from skillweave.api.player import Player
 from skillweave.arguments import checked_names
 from skillweave.envs.make import EngineName
@@ -15,10 +16,12 @@ from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
 from skillweave.messages import as_path, whole_number
+from skillweave.reporting.film import Film
+from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import render_policy
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.hub import must_be_own
+from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.trackers import track_film
 from skillweave.skills import Skill
 from skillweave.training.evaluation import Evaluation, evaluate
@@ -43,6 +46,13 @@ class Run:
         self.declaration, self.path, self.policy = declaration, path, policy
         self._player: Player | None = None
 
+    def __repr__(self) -> str:
+        return f"<Run {self.path}: {str(self.declaration).strip('<>')}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of what it is, and of its stages, for notebooks."""
+        return run_html(self.path, self.declaration)
+
     @property
     def hierarchy(self) -> Hierarchy:
         """The hierarchy that was trained.
@@ -65,6 +75,7 @@ class Run:
         max_steps: int | None = None,
         save: bool = False,
         engine: EngineName = "sync",
+        quiet: bool = False,
     ) -> Evaluation:
         """Score it in whole episodes.
 
@@ -79,6 +90,7 @@ class Run:
             save: keep the result in the run's directory, where ``info`` finds it, instead of the
                 one before. Not with ``skill`` or another engine.
             engine: sync: Gymnasium's environment; envpool, auto: see ``evaluate``.
+            quiet: no progress; else it is shown where an evaluation takes longer than a second.
 
         Returns:
             Returns, lengths, and what each skill did.
@@ -90,15 +102,18 @@ class Run:
             raise SkillweaveError("save keeps a whole policy's score: leave out skill and engine")
         if save:
             must_be_own(self.path)  # said before anything is played
-        found = evaluate(
-            self._policy(skill),
-            self.declaration.spec,
-            episodes=episodes,
-            seed=seed,
-            deterministic=deterministic,
-            max_steps=max_steps,
-            engine=engine,
-        )
+        policy = self._policy(skill)
+        with EpisodeProgress(episodes, quiet=quiet) as progress:
+            found = evaluate(
+                policy,
+                self.declaration.spec,
+                episodes=episodes,
+                seed=seed,
+                deterministic=deterministic,
+                max_steps=max_steps,
+                watch=progress.watch,
+                engine=engine,
+            )
         if save:
             save_evaluation(RunDirectory.open(self.path), found, seed, deterministic)
         return found
@@ -106,18 +121,22 @@ class Run:
     @checked_names
     def render(
         self,
-        path: str | Path,
+        path: str | Path | None = None,
         *,
         episodes: int = 1,
         seed: int = 0,
         deterministic: bool = True,
         skill: str | None = None,
         max_steps: int | None = None,
-    ) -> dict[str, Any]:
+    ) -> Film:
         """Write a captioned film; one in the run's own folder goes to its trackers, too.
 
+        A notebook shows the film that is returned.
+
         Args:
-            path: the file; its ending says which, ``.gif`` or ``.mp4``.
+            path: the file; its ending says which, ``.gif`` or ``.mp4``. None: ``film.gif`` in the
+                run's folder, with a skill's name where it acts alone. A policy without a folder of
+                its own (a weights file, a copy of the hub's) writes its film where Python runs.
             episodes: how many, one after another.
             seed: picks them.
             deterministic: act greedily, else sample.
@@ -127,7 +146,8 @@ class Run:
         Returns:
             ``path``, and what was filmed, as plain JSON.
         """
-        policy, path = self._policy(skill), as_path(path, "path")
+        policy = self._policy(skill)
+        path = self._film_path(skill) if path is None else as_path(path, "path")
         must_be_own(path.parent)
         seed = whole_number(seed, "seed", 0)
         plain = isinstance(self.declaration, PlainAgent)
@@ -145,7 +165,14 @@ class Run:
         )
         if path.parent.resolve() == self.path.resolve():
             track_film(RunDirectory.open(self.path), path)
-        return told
+        return Film(told)
+
+    def _film_path(self, skill: str | None) -> Path:
+        """Return where a film is written if nobody says where."""
+        ending = "" if skill is None else "-" + skill.replace("/", ".")
+        if self.path.is_dir() and not is_copy_of_hub(self.path):
+            return self.path / f"film{ending}.gif"
+        return Path(f"{self.path.name.removesuffix('.safetensors')}{ending}.gif")
 
     @checked_names
     def act(self, obs: Any, **told: Any) -> Any:

@@ -151,6 +151,7 @@ def go_on(
         stack.callback(run.close)
         run.begin()
         progress = stack.enter_context(Progress(quiet=quiet))
+        progress.plan(run.manifest["stages"])
         if note:
             progress.message(note)
         trackers = make_trackers(run.manifest.get("track", ()), run)

@@ -72,6 +72,7 @@ def _evaluate(command: commands.Evaluate) -> None:
         seed=command.seed,
         deterministic=command.deterministic,
         skill=command.skill,
+        quiet=command.quiet,
     )
     result = {"target": command.target, "env": found.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}

@@ -63,7 +63,7 @@ class Job:
             hierarchy = unpacked(code)
             trained = finish(hierarchy, self._manifest(hierarchy), self.path)
             found = trained.evaluate(
-                self.evaluate, seed=EVALUATION_SEED, deterministic=True, save=True
+                self.evaluate, seed=EVALUATION_SEED, deterministic=True, save=True, quiet=True
             )
             return float(found.mean)
         except SkillweaveError as error:

@@ -38,12 +38,12 @@ def train(command: commands.Train) -> None:
         hierarchy.env = replace(hierarchy.spec, workers=command.collectors)
     evolve = parse_evolve(command.evolve, hierarchy, command.flat)
     trained = _trained(command, hierarchy, command.flat, command.out, evolve)
-    result, lines = _told(trained, command.evaluate, command.render)
+    result, lines = _told(command, trained, command.render)
     if command.versus_flat:
         if not command.json:  # now: the flat agent takes as long again
             print("\n".join(lines), flush=True)
         flat = _trained(command, hierarchy, True, flat_out, baseline=True)
-        result["flat"], more = _told(flat, command.evaluate)
+        result["flat"], more = _told(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
         lines = ["", "the flat agent:", *more, "", *verdict]
     tell(command, result, "\n".join(lines))
@@ -57,7 +57,7 @@ def resume(command: commands.Resume) -> None:
         trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
     except KeyboardInterrupt:
         raise _interrupted(command.run, command.ray) from None
-    result, lines = _told(trained, command.evaluate)
+    result, lines = _told(command, trained)
     tell(command, result, "\n".join(lines))
 
 
@@ -105,7 +105,9 @@ def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
     ]
 
 
-def _told(trained: Run, episodes: int, render: bool = False) -> tuple[dict[str, Any], list[str]]:
+def _told(
+    command: commands.Train | commands.Resume, trained: Run, render: bool = False
+) -> tuple[dict[str, Any], list[str]]:
     """What a run has come to, for programs and for people."""
     manifest = trained.info()
     result: dict[str, Any] = {"run": str(trained.path), "stages": manifest["stages"]}
@@ -114,8 +116,8 @@ def _told(trained: Run, episodes: int, render: bool = False) -> tuple[dict[str, 
     lines = [
         f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"
     ]
-    if episodes:
-        score = trained.evaluate(episodes)
+    if command.evaluate:
+        score = trained.evaluate(command.evaluate, quiet=command.quiet)
         result["evaluation"] = score.to_json()
         save_score(trained, score)
         lines.append(f"score   {score.for_people()}")

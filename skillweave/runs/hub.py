@@ -193,15 +193,27 @@ def must_be_own(folder: Path) -> None:
 
     What is written there would be loaded the next time as if its owner had pushed it.
     """
+    if (name := _copied_from(folder)) is not None:
+        raise SkillweaveError(
+            f"{folder} is the copy of {name} that huggingface_hub keeps: nothing is written there "
+            "or pushed from there, as it would be taken for its owner's. Take a copy of your own, "
+            f"and use that: skillweave pull {name}"
+        )
+
+
+def is_copy_of_hub(folder: Path) -> bool:
+    """Return whether a folder is in the cache of the hub's library."""
+    return _copied_from(folder) is not None
+
+
+def _copied_from(folder: Path) -> str | None:
+    """Return the run's name on the hub; None: the folder is not in the cache."""
     found = folder.resolve()
     for place in (found, *found.parents):
         kind, *name = place.parent.parent.name.split("--")
         if place.parent.name == "snapshots" and kind == "models" and len(name) == 2:
-            raise SkillweaveError(
-                f"{folder} is the copy of {'/'.join(name)} that huggingface_hub keeps: nothing is "
-                "written there or pushed from there, as it would be taken for its owner's. Take a "
-                f"copy of your own, and use that: skillweave pull {'/'.join(name)}"
-            )
+            return "/".join(name)
+    return None
 
 
 def download(name: str, revision: str | None = None) -> Path:

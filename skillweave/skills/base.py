@@ -14,6 +14,7 @@ from gymnasium import Space
 
 from skillweave.arguments import checked_names
 from skillweave.messages import short
+from skillweave.notebooks import facts, joined
 from skillweave.skills.answers import answer
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.types import Array, SkillweaveError, Step
@@ -74,6 +75,20 @@ class Skill:
         super().__init_subclass__(**kwargs)
         if "name" not in cls.__dict__:
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower().strip("_")
+
+    def __repr__(self) -> str:
+        own = [*own_methods(self), *(f"{k}={short(v, 60)}" for k, v in _own_fields(self))]
+        return f"<Skill {self.name!r}: {', '.join(own) or 'all defaults'}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of what it declares, for notebooks."""
+        rows = [
+            ("skill", path_of(self)),
+            ("about", about(self)),
+            ("defines", ", ".join(own_methods(self)) or "nothing: all defaults"),
+            *((name, short(value, 200)) for name, value in _own_fields(self)),
+        ]
+        return joined([facts((k, v) for k, v in rows if v)])
 
     def reward(self, step: Step) -> Array:
         """What it maximises in a ``step``, (N,). The default is the environment's own reward."""
@@ -159,6 +174,25 @@ def _is_color(value: object) -> bool:
     if not isinstance(value, tuple | list) or len(value) != 3:
         return False
     return all(isinstance(v, int | np.integer) and 0 <= v <= 255 for v in value)
+
+
+def about(skill: Skill) -> str:
+    """Return the first line of the docstring of a skill's class; "" where it has none."""
+    lines = (type(skill).__dict__.get("__doc__") or "").strip().splitlines()
+    return lines[0] if lines else ""
+
+
+def own_methods(skill: Skill) -> list[str]:
+    """Return the methods of which a skill has its own version."""
+    return [method for method in skill.methods if skill.defines(method)]
+
+
+def _own_fields(skill: Skill) -> Iterator[tuple[str, Any]]:
+    """Yield the settings of a skill that differ from the defaults, but for its name."""
+    for field in Skill.__annotations__:
+        value = getattr(skill, field)
+        if field not in ("name", "methods", "_path") and value is not getattr(Skill, field):
+            yield field, value
 
 
 def path_of(skill: Skill) -> str:

@@ -17,12 +17,13 @@ from skillweave.arguments import checked_names
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.messages import whole_number
+from skillweave.notebooks import joined, paragraph, table
 from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.skill_report import SkillReport, SkillTally, all_steps
-from skillweave.training.skill_text import hasty_calls, idle_calls, late_calls, skill_table
+from skillweave.training.skill_text import hints, skill_rows, skill_table
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
@@ -102,10 +103,17 @@ class Evaluation:
 
     def for_people(self) -> str:
         """``str()``, and for a hierarchy a table of its skills, and what looks like a mistake."""
-        table = [skill_table(self.skills)] if self.skills else []
-        told = (idle_calls, late_calls, hasty_calls)
-        hints = [hint for tell in told for hint in tell(self.skills)]
-        return "\n".join([str(self), *table, *hints])
+        skills = [skill_table(self.skills)] if self.skills else []
+        return "\n".join([str(self), *skills, *hints(self.skills)])
+
+    def __repr__(self) -> str:
+        return f"<Evaluation: {self}>"
+
+    def _repr_html_(self) -> str:
+        """Return the same as ``for_people``, for notebooks."""
+        head, *rows = skill_rows(self.skills)
+        parts = [table(head, rows)] if rows else []
+        return joined([paragraph(self), *parts, *map(paragraph, hints(self.skills))])
 
     def __str__(self) -> str:
         j = self.to_json()

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from skillweave.training.skill_report import ENDS, SkillReport, all_steps
 
 
-def skill_table(skills: Mapping[str, SkillReport]) -> str:
-    """The reports as an aligned table for people, a line for each skill."""
+def skill_rows(skills: Mapping[str, SkillReport]) -> list[list[str]]:
+    """Return the reports as a table's cells: the titles, then a row for each skill."""
     total = all_steps(skills)
     head = ["skill", "share", "calls", "length", *ENDS.values()]
     rows = [[*head, "success", "return"]]
@@ -19,11 +19,21 @@ def skill_table(skills: Mapping[str, SkillReport]) -> str:
         ]
         rows.append(
             [
-                name, _percent(report.steps / total if total else 0.0), f"{report.calls:,}",
-                _number(report.length_mean), *ends, _percent(report.success_rate),
+                name,
+                _percent(report.steps / total if total else 0.0),
+                f"{report.calls:,}",
+                _number(report.length_mean),
+                *ends,
+                _percent(report.success_rate),
                 _number(report.return_mean),
             ]
-        )  # fmt: skip
+        )
+    return rows
+
+
+def skill_table(skills: Mapping[str, SkillReport]) -> str:
+    """Return the reports as an aligned table for people, a line for each skill."""
+    rows = skill_rows(skills)
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return "\n".join(
         "  ".join(
@@ -34,6 +44,11 @@ def skill_table(skills: Mapping[str, SkillReport]) -> str:
         )
         for row in rows
     )
+
+
+def hints(skills: Mapping[str, SkillReport]) -> list[str]:
+    """Return a sentence on each thing that looks like a mistake."""
+    return [*idle_calls(skills), *late_calls(skills), *hasty_calls(skills)]
 
 
 def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:

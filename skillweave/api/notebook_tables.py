@@ -1,0 +1,127 @@
+"""What ``Hierarchy``, ``Agent`` and ``Run`` say of themselves: a line, and tables for notebooks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.nesting import every_skill, inner_of
+from skillweave.notebooks import Markup, facts, joined, paragraph, table
+from skillweave.runs.directory import RunDirectory
+from skillweave.skills.base import RecordedSkill, Skill, about, own_methods
+from skillweave.training.evaluation_file import load_evaluation
+from skillweave.training.plain_agent import PlainAgent
+from skillweave.types import SkillweaveError
+
+if TYPE_CHECKING:
+    from skillweave.api import Agent, Hierarchy
+
+
+def hierarchy_line(declared: Hierarchy) -> str:
+    """Return what ``repr`` says of a hierarchy."""
+    names = ", ".join(s.name for s in declared.skills)
+    return f"<{type(declared).__name__} of {names} on {declared.spec.name}>"
+
+
+def agent_line(declared: Agent) -> str:
+    """Return what ``repr`` says of a plain agent."""
+    kind = _kind(declared.algorithm)
+    return f"<{type(declared).__name__} of {kind} on {declared.spec.name}>"
+
+
+def hierarchy_html(declared: Hierarchy) -> str:
+    """Return tables of a hierarchy, and of its skills at all levels."""
+    return joined([facts(_hierarchy_facts(declared)), _skills(declared)])
+
+
+def agent_html(declared: Agent) -> str:
+    """Return a table of a plain agent."""
+    return joined([facts(_agent_facts(declared))])
+
+
+def run_html(path: Path, declared: Hierarchy | Agent) -> str:
+    """Return tables of a run: what was trained, its stages, and its latest saved evaluation."""
+    if isinstance(declared, PlainAgent):
+        rows, skills = list(_agent_facts(declared)), []
+    else:
+        rows, skills = list(_hierarchy_facts(declared)), [_skills(declared)]
+    where = "run" if path.is_dir() else "weights"
+    shown = [facts([(where, path), *rows]), *skills]
+    try:
+        run = RunDirectory.open(path) if path.is_dir() else None
+        saved = None if run is None else load_evaluation(run)
+    except SkillweaveError as error:
+        return joined([*shown, paragraph(error)])
+    if run is not None:
+        shown.append(_stages(run))
+    if saved is not None:
+        shown.append(paragraph(f"evaluation: {saved}"))
+    return joined(shown)
+
+
+def _hierarchy_facts(declared: Hierarchy) -> Iterator[tuple[str, object]]:
+    yield "hierarchy on", declared.spec.name
+    if not declared.recorded:
+        yield "selector", _kind(declared.selector)
+        yield "learns", declared.learn
+        yield "training steps", f"{declared.total_steps:,}"
+    if declared.reflexes:
+        yield "reflexes", ", ".join(str(reflex.name) for reflex in declared.reflexes)
+
+
+def _agent_facts(declared: Agent) -> Iterator[tuple[str, object]]:
+    yield "agent on", declared.spec.name
+    yield "algorithm", _kind(declared.algorithm)
+    if not declared.recorded:
+        yield "training steps", f"{declared.steps:,}"
+
+
+def _skills(declared: Hierarchy) -> Markup:
+    """Return a table of a hierarchy's skills."""
+    rows = []
+    for path, skill in every_skill(declared.skills):
+        limit = "" if skill.max_steps is None else f"{skill.max_steps:,}"
+        defines = ", ".join(own_methods(skill))
+        node = path.rpartition("/")[0]
+        owner = inner_of(declared.skill(node)) if node else declared
+        rows.append((path, _learns_by(owner or declared, skill), defines, about(skill), limit))
+    return table(("skill", "policy", "defines", "about", "max_steps"), rows, left=4)
+
+
+def _learns_by(owner: Declaration, skill: Skill) -> str:
+    """Return how a skill gets its policy."""
+    if isinstance(skill, RecordedSkill):
+        return "learnt"
+    if inner_of(skill) is not None:
+        return "hierarchy"
+    if skill.policy is not None:
+        return "ready"
+    return _kind(skill.algorithm or owner.algorithm)
+
+
+def _stages(run: RunDirectory) -> Markup:
+    """Return a table of a run's stages."""
+    rows = []
+    for stage in run.manifest["stages"]:
+        final = stage.get("final", {})
+        steps, seconds = stage.get("steps"), stage.get("seconds")
+        rows.append(
+            (
+                stage["name"],
+                stage["status"],
+                "" if steps is None else f"{steps:,}",
+                "" if seconds is None else f"{seconds:,.0f}",
+                "" if final.get("return") is None else f"{final['return']:,.1f}",
+            )
+        )
+    return table(("stage", "status", "steps", "seconds", "return"), rows, left=2)
+
+
+def _kind(algorithm: object) -> str:
+    """Return the name of an algorithm, or of a ready selector."""
+    if isinstance(algorithm, AlgorithmConfig):
+        return type(algorithm).__name__
+    return f"ready: {getattr(algorithm, '__name__', type(algorithm).__name__)}"
