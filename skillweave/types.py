@@ -46,6 +46,10 @@ class SkillweaveError(ShortTraceback, Exception):
     """An error made for people: it says what was wrong, where, and what to do about it."""
 
 
+class Interrupted(ShortTraceback, KeyboardInterrupt):
+    """Training was interrupted; the message says what is saved and how to go on."""
+
+
 class MissingExtra(SkillweaveError, ImportError):
     """A feature needs an optional dependency; the message names the extra to install."""
 

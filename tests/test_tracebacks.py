@@ -73,6 +73,11 @@ shell.run_cell("""tiny = sw.PPO(num_envs=2, n_steps=8, batch_size=16)
 agent = sw.Hierarchy("CartPole-v1", [Center()], algorithm=tiny)
 agent.train("run", quiet=True)
 """, store_history=True)
+shell.run_cell("""from skillweave.runs.directory import RunDirectory
+def interrupt(*_): raise KeyboardInterrupt
+RunDirectory.log = interrupt
+sw.Agent("CartPole-v1", tiny, 100).train("stopped", quiet=True)
+""", store_history=True)
 '''
 
 
@@ -99,12 +104,16 @@ def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path: Path) -> None:
     assert 'agent.train("run", quiet=True)' in shown
     assert "In[1], line 5" in shown
     assert "return step.next_obs[:, 9]" in shown
+    shown, _, interrupted = shown.partition("-" * 70)[2].partition("-" * 70)
     *_, last = shown.strip().splitlines()
     assert last.startswith("SkillweaveError: skill 'center': reward() raised IndexError: index")
     assert last.endswith("(Cell In[1], line 5) at step 1")
     assert "skillweave/" not in shown
     assert "direct cause" not in shown
     assert len(shown.splitlines()) < 25
+    assert "In[3], line 4" in interrupted
+    assert "Interrupted: saved at the start; go on with: resume('stopped')" in interrupted
+    assert "skillweave/" not in interrupted
 
 
 def test_ipython_shows_all_frames_where_the_switch_is_set(tmp_path: Path) -> None:

@@ -128,6 +128,7 @@ class Run:
         deterministic: bool = True,
         skill: str | None = None,
         max_steps: int | None = None,
+        quiet: bool = False,
     ) -> Film:
         """Write a captioned film; one in the run's own folder goes to its trackers, too.
 
@@ -142,6 +143,7 @@ class Run:
             deterministic: act greedily, else sample.
             skill: show this skill alone, as in ``evaluate``.
             max_steps: an episode that nothing has ended by then is cut.
+            quiet: no progress; else it is shown where a film takes longer than a second.
 
         Returns:
             ``path``, and what was filmed, as plain JSON.
@@ -162,6 +164,7 @@ class Run:
             label=labels_of(policy, skills, skill),
             max_steps=max_steps,
             rng=np.random.default_rng(seed),
+            quiet=quiet,
         )
         if path.parent.resolve() == self.path.resolve():
             track_film(RunDirectory.open(self.path), path)

@@ -28,7 +28,7 @@ from skillweave.runs.manifest import identity
 from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
-from skillweave.types import SkillweaveError
+from skillweave.types import Interrupted, SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy
@@ -163,7 +163,7 @@ def go_on(
             policy = training.train(declared, run, (progress, *trackers), learner)
         except KeyboardInterrupt:
             again = f"resume({str(run.path)!r})"
-            raise KeyboardInterrupt(f"{saved_words(run)}; go on with: {again}") from None
+            raise Interrupted(f"{saved_words(run)}; go on with: {again}") from None
     return Run(declared_of(declared, run), run.path, policy)
 
 

@@ -90,6 +90,7 @@ def _render(command: commands.Render) -> None:
         seed=command.seed,
         deterministic=command.deterministic,
         skill=command.skill,
+        quiet=command.quiet,
     )
     returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])
     tell(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")

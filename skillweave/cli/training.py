@@ -122,7 +122,7 @@ def _told(
         save_score(trained, score)
         lines.append(f"score   {score.for_people()}")
     if render:
-        film = trained.render(trained.path / f"{manifest['kind']}.gif")
+        film = trained.render(trained.path / f"{manifest['kind']}.gif", quiet=command.quiet)
         result["film"] = film
         lines.append(f"film    {film['path']}")
     watch = command_words("evaluate|render|report", RunDirectory.open(trained.path))

@@ -16,6 +16,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.messages import told, whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
+from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds
@@ -43,6 +44,7 @@ def render_policy(
     fps: float | None = None,
     every: int = 2,
     rng: np.random.Generator | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Run a policy on Gymnasium's environment and write a captioned video of it.
 
@@ -53,6 +55,7 @@ def render_policy(
         fps: steps shown per second; None: as many as the environment says, so in real time.
         every: one frame for so many steps, and one for the end of each episode.
         rng: for ``act``; None: derived from ``seed``.
+        quiet: no progress.
 
     Returns:
         ``path``, ``frames``, and ``episodes``: for each its ``return``, its ``length``, whether it
@@ -70,12 +73,17 @@ def render_policy(
     # Observations, infos and masks are those of an evaluation.
     engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
     try:
-        with VideoWriter(path, (fps or env.metadata.get("render_fps") or 30) / every) as video:
+        rate = (fps or env.metadata.get("render_fps") or 30) / every
+        with (
+            VideoWriter(path, rate) as video,
+            EpisodeProgress(episodes, quiet=quiet, name="film") as progress,
+        ):
             film = _Film(env, video, every, label)
             whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
             how: Any = {"deterministic": deterministic, "rng": rng}
             for played in play(policy, whole, before_step=film.before_step, **how):
                 film.after_step(played)
+                progress.watch(played)
     finally:
         engine.close()
     return {"path": str(path), "frames": video.frames, "episodes": film.episodes}
