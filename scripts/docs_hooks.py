@@ -1,4 +1,4 @@
-"""What MkDocs asks while it builds the site: pictures are put into the page itself."""
+"""Hooks of MkDocs: pictures become part of the page, and numbers keep their units beside them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import re
 from pathlib import Path
 from typing import Any
 
+UNIT = re.compile(r"(?<=\d) (?=%|\()|(?<=%) (?=\()")
 PICTURE = re.compile(r"!\[([^\]]*)\]\((?:\.\./)*(pictures/[\w-]+\.svg)\)")
 DOCS = Path(__file__).parents[1] / "docs"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """An SVG that is part of the page has the colours of the page: those of light and of dark.
+    """Put every SVG into its page, and no line break between a table's number and its unit.
 
-    As an image it would follow the system, and not the switch of the page.
+    An SVG that is part of the page has the colours of the page. As an image it would follow the
+    system's colours, not the page's switch.
     """
 
     def inline(found: re.Match[str]) -> str:
@@ -23,4 +25,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
             f'<figure class="picture">\n{drawing}\n<figcaption>{found[1]}</figcaption>\n</figure>'
         )
 
-    return PICTURE.sub(inline, markdown)
+    lines = [
+        UNIT.sub("\u00a0", line) if line.startswith("|") else line
+        for line in markdown.splitlines()
+    ]
+    return PICTURE.sub(inline, "\n".join(lines))

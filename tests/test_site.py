@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from pages import ROOT
 
 import skillweave as sw
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 EXTERNAL = (
     r"<(?:script|img|iframe|source|video)[^>]*\ssrc=\"(?:https?:)?//[^\"]*",
     r"<link[^>]*rel=\"(?:stylesheet|preconnect|preload|icon)\"[^>]*href=\"(?:https?:)?//[^\"]*",
@@ -55,7 +57,24 @@ def test_every_public_name_has_its_place_in_the_reference(site: Path) -> None:
 
 
 def test_fields_and_pictures_are_in_the_pages(site: Path) -> None:
-    declare = (site / "reference/declare.html").read_text()
-    assert "always the true successor" in declare  # a comment beside a field of ``Step``
+    skill = (site / "reference/skill.html").read_text()
+    assert "always the true successor" in skill  # a comment beside a field of ``Step``
     concepts = (site / "concepts.html").read_text()
     assert concepts.count("<svg class=") >= 3  # drawn in the page, with its colours
+
+
+def test_search_finds_pages_that_are_opened_from_the_disk(site: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api")
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip("no browser here: apt-get install chromium")
+    with playwright.sync_playwright() as started:
+        window = started.chromium.launch(executable_path=browser, args=["--no-sandbox"])
+        page = window.new_page()
+        page.goto((site / "index.html").as_uri())
+        page.keyboard.press("/")
+        page.keyboard.type("population")
+        first = page.locator(".md-search-result__link").first
+        first.wait_for(timeout=20_000)
+        assert "evolution" in page.locator(".md-search-result__list").inner_text().lower()
+        window.close()
