@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,6 +17,7 @@ from skillweave import Agent, Hierarchy
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.S | re.M)
 INCLUDED = re.compile(r"^--8<--\n([\w/.]+)\n--8<--$", flags=re.M)
+BUDGETS = ("steps", "skill_steps", "selector_steps")
 STEPS = 1_000
 """Of each stage; those of an algorithm with replay are a little more than it waits."""
 
@@ -49,16 +50,19 @@ def _smaller(search: Any) -> Any:
     return replace(search, generations=2, population=3, episodes=1)
 
 
+def _shorter(group: Any) -> Any:
+    """Return settings of a way of learning with budgets of at most ``STEPS``."""
+    budgets = {f.name: getattr(group, f.name) for f in fields(group) if f.name in BUDGETS}
+    return replace(group, **{k: min(v, STEPS) for k, v in budgets.items() if v is not None})
+
+
 def train_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut the budgets of everything that is trained, and keep it quiet."""
     train, train_alone = Hierarchy.train, Agent.train
 
     def hierarchy(self: Hierarchy, *args: Any, **kwargs: Any) -> Any:
-        for name in ("skill_steps", "selector_steps", "together_steps", "flat_steps"):
-            value = getattr(self, name)
-            setattr(self, name, None if value is None else min(value, STEPS))
-        if kwargs.get("flat"):
-            self.flat_steps = STEPS
+        self.steps = min(self.steps or STEPS, STEPS)
+        self.apart, self.together = _shorter(self.apart), _shorter(self.together)
         for owner, name in [(self, "selector"), (self, "algorithm")]:
             setattr(owner, name, _sooner(getattr(owner, name)))
         for skill in self.skills:
