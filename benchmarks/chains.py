@@ -162,7 +162,7 @@ TASKS = {
         has_engines=False,
     ),
     # Its skills learn from the task's advantage, a hundred times as much as from their own rewards,
-    # as in the table of docs/measured.md; `no task advantage` says what that is worth.
+    # as in the table of docs/results.md; `no task advantage` says what that is worth.
     "lander": Task(
         _lander,
         functools.partial(replace, lunar_lander.SELECTOR),

@@ -3,7 +3,7 @@
     pip install 'skillweave[box2d,video]'
     python examples/tutorial.py --scale 1 --out runs/tutorial
 
-docs/migrating.md puts the old lines and the new ones side by side. The shipped recipe
+docs/from-agilerl.md puts the old lines and the new ones side by side. The shipped recipe
 ``lunar-lander`` has the same skills with budgets that make them land.
 """
 

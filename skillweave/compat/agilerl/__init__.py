@@ -1,4 +1,4 @@
-"""The module paths and names of AgileRL 0.1, on Skillweave; docs/migrating.md says what differs."""
+"""AgileRL 0.1's module paths and names on Skillweave; docs/from-agilerl.md says what differs."""
 
 import functools
 import warnings
