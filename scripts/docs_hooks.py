@@ -26,7 +26,6 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         )
 
     lines = [
-        UNIT.sub("\u00a0", line) if line.startswith("|") else line
-        for line in markdown.splitlines()
+        UNIT.sub("\u00a0", line) if line.startswith("|") else line for line in markdown.splitlines()
     ]
     return PICTURE.sub(inline, "\n".join(lines))
