@@ -6,12 +6,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.grouped import grouped
-from skillweave import Together
+from skillweave import Guide, Together
 
 
 def plainly(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return keyword arguments of ``Hierarchy`` for ``settings`` by bare names.
 
-    Unless ``settings`` say otherwise, skills learn apart, and follow their own reward alone.
+    Unless ``settings`` say otherwise, skills learn apart, and follow their own reward alone. A
+    ``guide`` has the values of ``guide_restrict`` and ``guide_kl``.
     """
-    return grouped({"learn": "apart", "together": Together(task_weight=0.0)} | dict(settings))
+    found = {"learn": "apart", "together": Together(task_weight=0.0)} | dict(settings)
+    guide = {
+        "restrict": found.pop("guide_restrict", True),
+        "target_kl": found.pop("guide_kl", None),
+    }
+    if found.get("guide") is not None:
+        found["guide"] = Guide(found["guide"], **guide)
+    return grouped(found)

@@ -425,7 +425,7 @@ def setting_cases(draw: Any) -> Case:
 
 DECLARED = (
     "skills", "call_steps", "reflexes", "algorithm", "selector", "skill_steps", "selector_steps",
-    "flat", "flat_steps", "greedy_skills", "reflexes_in_training", "cut_every", "eval_every",
+    "flat", "flat_steps", "greedy_skills", "reflexes_in_training", "checkpoint_every", "eval_every",
     "eval_episodes", "selector_target_return", "start_calls",
     "search_steps", "episode_calls",
 )  # fmt: skip

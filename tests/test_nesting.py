@@ -46,7 +46,7 @@ class Right(Skill):
 
 def options(**how):
     told = {"env": CARTPOLE, "algorithm": ON, "selector": ON, "skill_steps": 150}
-    return told | {"selector_steps": 150, "together_steps": 450, "cut_every": 75} | how
+    return told | {"selector_steps": 150, "together_steps": 450, "checkpoint_every": 75} | how
 
 
 def inside(*skills, **how):
@@ -157,11 +157,11 @@ KINDS = {
     "three": three,
     "observations in parts": in_parts,
     "guides": lambda: declare(
-        inside(guide=MODES, guide_nats=0.05, reflexes=[Reflex(leans, 0)]),
+        inside(guide=MODES, guide_kl=0.05, reflexes=[Reflex(leans, 0)]),
         learn="together",
         guide=lambda obs: np.where(obs[:, 1] > 0, "left", "inner"),
-        guide_restricts=False,
-        guide_nats=0.1,
+        guide_restrict=False,
+        guide_kl=0.1,
         reflexes=[Reflex(far, 1)],
     ),
     "guides, start calls": lambda: declare(
@@ -502,9 +502,9 @@ def stage(name, kept):
 def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(stages, greedy):
     run = SimpleNamespace(manifest={"stages": [stage(*told) for told in stages.items()]})
     found = settled(declare(), run)
-    assert tuple(own.greedy_skills for _, own in every_hierarchy(found)) == greedy
+    assert tuple(own.selection.greedy_skills for _, own in every_hierarchy(found)) == greedy
     said = settled(declare(inside(greedy_skills=False), greedy_skills=True), run)
-    assert [own.greedy_skills for _, own in every_hierarchy(said)] == [True, False]
+    assert [own.selection.greedy_skills for _, own in every_hierarchy(said)] == [True, False]
 
 
 def test_critics_learn_what_deciding_is_worth_at_every_level_where_calls_are_cut():

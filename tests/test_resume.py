@@ -42,7 +42,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool
 RECIPE = '''
 """A small hierarchy on CartPole with a piece of everything that could keep state."""
 import numpy as np
-from skillweave import Network, PPO, EnvSpec, Hierarchy, Reflex, Skill
+from skillweave import (
+    Apart, Network, PPO, EnvSpec, Hierarchy, Reflex, Selection, Skill, TrainDefaults,
+)
 
 class Left(Skill):
     max_steps = 15
@@ -68,10 +70,10 @@ hierarchy = Hierarchy(
     reflexes=[Reflex(lambda obs: obs[:, 2] > 0.05, action=1, name="catch")],
     algorithm=small,
     selector=small,
-    skill_steps=300,
-    selector_steps=750,
-    cut_every=75,
-    greedy_skills=False,
+    learn="apart",
+    apart=Apart(skill_steps=300, selector_steps=750),
+    train_defaults=TrainDefaults(checkpoint_every=75),
+    selection=Selection(greedy_skills=False),
 )
 '''
 
@@ -191,8 +193,8 @@ def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stoppe
 
     def hierarchy() -> Hierarchy:
         found = recipes.load("lunar-lander")
-        budgets = ["skills.stabilize.steps=1", "skills.center.steps=1", "selector_steps=1"]
-        apply_overrides(found, [*budgets, "skills.landing.steps=24000", "cut_every=1"])
+        budgets = ["skills.stabilize.steps=1", "skills.center.steps=1", "apart.selector_steps=1"]
+        apply_overrides(found, [*budgets, "skills.landing.steps=24000", "train.checkpoint_every=1"])
         return found
 
     hierarchy().train(tmp_path / "whole", seed=0, quiet=True)
@@ -246,10 +248,20 @@ def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Refe
 
 
 SETTINGS = [  # a run that lost any of them would end otherwise
-    ["reflexes_in_training=false", "skills.left.gamma=0.9", "cut_every=125", "selector_steps=350"],
-    ["greedy_skills=true", "call_steps=9", "skills.left.steps=200", "selector.learning_rate=0.01"],
-    ["start_calls=2", "search_steps=12"],
-    ["start_calls=2", "episode_calls=3"],
+    [
+        "reflexes_in_training=false",
+        "skills.left.gamma=0.9",
+        "train.checkpoint_every=125",
+        "apart.selector_steps=350",
+    ],
+    [
+        "selection.greedy_skills=true",
+        "call_steps=9",
+        "skills.left.steps=200",
+        "selector.learning_rate=0.01",
+    ],
+    ["apart.start_calls=2", "apart.search_steps=12"],
+    ["apart.start_calls=2", "apart.episode_calls=3"],
 ]
 
 
@@ -319,7 +331,7 @@ def stage_of(name: str, save_buffer: bool = True) -> Stage:
 
 def echo_run(path: Path, stage: Stage) -> RunDirectory:
     manifest = {
-        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "cut_every": 125, "skills": [],
+        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "checkpoint_every": 125, "skills": [],
         "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "stages": [stage.entry()],
     }  # fmt: skip
     return RunDirectory.create(path, manifest)
@@ -423,9 +435,9 @@ LEARNERS = {
 
 
 FEWER_STEPS = {
-    "skill_steps=300": "skill_steps=200",
-    "selector_steps=750": "selector_steps=400",
-    "cut_every=75": "cut_every=50",
+    "apart.skill_steps=300": "apart.skill_steps=200",
+    "apart.selector_steps=750": "apart.selector_steps=400",
+    "train.checkpoint_every=75": "train.checkpoint_every=50",
 }
 
 

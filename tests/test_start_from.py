@@ -62,7 +62,7 @@ class Other(Skill):
 def declare(learn="apart", rate=None, skills=(Left, Other, Push), **how):
     settings = {
         "call_steps": 5, "skill_steps": 300, "selector_steps": 300, "together_steps": 600,
-        "algorithm": ON, "selector": ON, "cut_every": 100, "greedy_skills": False,
+        "algorithm": ON, "selector": ON, "checkpoint_every": 100, "greedy_skills": False,
     }  # fmt: skip
     env = how.pop("env", "CartPole-v1")
     found = Hierarchy(env, [s() for s in skills], **plainly(settings | how | {"learn": learn}))

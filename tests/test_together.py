@@ -57,7 +57,7 @@ def declare(*skills, **how):
         "together_steps": 450,
         "skill_steps": 150,
         "selector_steps": 150,
-        "cut_every": 75,
+        "checkpoint_every": 75,
     }
     return Hierarchy(**plainly(options | how))
 
@@ -206,7 +206,7 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
 ):
     hierarchy = declare(learn=learn, greedy_skills=asked)
     run = hierarchy.train(tmp_path / "run", seed=3, quiet=True)
-    assert hierarchy.greedy_skills is asked, "another seed is judged anew"
+    assert hierarchy.selection.greedy_skills is asked, "another seed is judged anew"
     loaded = declare(learn=learn).load(run.path)
     run.save_weights(tmp_path / "weights")
     read = declare(learn=learn).load_weights(tmp_path / "weights")

@@ -165,7 +165,7 @@ def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
 
 def alone(env: Any, algorithm: Any, steps: int) -> Agent:
     """One agent."""
-    return Agent(env, algorithm, steps, cut_every=max(1, steps // 5))
+    return Often(env, algorithm, steps)
 
 
 def together(steps: int) -> Hierarchy:

@@ -274,6 +274,7 @@ def train_agent(
     target_success: float | None = None,
     eval_every: int | None = None,
     eval_episodes: int = 20,
+    checkpoint_every: int = 100_000,
     seed: int = 0,
     quiet: bool = False,
     track: Sequence[str] = (),
@@ -291,6 +292,7 @@ def train_agent(
         target_success: stop early at this share of episodes whose ``info["success"]`` is true.
         eval_every: environment steps between these evaluations; None: none.
         eval_episodes: episodes of each.
+        checkpoint_every: environment steps between checkpoints.
         run_dir: a new directory; an existing run is never overwritten.
         seed: the root of every random stream.
         quiet: no progress.
@@ -319,6 +321,7 @@ def train_agent(
         seed=seed,
         eval_every=eval_every,
         eval_episodes=eval_episodes,
+        checkpoint_every=checkpoint_every,
         quiet=quiet,
         track=track,
         evolve=evolve,

@@ -123,7 +123,7 @@ def test_the_lander_is_what_the_measured_table_says() -> None:
     recipe = recipes.load("lunar-lander")
     assert passes(CASES["apart"](TASKS["lander"], steps)) == passes(recipe)
     assert [s.steps or found.skill_steps for s in found.skills] == [10_000, 10_000, 50_000]
-    assert (found.selector_steps, found.together_steps) == (50_000, 1_500_000)
+    assert (found.selector_steps, found.together.steps) == (50_000, 1_500_000)
     assert found.together.task_weight == 100
     asked = hierarchy.declared("lunar-lander", hierarchy.together())
     same = replace(asked, env=found.env)  # but for how many workers step it

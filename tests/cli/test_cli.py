@@ -25,7 +25,9 @@ COMMANDS += ("sweep", "weights", "export", "import-agilerl")
 # The same hierarchy twice: as plain data, and with a reflex, which only code can say.
 PLAIN = '''
 """Two skills on CartPole."""
-from skillweave import Network, PPO, EnvSpec, Hierarchy, Reflex, Skill
+from skillweave import (
+    Apart, Network, PPO, EnvSpec, Hierarchy, Reflex, Selection, Skill, TrainDefaults,
+)
 
 class Left(Skill):
     max_steps = 10
@@ -42,9 +44,9 @@ hierarchy = Hierarchy(
     call_steps=5,
     algorithm=small,
     selector=small,
-    skill_steps=256,
-    selector_steps=512,
-    cut_every=128,
+    learn="apart",
+    apart=Apart(skill_steps=256, selector_steps=512),
+    train_defaults=TrainDefaults(checkpoint_every=128),
 )
 '''
 CATCH = '    reflexes=[Reflex(lambda obs: obs[:, 2] > 0.1, action=1, name="catch")],\n'
@@ -288,7 +290,7 @@ def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
     call: Call, tmp_path: Path
 ) -> None:
     before = recipes.load("lunar-lander").total_steps
-    budgets = ("skill_steps=100", "skills.landing.steps=100", "selector_steps=100")
+    budgets = ("apart.skill_steps=100", "skills.landing.steps=100", "apart.selector_steps=100")
     small = (*(part for b in budgets for part in ("--set", b)), "--scale", 0.5)
     tiny = [f"algorithm.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
     tiny += [f"skills.landing.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]

@@ -18,7 +18,7 @@ from skillweave.types import SkillweaveError
 
 RECIPE = '''
 """One skill on CartPole."""
-from skillweave import Network, PPO, Hierarchy, Skill
+from skillweave import Apart, Network, PPO, Hierarchy, Skill, TrainDefaults
 
 class Still(Skill):
     def reward(self, step):
@@ -26,8 +26,9 @@ class Still(Skill):
 
 small = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network(hidden=(8,)))
 hierarchy = Hierarchy(
-    "CartPole-v1", [Still()], algorithm=small, selector=small, skill_steps=64, selector_steps=64,
-    cut_every=32,
+    "CartPole-v1", [Still()], algorithm=small, selector=small, learn="apart",
+    apart=Apart(skill_steps=64, selector_steps=64),
+    train_defaults=TrainDefaults(checkpoint_every=32),
 )
 '''
 

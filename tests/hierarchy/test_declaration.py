@@ -66,8 +66,10 @@ def named(name: str, **attributes) -> Skill:
 
 
 def test_a_target_is_told_by_the_name_of_its_setting() -> None:
-    with pytest.raises(SkillweaveError, match="selector_target_return is 'x'; it must be a number"):
-        declare(selector_target_return="x")
+    with pytest.raises(
+        SkillweaveError, match="selector: target_return is 'x'; it must be a number"
+    ):
+        declare(target_return="x")
 
 
 WRONG = {
@@ -76,7 +78,7 @@ WRONG = {
     "a name that is no file name": (lambda: declare(named("a/b")), "'a/b'.*Custom.*letters"),
     "two of one name": (lambda: declare(Center(), Center()), "two skills.*'center'"),
     "the name of the selector": (lambda: declare(named("selector")), "'selector'.*stage"),
-    "the name of the baseline": (lambda: declare(named("flat")), "'flat'.*stage"),
+    "the name of the baseline": (lambda: declare(named("agent")), "'agent'.*stage"),
     "a class": (lambda: declare(Center), r"Center.*not a Skill.*write Center\(\), not Center"),
     "no skill at all": (lambda: declare("center"), "'center'.*not a Skill"),
     "max_steps=0": (lambda: declare(named("x", max_steps=0)), "'x'.*max_steps is 0"),
@@ -89,9 +91,9 @@ WRONG = {
         lambda: declare(Center(), named("endless"), call_steps=None),
         "call_steps is None.*'endless'.*max_steps or termination",
     ),
-    "skill_steps=0": (lambda: declare(skill_steps=0), "skill_steps is 0"),
-    "selector_steps=-1": (lambda: declare(selector_steps=-1), "selector_steps is -1"),
-    "cut_every=0": (lambda: declare(cut_every=0), "cut_every is 0"),
+    "apart.skill_steps=0": (lambda: declare(skill_steps=0), "skill_steps is 0"),
+    "apart.selector_steps=-1": (lambda: declare(selector_steps=-1), "selector_steps is -1"),
+    "checkpoint_every=0": (lambda: declare(checkpoint_every=0), "checkpoint_every is 0"),
 }
 
 
@@ -108,7 +110,7 @@ NOT_CHECKED = {
         "skills",
     ),
     "a reflex that is only a function": (lambda: declare(reflexes=[zeros]), "not a Reflex"),
-    "skill_steps='many'": (lambda: declare(skill_steps="many"), "skill_steps is 'many'"),
+    "apart.skill_steps='many'": (lambda: declare(skill_steps="many"), "skill_steps is 'many'"),
     "settings as a class": (lambda: declare(algorithm=PPO), "algorithm"),
     "a selector's settings as a class": (lambda: declare(selector=PPO), "selector"),
     "a skill's settings as a class": (lambda: declare(named("x", algorithm=PPO)), "'x'.*algorithm"),
@@ -200,11 +202,10 @@ def test_a_skill_that_is_not_there_is_answered_with_those_that_are():
 
 def test_budgets_are_the_skills_own_else_the_hierarchys_and_nothing_for_ready_policies():
     d = declare(Center(), Lean(), Ready(), skill_steps=7_000, selector_steps=100)
-    assert [d.budget(s) for s in d.skills] == [7_000, 5_000, 0]
+    assert d.budgets() == {"center": 7_000, "lean": 5_000, "selector": 100}
     assert d.total_steps == 12_100
     d.scale(0.1)
-    assert [d.budget(s) for s in d.skills] == [700, 500, 0]
-    assert d.selector_steps == 10
+    assert d.budgets() == {"center": 700, "lean": 500, "selector": 10}
     assert Lean.steps == 5_000, "scaling one declaration changed the class"
     for factor in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(SkillweaveError, match="scale"):
@@ -233,10 +234,14 @@ def test_a_declaration_is_data_where_acting_needs_no_code_of_the_users(make, is_
 SETTINGS = {
     "call_steps=20": lambda d: d.call_steps == 20,
     "call_steps=none": lambda d: d.call_steps is None,
-    "skill_steps=1e6": lambda d: d.skill_steps == 1_000_000,
-    "selector_steps=1_000": lambda d: d.selector_steps == 1000,
-    "greedy_skills=false": lambda d: d.greedy_skills is False,
-    "reflexes_in_training=False": lambda d: d.reflexes_in_training is False,
+    "apart.skill_steps=1e6": lambda d: d.apart.skill_steps == 1_000_000,
+    "apart.selector_steps=1_000": lambda d: d.apart.selector_steps == 1000,
+    "selection.greedy_skills=false": lambda d: d.selection.greedy_skills is False,
+    "steps=7e5": lambda d: d.steps == 700_000,
+    "learn=together": lambda d: d.learn == "together",
+    "together.epsilon=0.5": lambda d: d.together.epsilon == 0.5,
+    "train.eval_every=1e4": lambda d: d.train_defaults.eval_every == 10_000,
+    "skills.center.task_weight=0": lambda d: d.skill("center").task_weight == 0.0,
     "algorithm.gamma=0.5": lambda d: d.algorithm.gamma == 0.5 and d.selector.gamma == PPO().gamma,
     "selector.gamma=1": lambda d: d.selector.gamma == 1.0 and isinstance(d.selector.gamma, float),
     "selector.n_steps = 16": lambda d: d.selector.n_steps == 16,
@@ -248,12 +253,15 @@ SETTINGS = {
     "selector.learning_rate_schedule=constant": (
         lambda d: d.selector.learning_rate_schedule == "constant"
     ),
-    "selector_target_return=200": lambda d: d.selector_target_return == 200.0,
+    "selection.target_return=200": lambda d: d.selection.target_return == 200.0,
     "skills.center.target_return=1e1": lambda d: d.skill("center").target_return == 10.0,
     "flat.learning_rate=1e-4": (
-        lambda d: d.flat and d.flat.learning_rate == 1e-4 and d.algorithm.learning_rate == 1e-3
+        lambda d: (
+            (flat := d.train_defaults.flat)
+            and (flat.learning_rate, d.algorithm.learning_rate) == (1e-4, 1e-3)
+        )
     ),
-    "skills.center.steps=2e4": lambda d: d.budget(d.skill("center")) == 20_000,
+    "skills.center.steps=2e4": lambda d: d.budgets()["center"] == 20_000,
     "skills.lean.gamma=0.9": (
         lambda d: (
             (config := d.skill("lean").algorithm)
@@ -303,17 +311,17 @@ WRONG_SETTINGS = {
     "call_steps=2.5": "call_steps=2.5: expected int",
     "call_steps=true": "call_steps=true: expected int",
     "call_steps=": "call_steps=: expected int",
-    "greedy_skills=1": "greedy_skills=1: expected bool",
-    "interrupt=none": "interrupt=none: expected bool",
-    "skill_steps=none": "skill_steps=none: expected int",
-    "skill_steps=1e999": "skill_steps=1e999: expected int",
+    "selection.greedy_skills=1": "selection.greedy_skills=1: expected bool",
+    "together.interrupt=none": "together.interrupt=none: expected bool",
+    "apart.skill_steps=soon": "apart.skill_steps=soon: expected int",
+    "apart.skill_steps=1e999": "apart.skill_steps=1e999: expected int",
     "selector.gamma=high": "selector.gamma=high: expected float",
     "selector.gamma=true": "selector.gamma=true: expected float",
     "selector.gamma=nan": "selector.gamma=nan: expected float",
     "selector.network.activation=sine": "activation=sine: expected.*tanh",
     "selector.network.hidden=wide": "hidden=wide: expected tuple",
     "call_steps=0": "call_steps is 0",
-    "skill_steps=0": "skill_steps is 0",
+    "apart.skill_steps=0": "skill_steps is 0",
     "skills.lean.steps=-4": "'lean'.*steps is -4",
     "selector.gamma=2": "gamma is 2.0.*between 0 and 1",
     "skills.center.learning_rate=-1": "learning_rate is -1.0.*positive",
@@ -367,7 +375,7 @@ def test_changes_show_in_the_list_and_carry_over_to_another_declaration():
     changes = [
         "call_steps=7", "skills.center.gamma=0.9", "skills.center.network.hidden=(8, 4)",
         "skills.lean.steps=77", "selector.target_kl=0.02", "selector.learning_rate_schedule=kl",
-        "selector.normalize_obs=true", "greedy_skills=false",
+        "selector.normalize_obs=true", "selection.greedy_skills=false",
     ]  # fmt: skip
     apply_overrides(d, changes)
     listed = list_settings(d)

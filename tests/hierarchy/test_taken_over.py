@@ -27,7 +27,7 @@ def declare(**how):
         "selector": ON,
         "skill_steps": 200,
         "selector_steps": 200,
-        "cut_every": 100,
+        "checkpoint_every": 100,
     }
     return Hierarchy(**plainly(options | how))
 
@@ -113,7 +113,7 @@ def test_settings_that_differ_are_told_where_a_run_goes_on(
     assert ("goes on with its own settings" in told) == bool(says)
     assert says in told
     assert run.info()["stages"][0]["algorithm"]["gamma"] == ON.gamma
-    assert run.hierarchy.call_cost == 0.0
+    assert run.hierarchy.selection.call_cost == 0.0
     assert RunDirectory.open(tmp_path / "run").finished
 
 
@@ -129,7 +129,7 @@ def test_a_cost_of_calls_below_that_differs_is_told(tmp_path, monkeypatch, capsy
     capsys.readouterr()
     whole(0.5).resume(tmp_path / "run")
     told = "".join(capsys.readouterr())
-    assert "skills.inner.hierarchy.call_cost is 0 (declared now: 0.5)" in told
+    assert "skills.inner.hierarchy.selection.call_cost is 0 (declared now: 0.5)" in told
 
 
 def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
@@ -150,7 +150,7 @@ def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
     told = "".join(capsys.readouterr())
     assert "skills.left.max_steps is 15 (declared now: 4)" in told
     assert "call_cost is 0.5 (declared now: 0.1)" in told
-    assert (other.skills[0].max_steps, other.call_cost) == (4, 0.1)
+    assert (other.skills[0].max_steps, other.selection.call_cost) == (4, 0.1)
     assert_same(tmp_path / "run", tmp_path / "whole")
 
 
@@ -175,11 +175,11 @@ def test_a_recipe_is_not_asked_for_what_the_command_line_changed(tmp_path, monke
 
 
 def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, capsys):
-    agent = Agent("CartPole-v1", ON, 300, cut_every=100, target_return=1e6, eval_every=100)
+    agent = Agent("CartPole-v1", ON, 300, target_return=1e6)
     with monkeypatch.context() as patched:
         interrupt_at_checkpoint(patched, 1)
         with pytest.raises(KeyboardInterrupt):
-            agent.train(tmp_path / "run")
+            agent.train(tmp_path / "run", checkpoint_every=100, eval_every=100)
     capsys.readouterr()
     Agent.from_manifest(RunDirectory.open(tmp_path / "run").manifest).resume(tmp_path / "run")
     assert "own settings" not in "".join(capsys.readouterr())
@@ -201,12 +201,6 @@ def test_ctrl_c_says_how_far_it_is_saved_and_how_to_go_on(tmp_path, monkeypatch)
         declare().resume(path)
     with pytest.raises(KeyboardInterrupt, match=r"^saved at the start; go on"):
         declare().train(tmp_path / "other")
-
-
-@pytest.mark.parametrize("nats", [0.05, "x", -3])
-def test_a_distance_from_no_guide_is_refused(nats):
-    with pytest.raises(SkillweaveError, match=r"guide_nats is .*, but there is no guide"):
-        declare(guide_nats=nats)
 
 
 COLORS = [

@@ -103,7 +103,7 @@ def declare(*skills, **how):
         "skill_steps": 150,
         "selector_steps": 200,
         "together_steps": 450,
-        "cut_every": 75,
+        "checkpoint_every": 75,
         "greedy_skills": True,  # chance is another one with another number of environments
     }
     return Hierarchy(**plainly(options | how))
@@ -117,9 +117,9 @@ KINDS = {
     "tree, then": lambda: declare(selector=TREE, learn="apart, then together"),
     "restricted": lambda: declare(guide=AUTOMATON, learn="together"),
     "restricted, from replay": lambda: declare(guide=AUTOMATON, selector=OFF, selector_steps=450),
-    "near a tree": lambda: declare(guide=TREE, guide_restricts=False, guide_nats=0.05),
+    "near a tree": lambda: declare(guide=TREE, guide_restrict=False, guide_kl=0.05),
     "near and restricted, then": lambda: declare(
-        guide=AUTOMATON, guide_nats=0.1, learn="apart, then together", call_steps=Lengths(1, 4)
+        guide=AUTOMATON, guide_kl=0.1, learn="apart, then together", call_steps=Lengths(1, 4)
     ),
     "lengths by a rule": lambda: declare(guide=by_rule, call_steps=Lengths(1, 2, 4)),
 }
@@ -161,7 +161,7 @@ def test_skills_that_learn_under_a_ready_selector_solve_the_corridor(tmp_path):
     # To stay is nearly as good as to go, as there is time. After 12,000 steps greedy skills stay at
     # the door with a third of the seeds; after 24,000 with none of 0 to 11.
     skilled = declare(
-        selector=AUTOMATON, learn="together", together_steps=24_000, cut_every=100_000,
+        selector=AUTOMATON, learn="together", together_steps=24_000,
         algorithm=PPO(num_envs=8, n_steps=32, batch_size=64, network=SMALL, learning_rate=3e-3),
     )  # fmt: skip
     assert skilled.train(tmp_path / "run", seed=0, quiet=True).evaluate(30).mean > 0.9
@@ -234,8 +234,8 @@ def test_a_selector_near_its_guide_does_what_the_guide_does(tmp_path):
 
     free, told = shares()
     assert not told
-    near, told = shares(guide=lambda obs: ["other"] * len(obs), guide_restricts=False,
-                        guide_nats=0.02)  # fmt: skip
+    near, told = shares(guide=lambda obs: ["other"] * len(obs), guide_restrict=False,
+                        guide_kl=0.02)  # fmt: skip
     assert near > 0.8 > free
     assert told[-1]["anchor_kl"] < 0.2 * told[0]["anchor_kl"]
 
@@ -247,7 +247,7 @@ def test_a_function_that_is_told_of_calls_hears_of_those_that_were_made(tmp_path
         heard.append(last.skill.copy())
         return np.zeros(len(obs), int)
 
-    declare(guide=follow, guide_restricts=False, guide_nats=1.0, skill_steps=64).train(
+    declare(guide=follow, guide_restrict=False, guide_kl=1.0, skill_steps=64).train(
         tmp_path / "run", quiet=True
     )
     assert len(np.unique(np.concatenate(heard))) > 2
@@ -267,17 +267,17 @@ def test_a_population_of_restricted_selectors_evolves(tmp_path):
     run = hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
     for state, skill in calls_of(run.policy, guide):
         assert skill in guide.states[state]
-    near = declare(*skills, guide=guide, guide_nats=0.1)
+    near = declare(*skills, guide=guide, guide_kl=0.1)
     with pytest.raises(SkillweaveError, match="not kept near a guide"):
         near.train(tmp_path / "near", quiet=True, evolve=evolve)
 
 
 WRONG: dict[str, dict[str, Any]] = {
     "guide is 3; it must be a function": {"guide": 3},
-    "guide_nats is -1": {"guide": AUTOMATON, "guide_nats": -1},
-    "guide_nats is 'x'; it must be a number": {"guide": AUTOMATON, "guide_nats": "x"},
-    "the guide has no effect": {"guide": AUTOMATON, "guide_restricts": False},
-    "only PPO can be kept near": {"guide": AUTOMATON, "guide_nats": 0.1, "selector": OFF},
+    "guide_kl is -1": {"guide": AUTOMATON, "guide_kl": -1},
+    "guide_kl is 'x'; it must be a number": {"guide": AUTOMATON, "guide_kl": "x"},
+    "the guide has no effect": {"guide": AUTOMATON, "guide_restrict": False},
+    "only PPO can be kept near": {"guide": AUTOMATON, "guide_kl": 0.1, "selector": OFF},
     "has nothing to choose": {"guide": by_rule},
     "says only at decisions": {
         "guide": by_rule, "call_steps": Lengths(1, 2), "selector": OFF
@@ -299,7 +299,7 @@ def test_a_guide_that_fails_is_told_before_anything_is_trained(tmp_path):
     def wrong(obs):
         return np.full(len(obs), 9)
 
-    hierarchy = declare(guide=wrong, guide_restricts=False, guide_nats=0.1)
+    hierarchy = declare(guide=wrong, guide_restrict=False, guide_kl=0.1)
     with pytest.raises(SkillweaveError, match=r"guide: function wrong\(\) returned 9"):
         hierarchy.train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()

@@ -94,7 +94,7 @@ def test_as_a_skill_under_a_selector_that_is_trained(kind, tmp_path):
     inner = declare(SELECTORS[kind]).train(tmp_path / "run", quiet=True).as_skill("inner")
 
     def outer() -> Hierarchy:
-        steps = {"call_steps": 4, "selector_steps": 128, "cut_every": 32}
+        steps = {"call_steps": 4, "selector_steps": 128, "checkpoint_every": 32}
         return Hierarchy(SPEC, [inner, Wait()], selector=SMALL, **plainly(steps))
 
     run = outer().train(tmp_path / "outer", quiet=True)

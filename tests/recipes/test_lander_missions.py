@@ -297,10 +297,10 @@ def test_a_skill_does_not_see_the_mission_and_the_selector_and_flat_agents_do():
 def test_skills_sample_and_a_selector_over_given_skills_takes_fewer_steps():
     skills = {skill().name: lambda obs: np.zeros(len(obs), int) for skill in missions.SKILLS}
     first, further = missions.declare(), missions.with_skills("tour", skills)
-    assert first.greedy_skills is further.greedy_skills is False
-    assert (first.selector_steps, further.selector_steps) == (600_000, 300_000)
+    assert first.selection.greedy_skills is further.selection.greedy_skills is False
+    assert (first.apart.selector_steps, further.apart.selector_steps) == (600_000, 300_000)
     longer = missions.with_skills("tour", skills, greedy_skills=True, selector_steps=500_000)
-    assert (longer.greedy_skills, longer.selector_steps) == (True, 500_000)
+    assert (longer.selection.greedy_skills, longer.apart.selector_steps) == (True, 500_000)
 
 
 def test_the_selector_by_hand_calls_the_skill_of_the_leg():

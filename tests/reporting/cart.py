@@ -1,7 +1,7 @@
 """A small hierarchy on CartPole as a recipe, for reports that need a real run."""
 
 RECIPE = """
-from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill
+from skillweave import PPO, Apart, EnvSpec, Hierarchy, Network, Skill
 
 class Left(Skill):
     max_steps = 10
@@ -20,7 +20,7 @@ hierarchy = Hierarchy(
     call_steps=5,
     algorithm=small,
     selector=small,
-    skill_steps=256,
-    selector_steps=512,
+    learn="apart",
+    apart=Apart(skill_steps=256, selector_steps=512),
 )
 """

@@ -44,7 +44,7 @@ def manifest() -> dict[str, Any]:
         "env": "CartPole-v1",
         "env_kwargs": {},
         "seed": 7,
-        "cut_every": 100,
+        "checkpoint_every": 100,
         "skills": [{"name": "landing", "max_steps": None, "ready": False}],
         "call_steps": 10,
         "greedy_skills": True,
@@ -413,8 +413,11 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
             "stages[1].name is '../../x'; it must be",
         ),
         (lambda m: m["skills"].__setitem__(0, None), "skills[0] is None; it must be an object"),
-        (lambda m: m.update(cut_every=[[]]), "cut_every is [[]]; it must be a whole number"),
-        (lambda m: m.update(cut_every=0), "cut_every is 0; it must be at least 1"),
+        (
+            lambda m: m.update(checkpoint_every=[[]]),
+            "checkpoint_every is [[]]; it must be a whole number",
+        ),
+        (lambda m: m.update(checkpoint_every=0), "checkpoint_every is 0; it must be at least 1"),
         (lambda m: m.update(seed=-1), "seed is -1; it must be at least 0"),
         (lambda m: m.update(kind="x" * 10_000), "kind is 'xxx"),
         (

@@ -106,12 +106,12 @@ def test_what_a_killed_and_resumed_run_made_again_is_not_reported_twice(made, tm
             if name == "always" and steps >= 400:
                 raise Stop
 
-    whole = hierarchy(cut_every=150).train(tmp_path / "whole", quiet=True)
+    whole = hierarchy(checkpoint_every=150).train(tmp_path / "whole", quiet=True)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("skillweave.api.running.Progress", Stopping)
         with pytest.raises(Stop):
-            hierarchy(cut_every=150).train(tmp_path / "broken", quiet=True)
-    again = hierarchy(cut_every=150).resume(tmp_path / "broken", quiet=True)
+            hierarchy(checkpoint_every=150).train(tmp_path / "broken", quiet=True)
+    again = hierarchy(checkpoint_every=150).resume(tmp_path / "broken", quiet=True)
     ours, theirs = ([p["steps"] for p in r.info()["stages"]] for r in (again, whole))
     assert ours == theirs
 
@@ -126,11 +126,11 @@ def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
             return np.ones(len(obs), np.int64)
 
     declared = sw.Hierarchy(sw.EnvSpec(Walk, engine="sync"), [Zero(), One()], learn="apart")
-    declared.selector_steps //= 20  # a twentieth of the default budget
+    declared.apart.selector_steps //= 20  # a twentieth of the default budget
     run = declared.train(tmp_path / "run", quiet=True)
     updates = sum(1 for _ in RunDirectory.open(run.path).metrics())
     assert updates >= 150 / 20
-    assert run.info()["stages"][0]["steps"] < declared.selector_steps + 64 * 64
+    assert run.info()["stages"][0]["steps"] < declared.apart.selector_steps + 64 * 64
 
 
 @pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])

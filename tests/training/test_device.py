@@ -36,7 +36,9 @@ def test_a_device_that_is_not_there_is_told_before_anything_is_written(
     config, env = LEARNERS[name]
     config = replace(config, device="cuda")
     with pytest.raises(SkillweaveError, match=r"stage 'agent': .*no CUDA device here; use 'cpu'"):
-        train_agent(env, config, 256, tmp_path / "run", quiet=True, evolve=evolve)
+        train_agent(
+            env, config, 256, tmp_path / "run", quiet=True, evolve=evolve, checkpoint_every=200
+        )
     assert not (tmp_path / "run").exists()
 
 
@@ -50,7 +52,7 @@ def test_auto_is_the_cpu_where_there_is_nothing_else(
     for device in ("cpu", "auto"):
         config, env = LEARNERS[name]
         config, path = replace(config, device=device), tmp_path / device
-        train_agent(env, config, 256, path, quiet=True, evolve=evolve)
+        train_agent(env, config, 256, path, quiet=True, evolve=evolve, checkpoint_every=200)
         found.append(read_tensors(path / "policies" / "agent.safetensors")[0])
     assert all(torch.equal(value, found[1][key]) for key, value in found[0].items())
 
@@ -63,7 +65,9 @@ def test_on_a_gpu_it_learns_and_its_policy_is_read_without_one(
 ) -> None:
     config, env = LEARNERS[name]
     config = replace(config, device="cuda")
-    run = train_agent(env, config, 512, tmp_path / "run", quiet=True, evolve=evolve, cut_every=200)
+    run = train_agent(
+        env, config, 512, tmp_path / "run", quiet=True, evolve=evolve, checkpoint_every=200
+    )
     assert all(v.device.type == "cpu" and v.isfinite().all() for v in run.policy.weights.values())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert len(run.evaluate(2).returns) == 2

@@ -128,8 +128,9 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
         return {"eval_return": float(steps // 100)} if steps // 100 > before // 100 else {}
 
     monkeypatch.setattr(PeriodicEvaluation, "due", due)
-    agent = Agent(WALK, algorithm, 2_000, target_return=4.0, eval_every=100, cut_every=100)
-    whole = agent.train(tmp_path / "whole", quiet=True)
+    agent = Agent(WALK, algorithm, 2_000, target_return=4.0)
+    often = {"eval_every": 100, "checkpoint_every": 100}
+    whole = agent.train(tmp_path / "whole", quiet=True, **often)
     reached = whole.info()["stages"][0]["reached"]
     assert reached["value"] == 4.0
 
@@ -147,7 +148,7 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
 
             patch.setattr(Target, "reached", dies)
         with pytest.raises(ZeroDivisionError):
-            agent.train(tmp_path / "run", quiet=True)
+            agent.train(tmp_path / "run", quiet=True, **often)
     assert not RunDirectory.open(tmp_path / "run").finished
     again = agent.resume(tmp_path / "run", quiet=True)
     ours, theirs = again.info()["stages"][0], whole.info()["stages"][0]
@@ -190,8 +191,8 @@ def test_skills_and_selector_have_targets_of_their_own(
 
 
 def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path: Path) -> None:
-    agent = Agent(WALK, SMALL, 640, target_success=0.99, eval_every=100, eval_episodes=20)
-    run = agent.train(tmp_path / "run", quiet=True)
+    agent = Agent(WALK, SMALL, 640, target_success=0.99)
+    run = agent.train(tmp_path / "run", quiet=True, eval_every=100, eval_episodes=20)
     (entry,) = run.info()["stages"]
     assert "reached" not in entry, "about half of the episodes succeed"
     told = [m["eval_success"] for m in RunDirectory.open(run.path).metrics() if "eval_return" in m]
@@ -200,9 +201,9 @@ def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path: Path) -
 
 
 def test_a_success_that_nobody_tells_is_an_error(tmp_path: Path) -> None:
-    agent = Agent("CartPole-v1", SMALL, 200, target_success=0.5, eval_every=50, eval_episodes=1)
+    agent = Agent("CartPole-v1", SMALL, 200, target_success=0.5)
     with pytest.raises(SkillweaveError, match=r"agent.*target_success.*info\['success'\]"):
-        agent.train(tmp_path / "run", quiet=True)
+        agent.train(tmp_path / "run", quiet=True, eval_every=50, eval_episodes=1)
 
 
 def test_a_population_ends_at_its_stages_target(tmp_path: Path) -> None:
