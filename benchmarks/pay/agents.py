@@ -216,7 +216,7 @@ class Bench:
             task.env,
             learner,
             budget,
-            evaluation=TrainDefaults(
+            train_defaults=TrainDefaults(
                 eval_every=max(1, budget // self.suite.evaluations),
                 eval_episodes=self.suite.evaluated,
             ),

@@ -5,12 +5,12 @@ All are evaluated on the task's own reward while they train, whatever they learn
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skillweave import Agent, Skill, TrainDefaults
+from skillweave import Agent, Skill
 from skillweave.api.run import Run
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
@@ -28,8 +28,6 @@ class Flat(Agent):
 
     learns: Skill | None = None
     """F1 and F2: whose reward it learns."""
-    evaluation: TrainDefaults = field(default_factory=TrainDefaults)
-    """Evaluations while it trains."""
     starts_from: Path | None = None
     """F3: the run in which it has learnt another task."""
 
@@ -45,7 +43,7 @@ class Flat(Agent):
         if path.exists():
             run = RunDirectory.open(path)
         else:
-            content = self.manifest(seed, self.evaluation)
+            content = self.manifest(seed)
             content["stages"][0]["workers"] = 1  # runs go side by side
             learnt = {} if self.starts_from is None else learnt_in(self.starts_from)
             if self.starts_from is not None:

@@ -165,7 +165,8 @@ def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
 
 def alone(env: Any, algorithm: Any, steps: int) -> Agent:
     """One agent."""
-    return Often(env, algorithm, steps)
+    often = TrainDefaults(checkpoint_every=max(1, steps // 5))
+    return Agent(env, algorithm, steps, train_defaults=often)
 
 
 def together(steps: int) -> Hierarchy:

@@ -50,8 +50,8 @@ class Agent(PlainAgent):
         *,
         seed: int = 0,
         eval_every: int | None = None,
-        eval_episodes: int = 20,
-        checkpoint_every: int = 100_000,
+        eval_episodes: int | None = None,
+        checkpoint_every: int | None = None,
         quiet: bool = False,
         track: Sequence[str] = (),
         evolve: Evolve = None,
@@ -62,7 +62,9 @@ class Agent(PlainAgent):
 
         The arguments are those of ``Hierarchy.train``.
         """
-        how = TrainDefaults(eval_every, eval_episodes, checkpoint_every)
+        how = self.train_defaults.given(
+            eval_every=eval_every, eval_episodes=eval_episodes, checkpoint_every=checkpoint_every
+        )
         content = self.manifest(whole_number(seed, "seed", 0), how)
         return begin(self, content, run_dir, quiet, track, evolve, cluster, start_from)
 

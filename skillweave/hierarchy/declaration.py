@@ -192,7 +192,7 @@ class Declaration(Nestable):
                 "steps"
             )
         config = algorithm or self.train_defaults.flat or seeing_all(self.algorithm)
-        return PlainAgent(self.env, config, steps)
+        return PlainAgent(self.env, config, steps, train_defaults=self.train_defaults)
 
     def skill_set(
         self, policies: Sequence[Policy], skills: Sequence[Skill] | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +14,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.runs.directory import RunDirectory
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.checks import check_algorithm, check_env, check_fields, check_rollout
-from skillweave.training.defaults import TrainDefaults
+from skillweave.training.defaults import TrainDefaults, check_defaults
 from skillweave.training.scene import skill_scene
 from skillweave.training.stage import Stage, target_of
 
@@ -40,6 +40,8 @@ class PlainAgent:
     """Training ends early at this mean return of the periodic evaluation; None: it does not."""
     target_success: float | None = None
     """Training ends early at this share of successful episodes (``info["success"]``)."""
+    train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
+    """Values for arguments of ``train`` that its caller leaves out."""
     recorded = False
     """It is of a run that was loaded without its code, and knows less than was declared."""
 
@@ -47,6 +49,7 @@ class PlainAgent:
         check_env(self.env)
         check_algorithm(self.algorithm, "algorithm")
         check_fields(self)
+        check_defaults(self.train_defaults)
         target_of(self.target_return, self.target_success, AGENT)
 
     @property
@@ -79,7 +82,7 @@ class PlainAgent:
 
     def manifest(self, seed: int, how: TrainDefaults | None = None) -> dict[str, Any]:
         """Return the content of a new run's ``run.json``, for this ``seed``."""
-        how = how or TrainDefaults()
+        how = how or self.train_defaults
         return {
             "kind": "agent",
             "env": self.spec.name,

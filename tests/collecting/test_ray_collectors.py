@@ -20,7 +20,11 @@ from reference_calls import Counter, Left, Right, Zigzag
 from small_runs import interrupt_at_checkpoint
 from toy_acting import Again, Choices, requests
 
-from skillweave import PPO, Agent
+from skillweave import (
+    PPO,
+    Agent,
+    TrainDefaults,
+)
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.decisions import DecisionCollector
@@ -175,9 +179,10 @@ def test_a_run_on_ray_goes_on_in_processes_and_ends_as_if_nothing_had_happened(
 
     small = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1)
     spec = EnvSpec("CartPole-v1", engine="sync", workers=2)
-    whole = Agent(spec, small, 512, cut_every=128)
+    often = TrainDefaults(checkpoint_every=128)
+    whole = Agent(spec, small, 512, train_defaults=often)
     whole.train(tmp_path / "whole", quiet=True)
-    agent = Agent(replace(spec, workers=1), small, 512, cut_every=128)
+    agent = Agent(replace(spec, workers=1), small, 512, train_defaults=often)
     interrupt_at_checkpoint(monkeypatch, 2)
     with pytest.raises(KeyboardInterrupt):
         agent.train(tmp_path / "on", quiet=True, cluster=Ray(collectors=2))
