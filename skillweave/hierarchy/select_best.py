@@ -18,6 +18,7 @@ from skillweave.hierarchy.nesting import below, copied, every_hierarchy
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import EPISODES, SAMPLING, kept_words, to_be_judged
 from skillweave.training.evaluation import Evaluation, evaluate
+from skillweave.training.skill_text import useless_skills
 from skillweave.training.stage import TOGETHER, Policies
 from skillweave.training.stage_log import Listener
 
@@ -58,6 +59,8 @@ def select_best(
         run.save()
         for listener in listeners:
             listener.message(f"{entry['name']}: {kept_words(entry['kept'])}")
+            for hint in useless_skills(scores[entry["kept"]["kept"]].skills, EPISODES):
+                listener.message(hint)
     return before if entry.get("kept", {}).get("kept") == "before" else after
 
 

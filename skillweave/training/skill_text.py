@@ -98,6 +98,28 @@ def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
     return found
 
 
+def useless_skills(skills: Mapping[str, SkillReport], episodes: int) -> list[str]:
+    """Return a sentence on each skill that was never called, or whose calls never succeeded.
+
+    Args:
+        episodes: the number of episodes that were played.
+    """
+    found = []
+    for name, report in skills.items():
+        if not report.calls:
+            found.append(
+                f"Skill {name!r} was never chosen in {episodes} episodes. If the task needs it, see "
+                "that its initiation() is True where the other skills end, give it more steps, or "
+                "raise together.epsilon_final; else leave it out."
+            )
+        elif report.succeeded == 0:
+            found.append(
+                f"None of {report.calls:,} calls of skill {name!r} ended with success() true. Give "
+                "it more steps or longer calls (call_steps), or a reward that leads there."
+            )
+    return found
+
+
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.0%}"
 

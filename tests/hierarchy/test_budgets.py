@@ -1,0 +1,138 @@
+"""How the steps of a hierarchy are split, and what learns together by default."""
+
+from __future__ import annotations
+
+import pytest
+
+from skillweave import PPO, Apart, Hierarchy, Lengths, Skill, SkillweaveError, Together
+from skillweave.hierarchy.schedule import stages_of
+
+
+class One(Skill):
+    pass
+
+
+class Two(Skill):
+    pass
+
+
+class Ready(Skill):
+    @staticmethod
+    def policy(obs):
+        return obs[:, 0] > 0
+
+
+def declare(*skills, **how) -> Hierarchy:
+    return Hierarchy("CartPole-v1", skills or [One(), Two()], **how)
+
+
+CASES = {
+    "together": ({"steps": 900}, {"together": 900}),
+    "by default, a million": ({}, {"together": 1_000_000}),
+    "a budget of its own": ({"steps": 900, "together": Together(steps=50)}, {"together": 50}),
+    "apart: a share for each skill, two for the selector": (
+        {"steps": 400, "learn": "apart"},
+        {"one": 100, "two": 100, "selector": 200},
+    ),
+    "apart: budgets replace their part": (
+        {"steps": 400, "learn": "apart", "apart": Apart(skill_steps=7)},
+        {"one": 7, "two": 7, "selector": 200},
+    ),
+    "both: half of the steps each": (
+        {"steps": 801, "learn": "apart, then together"},
+        {"one": 100, "two": 100, "selector": 200, "together": 401},
+    ),
+    "a ready selector takes none": (
+        {"steps": 400, "learn": "apart", "selector": lambda obs: obs[:, 0] > 0},
+        {"one": 200, "two": 200},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_steps_are_split_as_the_hierarchy_learns(case):
+    how, budgets = CASES[case]
+    found = declare(**how)
+    assert found.budgets() == budgets
+    assert found.total_steps == sum(budgets.values())
+    assert {s.name: s.budget for s in stages_of(found)} == budgets
+    assert found.plain_agent().steps == found.total_steps
+
+
+def test_a_skills_own_steps_replace_its_part():
+    class Long(Skill):
+        steps = 1_000
+
+    found = declare(One(), Long(), steps=400, learn="apart")
+    assert found.budgets() == {"one": 100, "long": 1_000, "selector": 200}
+
+
+def test_a_hierarchy_below_takes_a_share_for_each_who_learns_in_it():
+    inner = declare(One(), Two(), name="inner", learn="apart")
+    found = declare(One(), inner, steps=700, learn="apart")
+    assert found.budgets() == {
+        "inner/one": 100,
+        "inner/two": 100,
+        "inner/selector": 200,
+        "one": 100,
+        "selector": 200,
+    }
+    inner.steps = 40
+    assert found.budgets()["inner/selector"] == 20
+    found.scale(0.5)
+    assert (found.steps, inner.steps) == (350, 20)
+
+
+def test_where_no_skill_learns_the_selector_trains_alone():
+    found = declare(Ready(), steps=300)
+    assert found.budgets() == {"selector": 300}
+    assert [s.kind for s in stages_of(found)] == ["selector"]
+
+
+def test_by_default_all_learn_together_and_skills_feel_the_task():
+    (stage,) = stages_of(declare())
+    assert stage.together == Together()
+    assert stage.together.task_weight == 1.0
+    assert list(stage.beside) == ["one", "two", "skill_critic"]
+    assert stage.task_weights == {}
+
+
+def test_a_skill_keeps_to_its_own_reward_where_it_says_so():
+    class Own(Skill):
+        task_weight = 0.0
+
+    (stage,) = stages_of(declare(One(), Own()))
+    assert stage.task_weights == {"own": 0.0}
+    assert stage.entry()["task_weights"] == {"own": 0.0}
+    alone = stages_of(declare(Own()))[0]
+    assert "skill_critic" not in alone.beside, "no skill needs what the critic says"
+
+
+def test_a_weight_of_a_hierarchy_holds_for_the_skills_in_it():
+    inner = declare(One(), Two(), name="inner")
+
+    class Inner(Skill):
+        policy, task_weight = inner, 0.5
+
+    (stage,) = stages_of(declare(One(), Inner()))
+    assert stage.task_weights == {"inner/one": 0.5, "inner/two": 0.5}
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("nan"), "much", True])
+def test_a_weight_that_is_none_is_refused(weight):
+    class Odd(Skill):
+        task_weight = weight
+
+    with pytest.raises(SkillweaveError, match="task_weight is .*at least 0"):
+        declare(Odd())
+
+
+@pytest.mark.parametrize("field", ["apart", "together", "selection", "guide", "train_defaults"])
+def test_a_group_that_is_something_else_is_refused(field):
+    with pytest.raises(SkillweaveError, match=f"{field} is .*; write {field}="):
+        declare(**{field: {"steps": 3}})
+
+
+def test_lengths_learn_together_too():
+    (stage,) = stages_of(declare(call_steps=Lengths(4, 8), selector=PPO()))
+    assert stage.kind == "together"
