@@ -424,11 +424,24 @@ def setting_cases(draw: Any) -> Case:
 
 
 DECLARED = (
-    "skills", "call_steps", "reflexes", "algorithm", "selector", "skill_steps", "selector_steps",
-    "flat", "flat_steps", "greedy_skills", "reflexes_in_training", "checkpoint_every", "eval_every",
-    "eval_episodes", "selector_target_return", "start_calls",
-    "search_steps", "episode_calls",
-)  # fmt: skip
+    "skills",
+    "call_steps",
+    "reflexes",
+    "algorithm",
+    "selector",
+    "skill_steps",
+    "selector_steps",
+    "start_calls",
+    "search_steps",
+    "episode_calls",
+    "call_cost",
+    "greedy_skills",
+    "greedy_selector",
+    "target_return",
+    "checkpoint_every",
+    "eval_every",
+    "eval_episodes",
+)
 ATTRIBUTES = (
     "name", "max_steps", "steps", "algorithm", "policy", "color", "reward", "termination",
     "target_return", "target_success",

@@ -249,7 +249,6 @@ def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Refe
 
 SETTINGS = [  # a run that lost any of them would end otherwise
     [
-        "reflexes_in_training=false",
         "skills.left.gamma=0.9",
         "train.checkpoint_every=125",
         "apart.selector_steps=350",

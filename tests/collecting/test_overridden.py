@@ -117,11 +117,10 @@ def test_reflexes_of_a_hierarchy_below_hold_where_it_acts_and_those_above_come_l
     assert (seen > 2).all()
 
 
-@pytest.mark.parametrize("heeded", [True, False])
-def test_reflexes_are_out_of_force_while_skills_learn_if_that_is_asked(heeded):
+def test_reflexes_are_in_force_while_skills_learn():
     from test_together import declare
 
-    hierarchy = declare(reflexes=[BACK], reflexes_in_training=heeded)
+    hierarchy = declare(reflexes=[BACK])
     (stage,) = stages_of(hierarchy)
     skills = stage.scene(hierarchy.ready_policies()).skills
-    assert skills.reflexes == ((BACK,) if heeded else ())
+    assert skills.reflexes == (BACK,)

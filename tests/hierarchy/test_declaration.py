@@ -509,7 +509,7 @@ def test_a_whole_hierarchy_is_a_skill_of_another(tmp_path):
     assert (skill.name, skill.max_steps, skill.policy.labels) == ("stand", 12, ("center", "lean"))
     outer = declare(skill, Center())
     outer.check_spaces()
-    assert (outer.budget(skill), outer.is_data) == (0, False)
+    assert (list(outer.budgets()), outer.is_data) == (["center", "selector"], False)
     policy = trained(outer)
     assert policy.labels == ("stand", "center")
     write_weights(tmp_path / "w", outer, policy)
@@ -548,10 +548,14 @@ def test_a_hierarchy_as_a_skill_needs_a_proper_name(tmp_path, name):
 def test_a_budget_that_ends_before_learning_begins_is_refused(tmp_path, flat):
     late = DQN(learning_starts=500)
     h = Hierarchy(
-        "CartPole-v1", [Plain()], algorithm=late, apart=Apart(skill_steps=500), learn="apart"
+        "CartPole-v1",
+        [Plain()],
+        algorithm=late,
+        apart=Apart(skill_steps=499, selector_steps=1),
+        learn="apart",
     )
-    name = "agent" if flat else "plain"
-    says = f"stage '{name}': its budget is 500 steps, but it begins to learn only after 500"
+    name, budget = ("agent", 500) if flat else ("plain", 499)
+    says = f"stage '{name}': its budget is {budget} steps, but it begins to learn only after 500"
     with pytest.raises(SkillweaveError, match=says):
         h.train(tmp_path / "run", flat=flat)
     assert not (tmp_path / "run").exists()

@@ -362,11 +362,10 @@ def always(skill: Skill, **more) -> HierarchyPolicy:
     return HierarchyPolicy(Chooser(1), declared.skill_set([skill.policy]))
 
 
-@pytest.mark.parametrize("in_training", [True, False])
 @pytest.mark.parametrize("kind", [Counter, Zigzag, "nested"])
-def test_a_skill_alone_acts_as_under_a_selector_that_chooses_no_other(kind, in_training):
+def test_a_skill_alone_acts_as_under_a_selector_that_chooses_no_other(kind):
     on = Reflex(lambda obs: obs[:, POSITION] == 1, action=2)
-    more = {"reflexes": [on], "reflexes_in_training": in_training, "call_steps": 3}
+    more = {"reflexes": [on], "call_steps": 3}
     inner = hierarchy(Counter, Right, Left, call_steps=2)
     skill = alone(Left(), ()).as_skill("inner") if kind == "nested" else kind()
     if kind == "nested":

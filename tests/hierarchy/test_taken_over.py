@@ -129,7 +129,7 @@ def test_a_cost_of_calls_below_that_differs_is_told(tmp_path, monkeypatch, capsy
     capsys.readouterr()
     whole(0.5).resume(tmp_path / "run")
     told = "".join(capsys.readouterr())
-    assert "skills.inner.hierarchy.selection.call_cost is 0 (declared now: 0.5)" in told
+    assert "skills.inner.hierarchy.call_cost is 0 (declared now: 0.5)" in told
 
 
 def test_what_is_told_to_count_is_what_counts(tmp_path, monkeypatch, capsys):
