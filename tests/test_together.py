@@ -42,6 +42,7 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.adoption import told_differences
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.kept import SAMPLING
 from skillweave.training import woven
 from skillweave.training.stage_log import START, StageLog, success_rate
 
@@ -181,8 +182,8 @@ def test_skills_that_grew_in_a_population_go_on_as_they_are(tmp_path):
 def test_the_better_of_before_and_after_is_kept(whole):
     _, path = whole("then")
     told = RunDirectory.open(path).stage("together")["kept"]
-    better = "after" if told["after"] >= told["before"] else "before"
-    assert told["kept"] == better
+    assert {"before", "greedy"} < set(told)
+    assert told["kept"] in told
     names = {"selector", "left", "balance"}
     own = {f"{n}.safetensors" for n in names} | {f"together.{n}.safetensors" for n in names}
     assert set(policies(path)) == own, "nothing that was learnt is lost"
@@ -193,18 +194,18 @@ def test_the_better_of_before_and_after_is_kept(whole):
 @pytest.mark.parametrize(
     ("learn", "asked", "played"),
     [
-        ("together", None, {"after", "sampled"}),
+        ("together", None, {"greedy", "skills_sample"}),
         ("together", True, set()),
         ("together", False, set()),
-        ("apart, then together", None, {"before", "after", "sampled"}),
-        ("apart, then together", False, {"before", "after"}),
+        ("apart, then together", None, {"before", "greedy", "skills_sample"}),
+        ("apart, then together", False, {"before", "greedy"}),
         ("apart", None, None),
     ],
 )
 def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
     tmp_path, learn, asked, played
 ):
-    hierarchy = declare(learn=learn, greedy_skills=asked)
+    hierarchy = declare(learn=learn, greedy_skills=asked, greedy_selector=True)
     run = hierarchy.train(tmp_path / "run", seed=3, quiet=True)
     assert hierarchy.selection.greedy_skills is asked, "another seed is judged anew"
     loaded = declare(learn=learn).load(run.path)
@@ -218,14 +219,14 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
     best = kept.pop("kept")
     assert set(kept) == played
     assert kept[best] == max(kept.values())
-    assert greedy == {asked is None and best != "sampled"}
+    assert greedy == {asked is None and best != "skills_sample"}
     assert run.evaluate(100, seed=select_best.SEEDS + 3).mean == kept[best]
 
 
 @pytest.mark.usefixtures("usual_episodes")
 def test_it_is_found_out_in_the_pool_where_it_was_trained_in_one(tmp_path):
     pytest.importorskip("envpool")
-    hierarchy = declare(env=EnvSpec("CartPole-v1", workers=1))
+    hierarchy = declare(env=EnvSpec("CartPole-v1", workers=1), greedy_selector=True)
     run = hierarchy.train(tmp_path / "run", seed=3, quiet=True)
     kept = run.info()["stages"][-1]["kept"]
     how = {"seed": select_best.SEEDS + 3, "deterministic": True}
@@ -246,20 +247,57 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     def played(policy, spec, *, engine, **how):
         assert engine == spec.engine == wanted, "they are played where it was trained"
         mean = 10.0 if policy.skills.greedy is better else 5.0
-        return SimpleNamespace(mean=mean, lengths=(7, 8))
+        return SimpleNamespace(mean=mean, lengths=(7, 8), skills={})
 
     monkeypatch.setattr(select_best, "evaluate", played)
     heard = Heard()
-    hierarchy = declare(env=EnvSpec("CartPole-v1", engine=engine))
+    hierarchy = declare(env=EnvSpec("CartPole-v1", engine=engine), greedy_selector=True)
     run = new_run(hierarchy, tmp_path / "run")
     with closing(run):
         policy = training.train(hierarchy, run, (heard,))
     assert policy.skills.greedy is better
     assert run.stage("together")["evaluation_steps"] == 30
     returns = (10.0, 5.0) if better else (5.0, 10.0)
-    words = "with greedy skills {:.1f}, with skills that sample {:.1f} (100 episodes each): kept"
+    words = "greedy {:.4g}, with skills that sample {:.4g} (100 episodes each); kept: "
     assert words.format(*returns) in heard.said[-1]
-    assert "2 times 100 episodes are played" in heard.said[-2]
+    assert "100 episodes of each kind are played" in heard.said[-2]
+
+
+@pytest.mark.parametrize(
+    ("means", "kept"),
+    [
+        ({"greedy": 5.0, "selector": 10.0}, "selector_samples"),
+        ({"greedy": 5.0, "selector": 5.1}, "greedy"),  # not clearly better
+        ({"greedy": 5.0, "skills": 7.0, "selector": 10.0}, "both_sample"),
+    ],
+)
+def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, means, kept):
+    """A greedy selector can call one skill forever, where a sampling one solves the task."""
+
+    def played(policy, spec, **how):
+        samples = not policy.skills.greedy_selector
+        skills = "greedy" if policy.skills.greedy else "skills"
+        mean = means["selector"] if samples else means.get(skills, 0.0)
+        returns = (mean - 1.0, mean + 1.0) * 20
+        return SimpleNamespace(mean=mean, returns=returns, lengths=(7,), skills={})
+
+    monkeypatch.setattr(select_best, "evaluate", played)
+    run = declare().train(tmp_path / "run", quiet=True)
+    entry = RunDirectory.open(run.path).stage("together")
+    assert entry["kept"]["kept"] == kept
+    weights = run.save_weights(tmp_path / "weights")
+    for found in (run, declare().load(run.path), declare().load_weights(weights)):
+        policy = found.policy
+        samples = (not policy.skills.greedy, not policy.skills.greedy_selector)
+        assert samples == SAMPLING[kept]
+
+
+def test_a_sampling_selector_samples_also_where_greedy_actions_are_asked(tmp_path):
+    run = declare(greedy_selector=False, greedy_skills=True).train(tmp_path / "run", quiet=True)
+    policy, obs = run.policy, np.zeros((200, 4), np.float32)
+    rng = np.random.default_rng(0)
+    _, memory = policy.act(policy.start(200), obs, deterministic=True, rng=rng)
+    assert len(set(memory["skill"].tolist())) > 1, "the selector is nearly uniform so early"
 
 
 def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch):
@@ -281,7 +319,7 @@ def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch
 
 @pytest.mark.parametrize(("learn", "said"), [("apart", True), ("together", None)])
 def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn, said):
-    """Older runs always say it; nothing differs from what was left open."""
+    """Nothing differs from what was left open."""
     run = new_run(declare(learn=learn), tmp_path / "run")
     assert run.manifest["greedy_skills"] is said
     run.manifest["greedy_skills"] = True
@@ -353,7 +391,8 @@ def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_pa
     training.train(hierarchy, run, (heard,))
     run.close()
     said = [text for text in heard.said if "succe" in text]
-    assert [text.partition(":")[0] for text in said] == ["never", "together"]
+    assert [text.partition(":")[0] for text in said[:2]] == ["never", "together"]
+    assert all("'never' ended with success() true" in text for text in said[2:])
     assert "success() held at the end of none of its calls" in said[0]
     assert "skill 'never' did not succeed any more" in said[1]
     told = lines(tmp_path / "run")[-1]
@@ -418,7 +457,6 @@ def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
 
 WRONG = {
     "learn is 'both'": {"learn": "both"},
-    "write together=Together": {"together": 3},
     "it must be at least 1, Lengths": {"call_steps": 0},
     "call_cost is -1": {"call_cost": -1},
     "interrupt is 3": {"interrupt": 3},
@@ -450,9 +488,7 @@ def test_a_skill_that_would_never_learn_is_told(tmp_path):
 
 
 def test_a_stage_ends_early_at_its_target(tmp_path):
-    hierarchy = declare(
-        eval_every=200, eval_episodes=2, selector_target_return=5.0, together_steps=10_000
-    )
+    hierarchy = declare(eval_every=200, eval_episodes=2, target_return=5.0, together_steps=10_000)
     path = tmp_path / "run"
     hierarchy.train(path, seed=0, quiet=True)
     (entry,) = RunDirectory.open(path).manifest["stages"]
@@ -461,9 +497,22 @@ def test_a_stage_ends_early_at_its_target(tmp_path):
     assert entry["evaluation_steps"] > 10
 
 
-def test_hierarchies_that_learn_as_a_whole_do_not_evolve(tmp_path):
+def test_what_cannot_evolve_together_learns_apart_and_says_so_once(tmp_path, capsys):
+    how = {"skill_steps": 100, "selector_steps": 100}
+    hierarchy = declare(Left(), Push(), **how)
+    evolve = {"left": Evolution(population=2, generations=1, episodes=1)}
+    run = hierarchy.train(tmp_path / "run", evolve=evolve)
+    said = capsys.readouterr().err.replace("\n", " ")
+    assert said.count("cannot evolve together yet, so they learn apart") == 1
+    assert [s["name"] for s in run.info()["stages"]] == ["left", "selector"]
+    assert hierarchy.learn == "together", "the declaration stays as it was"
+    assert len(hierarchy.load(run.path).evaluate(2).returns) == 2
+
+
+def test_what_is_asked_to_learn_together_at_last_does_not_evolve(tmp_path):
+    hierarchy = declare(learn="apart, then together")
     with pytest.raises(SkillweaveError, match="stage 'together': selector and left"):
-        declare().train(tmp_path / "run", quiet=True, evolve=Evolution(population=2))
+        hierarchy.train(tmp_path / "run", quiet=True, evolve=Evolution(population=2))
 
 
 def test_continuous_skills_of_several_algorithms_learn_together(tmp_path):
