@@ -80,15 +80,18 @@ def _agent_facts(declared: Agent) -> Iterator[tuple[str, object]]:
 
 
 def _skills(declared: Hierarchy) -> Markup:
-    """Return a table of a hierarchy's skills."""
+    """Return a table of a hierarchy's skills; a column in which nothing stands is left out."""
+    head = ["skill", "policy", "defines", "about", "max_steps"]
     rows = []
     for path, skill in every_skill(declared.skills):
-        limit = "" if skill.max_steps is None else f"{skill.max_steps:,}"
-        defines = ", ".join(own_methods(skill))
         node = path.rpartition("/")[0]
         owner = inner_of(declared.skill(node)) if node else declared
-        rows.append((path, _learns_by(owner or declared, skill), defines, about(skill), limit))
-    return table(("skill", "policy", "defines", "about", "max_steps"), rows, left=4)
+        limit = "" if skill.max_steps is None else f"{skill.max_steps:,}"
+        defines = ", ".join(own_methods(skill))
+        rows.append([path, _learns_by(owner or declared, skill), defines, about(skill), limit])
+    used = [i for i in range(len(head)) if any(row[i] for row in rows)]
+    shown = [[row[i] for i in used] for row in rows]
+    return table([head[i] for i in used], shown, left=sum(i < 4 for i in used))
 
 
 def _learns_by(owner: Declaration, skill: Skill) -> str:

@@ -17,8 +17,8 @@ class Row:
 
     name: str
     """What goes on."""
-    share: float
-    """How much of it is done, from 0 to 1."""
+    share: float | None
+    """How much of it is done, from 0 to 1; None: it has no such share."""
     steps: str = ""
     """The same in numbers."""
     result: str = ""
@@ -96,7 +96,7 @@ class Bars:
         if row.key not in self._tasks:
             name = f"  {row.name}" if row.under else row.name
             self._tasks[row.key] = self._bars.add_task(name, total=1.0, **fields)
-        self._bars.update(self._tasks[row.key], completed=row.share, **fields)
+        self._bars.update(self._tasks[row.key], completed=row.share or 0.0, **fields)
 
     def draw(self) -> None:
         """Show all rows."""
@@ -133,7 +133,7 @@ class Cell:
         rows = [
             (
                 (indent if row.under else "") + row.name,
-                _bar(row.share),
+                "" if row.share is None else _bar(row.share),
                 row.steps,
                 row.result,
                 row.speed,
@@ -162,7 +162,8 @@ class Cell:
 
 
 def _texts(row: Row) -> tuple[str, ...]:
-    return row.name, f"{row.share:.0%}", row.steps, row.result, row.speed, row.left
+    share = "" if row.share is None else f"{row.share:.0%}"
+    return row.name, share, row.steps, row.result, row.speed, row.left
 
 
 def _bar(share: float) -> Markup:

@@ -139,7 +139,7 @@ class Progress:
         counted = f"{_short(steps)}/{_short(budget)}"
         self._display.put(Row(name, share, counted, result, speed, left))
         for agent, usage, acts, reward in _agents(metrics):
-            self._display.put(Row(agent, usage or 0.0, acts, reward, under=name))
+            self._display.put(Row(agent, usage, acts, reward, under=name))
         if self._several:
             self._put_total(name)
         self._display.draw()
