@@ -11,11 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import gymnasium as gym
 import numpy as np
 import pytest
 
+from skillweave import PPO, EnvSpec, Hierarchy, Skill
 from skillweave.messages import told
 from skillweave.tracebacks import place
+from skillweave.types import SkillweaveError
 
 HERE = Path(__file__).name
 
@@ -28,18 +31,18 @@ def caught(function: Callable[[], Any]) -> Exception:
 
 def line_of(text: str) -> int:
     lines = Path(__file__).read_text().splitlines()
-    return next(i for i, line in enumerate(lines, 1) if text in line and "line_of" not in line)
+    return next(i for i, line in enumerate(lines, 1) if line.endswith(text))
 
 
 def test_the_line_is_the_users_and_not_that_of_numpy_or_of_the_standard_library() -> None:
     def of_numpy() -> None:
-        np.stack([])  # a function of NumPy's fails
+        np.stack([])  # a function of NumPy fails
 
     def of_json() -> None:
-        json.loads("{")  # a function of Python's own fails
+        json.loads("{")  # a function of Python fails
 
-    assert place(caught(of_numpy)) == f"{HERE}, line {line_of('of NumPy')}"
-    assert place(caught(of_json)) == f"{HERE}, line {line_of('own fails')}"
+    assert place(caught(of_numpy)) == f"{HERE}, line {line_of('function of NumPy fails')}"
+    assert place(caught(of_json)) == f"{HERE}, line {line_of('function of Python fails')}"
     assert told(caught(of_json)).startswith("JSONDecodeError: Expecting")
 
 
@@ -120,3 +123,58 @@ def test_ipython_shows_all_frames_where_the_switch_is_set(tmp_path: Path) -> Non
     shown = in_ipython(tmp_path, SKILLWEAVE_TRACEBACK="1")
     assert "skillweave/skills/outputs.py" in shown
     assert "IndexError" in shown
+
+
+class OutOfBounds(Skill):
+    def reward(self, step: Any) -> Any:
+        return step.next_obs[:, 9]  # reward fails
+
+
+class Plain(Skill):
+    pass
+
+
+class Broken(gym.Env[Any, Any]):
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return {}["no such key"]  # step fails
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(
+    ("env", "skill", "who", "line"),
+    [
+        (
+            "CartPole-v1",
+            OutOfBounds(),
+            r"out_of_bounds.*reward\(\) raised",
+            "# reward fails",
+        ),
+        (Broken, Plain(), r"Broken: .*step 1 of its episode: step\(\) raised", "# step fails"),
+    ],
+)
+def test_an_error_in_the_users_code_names_its_line_also_from_a_worker(
+    tmp_path: Path, workers: int, env: Any, skill: Any, who: str, line: str
+) -> None:
+    tiny = PPO(num_envs=2, n_steps=8, batch_size=16)
+    spec = EnvSpec(env, workers=workers, engine="sync")
+    hierarchy = Hierarchy(spec, [skill], algorithm=tiny, selector=tiny, steps=100)
+    where = rf"\({HERE}, line {line_of(line)}\)"
+    with pytest.raises(SkillweaveError, match=f"{who}.*{where}"):
+        hierarchy.train(tmp_path / "run", quiet=True)
+
+
+def test_an_error_in_a_ready_policy_names_its_line(tmp_path: Path) -> None:
+    class Ready(Skill):
+        def policy(self, obs: Any) -> Any:
+            return 1 / 0  # a policy fails
+
+    hierarchy = Hierarchy("CartPole-v1", [Ready()])
+    where = rf"ZeroDivisionError.*\({HERE}, line {line_of('a policy fails')}\)"
+    with pytest.raises(SkillweaveError, match=where):
+        hierarchy.train(tmp_path / "run", quiet=True)

@@ -129,7 +129,7 @@ class Progress:
         if self._display is None:
             part = f"{steps:,} of {budget:,} steps ({share:.0%})"
             seconds = self._left_in_all(name)
-            in_all = "" if seconds is None else f"{_clock(seconds)} left in all"
+            in_all = f"{_clock(seconds)} left in all" if seconds else ""
             told = ", ".join(filter(None, (part, result, speed, left, in_all)))
             self._line(f"{self._numbered(name)}: {told}")
             if name in self._over:

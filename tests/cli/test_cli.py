@@ -179,7 +179,7 @@ def test_train_prints_one_json_object_and_tells_progress_on_stderr(
     assert [p["name"] for p in answer.json["stages"]] == ["left", "balance", "selector"]
     assert all(p["status"] == "done" for p in answer.json["stages"])
     assert set(answer.json["evaluation"]) >= KEYS
-    assert "left: training for 256 steps" in answer.err
+    assert "left (1 of 3): training for 256 steps" in answer.err
 
 
 def test_train_and_evaluate_in_a_process_of_their_own_print_one_json_object(
@@ -189,7 +189,7 @@ def test_train_and_evaluate_in_a_process_of_their_own_print_one_json_object(
     answer = in_a_process("train", trained.coded, "-o", "run", *common, cwd=tmp_path)
     assert answer.code == 0, answer.err
     assert answer.json["run"] == "run"
-    assert "selector: training for 512 steps" in answer.err
+    assert "selector (3 of 3): training for 512 steps" in answer.err
     arguments = ("evaluate", "run", "--recipe", trained.coded, "--episodes", 3, "--json")
     answer = in_a_process(*arguments, cwd=tmp_path)
     assert answer.code == 0, answer.err

@@ -256,8 +256,7 @@ def test_of_several_stages_it_tells_which_one_it_is_and_the_time_left_in_all(
         "0:33 left in all",
         "selector (3 of 3): training for 40,000 steps",
         "selector (3 of 3): 20,000 of 40,000 steps (50%), 500 steps/s, 0:40 left, 0:40 left in all",
-        "selector (3 of 3): 40,000 of 40,000 steps (100%), 500 steps/s, done in 1:20, "
-        "0:00 left in all",
+        "selector (3 of 3): 40,000 of 40,000 steps (100%), 500 steps/s, done in 1:20",
     ]
 
 
