@@ -254,7 +254,8 @@ def test_an_evaluation_in_a_notebook_leaves_nothing_but_its_result(
     now = iter([0.0, 2.0, 4.0])
     monkeypatch.setattr(timed, "time", SimpleNamespace(monotonic=lambda: next(now)))
     with EpisodeProgress(4) as progress:
-        played = SimpleNamespace(over=np.array([True]), episode=np.array([0]))
+        one = np.ones(1, int)
+        played = SimpleNamespace(over=one == 1, episode=one, lasted=one)
         progress.watch(played)
         assert "1 of 4 episodes" in kernel.outputs[0]["text/html"]
         progress.watch(played)

@@ -212,7 +212,7 @@ class EpisodeProgress:
 
     def __init__(self, episodes: int, *, quiet: bool = False, name: str = "evaluation") -> None:
         self._episodes, self._quiet, self._name = episodes, quiet, name
-        self._over = 0
+        self._over = self._steps = 0
         self._display: Display | None = None
         self._tried = False
 
@@ -229,6 +229,7 @@ class EpisodeProgress:
         """See a step of some episodes (``Played``)."""
         if self._quiet:
             return
+        self._steps += int(played.lasted.sum())
         self._over += int(np.count_nonzero(played.over & (played.episode >= 0)))
         now = time.monotonic()
         pause = PATIENCE if self._display is None else self._display.every
@@ -247,7 +248,7 @@ class EpisodeProgress:
         taken, share = now - self._begun, self._over / self._episodes
         left = f"{_clock(taken / share - taken)} left" if share else ""
         counted = f"{self._over:,} of {self._episodes:,} episodes"
-        self._display.put(Row(self._name, share, counted, left=left))
+        self._display.put(Row(self._name, share, counted, f"{self._steps:,} steps", left=left))
         self._display.draw()
 
 
