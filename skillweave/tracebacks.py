@@ -60,6 +60,11 @@ def is_own(frame: FrameType) -> bool:
     return not any(path.is_relative_to(standard) for standard in _STANDARD)
 
 
+def is_users(error: BaseException) -> bool:
+    """Return whether the user's code raised ``error`` below the function that caught it."""
+    return any(is_own(frame) for frame, _ in traceback.walk_tb(error.__traceback__))
+
+
 class ShortTraceback(BaseException):
     """An exception whose traceback in a notebook or in IPython shows the user's lines alone."""
 

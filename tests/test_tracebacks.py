@@ -15,10 +15,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave import PPO, EnvSpec, Hierarchy, Skill
+from skillweave import PPO, EnvSpec, Hierarchy, Skill, evaluate
 from skillweave.messages import told
-from skillweave.tracebacks import place
-from skillweave.types import SkillweaveError
+from skillweave.skills.outputs import blame
+from skillweave.tracebacks import LIBRARY, place
+from skillweave.types import Memoryless, SkillweaveError
 
 HERE = Path(__file__).name
 
@@ -178,3 +179,37 @@ def test_an_error_in_a_ready_policy_names_its_line(tmp_path: Path) -> None:
     where = rf"ZeroDivisionError.*\({HERE}, line {line_of('a policy fails')}\)"
     with pytest.raises(SkillweaveError, match=where):
         hierarchy.train(tmp_path / "run", quiet=True)
+
+
+class Own(Memoryless):
+    """A policy of the user's own."""
+
+    def __init__(self) -> None:
+        with gym.make("CartPole-v1") as env:
+            self.observation_space, self.action_space = env.observation_space, env.action_space
+
+    def act(self, memory: Any, obs: Any, mask: Any = None, **how: Any) -> Any:
+        raise KeyError("left")  # act fails
+
+
+def test_an_error_in_a_policy_of_the_users_own_names_its_line(tmp_path: Path) -> None:
+    class Ready(Skill):
+        policy = Own()
+
+    where = rf"KeyError: 'left' \({HERE}, line {line_of('# act fails')}\)"
+    tiny = PPO(num_envs=2, n_steps=8, batch_size=16)
+    hierarchy = Hierarchy("CartPole-v1", [Ready()], selector=tiny, steps=100)
+    with pytest.raises(SkillweaveError, match=rf"skill 'ready': its policy's act\(\).*{where}"):
+        hierarchy.train(tmp_path / "run", quiet=True)
+    with pytest.raises(SkillweaveError, match=rf"the policy's act\(\) raised {where}"):
+        evaluate(Own(), "CartPole-v1", episodes=1)
+
+
+def test_an_error_of_the_librarys_own_is_not_blamed_on_the_user() -> None:
+    def ours() -> None:
+        exec(compile("1 / 0", str(LIBRARY / "collecting" / "calls.py"), "exec"), {})
+
+    error = caught(ours)
+    error.__traceback__ = error.__traceback__.tb_next.tb_next  # type: ignore[union-attr]
+    with pytest.raises(ZeroDivisionError):
+        blame(error, "the policy's act()")

@@ -16,6 +16,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.envs.infos import allowed_rows
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked, path_of
+from skillweave.skills.outputs import blame
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
 
@@ -175,7 +176,11 @@ class SkillSet:
                 continue
             own = self._own(memory, i, rows[mine])
             allowed = allowed_rows(mask, mine)
-            some, after = policy.act(own, obs[mine], allowed, deterministic=self.greedy, rng=rng)
+            how: Any = {"deterministic": self.greedy, "rng": rng}
+            try:
+                some, after = policy.act(own, obs[mine], allowed, **how)
+            except Exception as error:
+                blame(error, f"skill {path_of(self.skills[i])!r}: its policy's act()")
             self._put(memory, i, rows[mine], after)
             if len(mine) == len(rows):
                 actions = some

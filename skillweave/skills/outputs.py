@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from skillweave.messages import short, told
+from skillweave.tracebacks import is_users
 from skillweave.types import Array, SkillweaveError
 
 
@@ -31,6 +32,16 @@ def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
         raise SkillweaveError(
             f"{who} raised {told(error)}{at_step(elapsed)}{given}{hint}"
         ) from error
+
+
+def blame(error: Exception, who: str) -> NoReturn:
+    """Raise a SkillweaveError that names ``who`` where the user's code raised ``error``.
+
+    Otherwise raise ``error`` itself: its traceback shows what is wrong in this library.
+    """
+    if isinstance(error, SkillweaveError) or not is_users(error):
+        raise error
+    raise SkillweaveError(f"{who} raised {told(error)}") from error
 
 
 def at_step(elapsed: Any) -> str:

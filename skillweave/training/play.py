@@ -10,6 +10,7 @@ import numpy as np
 
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
+from skillweave.skills.outputs import blame
 from skillweave.types import Array, Memory, Policy, Step
 
 
@@ -79,7 +80,10 @@ def play(
     while len(rows := episodes.rows):
         own = {k: v[rows] for k, v in memory.items()}
         obs, mask = episodes.obs[rows], episodes.mask()
-        action, own = policy.act(own, obs, mask, deterministic=deterministic, rng=rng)
+        try:
+            action, own = policy.act(own, obs, mask, deterministic=deterministic, rng=rng)
+        except Exception as error:
+            blame(error, "the policy's act()")
         if before_step is not None:
             before_step(own)
         acting = policy.acting(own)
