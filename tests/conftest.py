@@ -41,12 +41,10 @@ def pytest_collection_finish() -> None:
 def few_episodes() -> Iterator[None]:
     """Who learnt together is judged by few episodes: here it is of no matter who wins."""
     from skillweave.hierarchy import select_best
-    from skillweave.runs import kept
 
-    assert kept.EPISODES == select_best.EPISODES == 100, "so it is documented"
+    assert (select_best.LEAST, select_best.MOST) == (20, 100), "so it is documented"
     with pytest.MonkeyPatch.context() as patch:
-        for module in (select_best, kept):
-            patch.setattr(module, "EPISODES", 4)
+        patch.setattr(select_best, "MOST", 4)
         yield
 
 
@@ -54,10 +52,9 @@ def few_episodes() -> Iterator[None]:
 def usual_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who learnt together is judged by as many episodes as users have."""
     from skillweave.hierarchy import select_best
-    from skillweave.runs import kept
 
-    for module in (select_best, kept):
-        monkeypatch.setattr(module, "EPISODES", 100)
+    monkeypatch.setattr(select_best, "MOST", 100)
+    monkeypatch.setattr(select_best, "LEAST", 100)
 
 
 @pytest.fixture(autouse=True)

@@ -217,6 +217,7 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
         return
     kept = dict(RunDirectory.open(run.path).stage("together")["kept"])
     best = kept.pop("kept")
+    assert kept.pop("episodes") == 100
     assert set(kept) == played
     assert kept[best] == max(kept.values())
     assert greedy == {asked is None and best != "skills_sample"}
@@ -234,7 +235,6 @@ def test_it_is_found_out_in_the_pool_where_it_was_trained_in_one(tmp_path):
     assert run.evaluate(100, **how).mean != kept[kept["kept"]]
 
 
-@pytest.mark.usefixtures("usual_episodes")
 @pytest.mark.parametrize("engine", ["auto", "sync"])
 @pytest.mark.parametrize("better", [True, False])
 def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
@@ -258,9 +258,9 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     assert policy.skills.greedy is better
     assert run.stage("together")["evaluation_steps"] == 30
     returns = (10.0, 5.0) if better else (5.0, 10.0)
-    words = "greedy {:.4g}, with skills that sample {:.4g} (100 episodes each); kept: "
+    words = "greedy {:.4g}, with skills that sample {:.4g} (4 episodes each); kept: "
     assert words.format(*returns) in heard.said[-1]
-    assert "100 episodes of each kind are played" in heard.said[-2]
+    assert "4 episodes of each kind are played" in heard.said[-2]
 
 
 @pytest.mark.parametrize(
@@ -290,6 +290,16 @@ def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, 
         policy = found.policy
         samples = (not policy.skills.greedy, not policy.skills.greedy_selector)
         assert samples == SAMPLING[kept]
+
+
+@pytest.mark.parametrize(
+    ("steps", "length", "episodes"),
+    [(1_000_000, 200.0, 100), (100_000, 200.0, 50), (100_000, 1_000.0, 20), (500, None, 50)],
+)
+def test_fewer_episodes_are_played_where_they_are_long(monkeypatch, steps, length, episodes):
+    monkeypatch.setattr(select_best, "MOST", 100)
+    entry = {"steps": steps, "final": {"length": length}}
+    assert select_best._episodes(entry) == episodes
 
 
 def test_a_sampling_selector_samples_also_where_greedy_actions_are_asked(tmp_path):

@@ -16,7 +16,7 @@ from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import below, copied, every_hierarchy
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.kept import EPISODES, SAMPLING, kept_words, to_be_judged
+from skillweave.runs.kept import SAMPLING, kept_words, to_be_judged
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.skill_text import useless_skills
 from skillweave.training.stage import TOGETHER, Policies
@@ -24,6 +24,10 @@ from skillweave.training.stage_log import Listener
 
 SEEDS = 1_000
 """Seeds of these episodes start here: people use smaller ones."""
+MOST, LEAST = 100, 20
+"""Episodes of each candidate."""
+SHARE = 0.1
+"""Share of the stage's steps that the episodes of a candidate may take, if LEAST do."""
 CLEARLY = 2.0
 """Standard errors by which a sampling selector must be better to be kept in place of a greedy one,
 which users expect."""
@@ -46,22 +50,28 @@ def select_best(
     """
     entry = run.stage("/".join((*nodes, TOGETHER)))
     if "kept" not in entry and to_be_judged(entry):
+        episodes = _episodes(entry)
         for listener in listeners:
             listener.message(
-                f"{entry['name']}: {EPISODES} episodes of each kind are played, to find out "
+                f"{entry['name']}: {episodes} episodes of each kind are played, to find out "
                 "whether skills and selector should be greedy"
             )
-        scores = _scores(declaration, run, before, after, nodes)
-        entry["kept"] = {name: score.mean for name, score in scores.items()} | {
-            "kept": _best(scores)
-        }
+        scores = _scores(declaration, run, before, after, nodes, episodes)
+        means = {name: score.mean for name, score in scores.items()}
+        entry["kept"] = means | {"episodes": episodes, "kept": _best(scores)}
         entry["evaluation_steps"] += sum(sum(score.lengths) for score in scores.values())
         run.save()
         for listener in listeners:
             listener.message(f"{entry['name']}: {kept_words(entry['kept'])}")
-            for hint in useless_skills(scores[entry["kept"]["kept"]].skills, EPISODES):
+            for hint in useless_skills(scores[entry["kept"]["kept"]].skills, episodes):
                 listener.message(hint)
     return before if entry.get("kept", {}).get("kept") == "before" else after
+
+
+def _episodes(entry: Mapping[str, Any]) -> int:
+    """Return the number of episodes for each candidate: fewer where episodes are long."""
+    length = entry["final"].get("length") or 1.0
+    return int(np.clip(round(SHARE * entry["steps"] / length), min(LEAST, MOST), MOST))
 
 
 def _scores(
@@ -70,6 +80,7 @@ def _scores(
     before: Policies,
     after: Policies,
     nodes: tuple[str, ...],
+    episodes: int,
 ) -> dict[str, Evaluation]:
     """Return the evaluations of all candidates, by name."""
     entry = run.stage("/".join((*nodes, TOGETHER)))
@@ -78,7 +89,7 @@ def _scores(
 
     def score(hierarchy: Declaration, policies: Policies) -> Evaluation:
         policy = assembled(hierarchy, policies)
-        return evaluate(policy, spec, episodes=EPISODES, seed=seed, engine=spec.engine)
+        return evaluate(policy, spec, episodes=episodes, seed=seed, engine=spec.engine)
 
     def sampling(name: str) -> Evaluation:
         return score(with_sampling(declaration, *SAMPLING[name]), learnt)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, NotRequired, TypedDict
 
-EPISODES = 100
-"""Episodes of each hierarchy that is compared."""
+from skillweave.reading import Positive
 
 Candidate = Literal["before", "greedy", "skills_sample", "selector_samples", "both_sample"]
 """A hierarchy that a stage could end with."""
@@ -35,13 +34,15 @@ class Kept(TypedDict):
     skills_sample: NotRequired[float]
     selector_samples: NotRequired[float]
     both_sample: NotRequired[float]
+    episodes: Positive
+    """Of each of them."""
     kept: Candidate
 
 
 def kept_words(kept: Mapping[str, Any]) -> str:
     """Return a sentence on the hierarchies that were compared, and on which was kept."""
     returns = ", ".join(f"{words} {kept[k]:.4g}" for k, words in _WORDS.items() if k in kept)
-    return f"mean return {returns} ({EPISODES} episodes each); kept: {_WORDS[kept['kept']]}"
+    return f"mean return {returns} ({kept['episodes']} episodes each); kept: {_WORDS[kept['kept']]}"
 
 
 def to_be_judged(entry: Mapping[str, Any]) -> bool:

@@ -276,6 +276,6 @@ def test_skills_alone_are_scored_as_the_run_plays_them(
     found = one("together", task, 4_000, "auto", f4=True, seed=0)
     # Those of `lander` are declared to sample; for `bridge` it is found out.
     greedy = task == "bridge"
-    assert found["kept"]["kept"] != "sampled", "else the two say the same"
+    assert found["kept"]["kept"] != "skills_sample", "else the two say the same"
     skills = CASES["together"](TASKS[task], 4_000).skills
     assert asked[1:] == [*((greedy, s.name) for s in skills), (None, None)]
