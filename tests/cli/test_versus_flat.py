@@ -37,7 +37,7 @@ def test_both_are_trained_on_as_many_steps_and_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "plain.py").write_text(
-        PLAIN.replace("hierarchy = Hierarchy(", "hierarchy = Hierarchy(flat_steps=1,")
+        PLAIN
     )
     common = ["train", str(tmp_path / "plain.py"), "-o", str(tmp_path / "run"), "--versus-flat"]
     assert main([*common, "--quiet", "--json", "--evaluate", "4"]) == 0

@@ -167,15 +167,15 @@ def test_a_ready_selector_takes_no_steps():
     assert ready.plain_agent().steps == 64
     assert declare(SMALL, Learnt(), selector_steps=1000).total_steps == 1064
     assert not ready.is_data
-    with pytest.raises(SkillweaveError, match=r"nothing of this hierarchy is trained.*flat_steps"):
+    with pytest.raises(SkillweaveError, match=r"nothing of this hierarchy is trained.*set steps"):
         declare(by_rule).plain_agent()
-    assert declare(by_rule, flat_steps=50).plain_agent().steps == 50
+    assert declare(by_rule, steps=50).plain_agent().steps == 50
 
 
 WRONG = {
     "a class": (lambda: declare(Automaton), "selector is <class.*Automaton or tree"),
     "text": (lambda: declare("get_key"), "selector is 'get_key'.*no function, Automaton or tree"),
-    "a target": (lambda: declare(by_rule, selector_target_return=1.0), "selector is ready"),
+    "a target": (lambda: declare(by_rule, target_return=1.0), "selector is ready"),
     "an unknown skill": (lambda: declare(tree.Sequence("walk")), "leaf names 'walk'"),
     "a wrong choice": (
         lambda: declare(lambda obs: [7] * len(obs)).check_spaces(),
