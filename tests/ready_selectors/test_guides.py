@@ -273,9 +273,9 @@ def test_a_population_of_restricted_selectors_evolves(tmp_path):
 
 
 WRONG: dict[str, dict[str, Any]] = {
-    "guide is 3; it must be a function": {"guide": 3},
-    "guide_kl is -1": {"guide": AUTOMATON, "guide_kl": -1},
-    "guide_kl is 'x'; it must be a number": {"guide": AUTOMATON, "guide_kl": "x"},
+    "Guide: selector is 3; it must be a function": {"guide": 3},
+    "Guide: target_kl is -1": {"guide": AUTOMATON, "guide_kl": -1},
+    "Guide: target_kl is 'x'; it must be a number": {"guide": AUTOMATON, "guide_kl": "x"},
     "the guide has no effect": {"guide": AUTOMATON, "guide_restrict": False},
     "only PPO can be kept near": {"guide": AUTOMATON, "guide_kl": 0.1, "selector": OFF},
     "has nothing to choose": {"guide": by_rule},
@@ -285,7 +285,6 @@ WRONG: dict[str, dict[str, Any]] = {
     "the guide restricts which skill": {"guide": AUTOMATON, "interrupt": True},
     "a guide is given, but the selector is ready": {"guide": TREE, "selector": by_rule},
     "names 'fly', which is no skill": {"guide": Automaton({"a": "fly"}, {})},
-    "nobody learns": {"skills": [Leave(), Wait()], "selector": by_rule, "learn": "together"},
 }  # fmt: skip
 
 
