@@ -178,6 +178,11 @@ def evolving(declared: H, evolve: Evolve) -> tuple[H, str]:
     asked = evolve if isinstance(evolve, Mapping) else {"": evolve}
     if all(how is None for how in asked.values()):
         return declared, ""
+    return apart_to_evolve(declared)
+
+
+def apart_to_evolve(declared: H) -> tuple[H, str]:
+    """Return a copy of a hierarchy that learns apart, and the sentence that says so."""
     found = copied(declared)
     changed = [h for _, h in every_hierarchy(found) if h.learns_together and h.learn == "together"]
     if not changed:

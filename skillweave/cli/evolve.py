@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from skillweave.api.running import apart_to_evolve
 from skillweave.cli.overrides import replaced
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
@@ -28,7 +29,10 @@ def parse_evolve(
     """
     if not settings:
         return None
-    stages = declaration.plain_agent().stages() if flat else stages_of(declaration)
+    if flat:
+        stages = declaration.plain_agent().stages()
+    else:
+        stages = stages_of(apart_to_evolve(declaration)[0])
     names = [p.name for p in stages]
     everyone, own = [], {name: list[tuple[str, str, str]]() for name in names}
     for setting in settings:

@@ -481,7 +481,7 @@ def test_info_of_a_recipe_shows_settings_that_can_be_set(
 ) -> None:
     found = call("info", trained.plain, "--json").json
     settings = found["settings"]
-    assert settings["selector_steps"] == 512
+    assert settings["apart.selector_steps"] == 512
     assert settings["skills.left.steps"] == 256
     assert settings["selector.network.hidden"] == [8]
     lines = call("info", trained.plain).out.splitlines()

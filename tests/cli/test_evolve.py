@@ -18,7 +18,7 @@ from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
 
 RECIPE = """
-from skillweave import Hierarchy, PPO, Network, Skill
+from skillweave import Apart, Hierarchy, PPO, Network, Skill
 
 class Left(Skill):
     "Anything."
@@ -28,7 +28,7 @@ class Right(Skill):
 
 small = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network((8,), "relu"))
 hierarchy = Hierarchy("CartPole-v1", [Left(), Right()], algorithm=small, selector=small,
-                      skill_steps=128, selector_steps=128)
+                      learn="apart", apart=Apart(skill_steps=128, selector_steps=128))
 """
 TINY = (
     "population=3", "generations=2", "episodes=2", "right.population=2",

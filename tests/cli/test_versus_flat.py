@@ -36,9 +36,7 @@ def test_the_verdict_says_who_is_better_if_intervals_are_apart(
 def test_both_are_trained_on_as_many_steps_and_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "plain.py").write_text(
-        PLAIN
-    )
+    (tmp_path / "plain.py").write_text(PLAIN)
     common = ["train", str(tmp_path / "plain.py"), "-o", str(tmp_path / "run"), "--versus-flat"]
     assert main([*common, "--quiet", "--json", "--evaluate", "4"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -313,8 +313,12 @@ def test_an_evaluation_shows_its_episodes_after_a_second_and_then_goes_away(
         clock.now += 2.0
         progress.watch(played(4))
     lines = [" ".join(line.split()) for line in screen(terminal)]
-    assert any(re.fullmatch(r"evaluation \S+ 4 of 20 episodes 40 steps 0:08 left", x) for x in lines)
-    assert any(re.fullmatch(r"evaluation \S+ 8 of 20 episodes 44 steps 0:06 left", x) for x in lines)
+    assert any(
+        re.fullmatch(r"evaluation \S+ 4 of 20 episodes 40 steps 0:08 left", x) for x in lines
+    )
+    assert any(
+        re.fullmatch(r"evaluation \S+ 8 of 20 episodes 44 steps 0:06 left", x) for x in lines
+    )
     assert "\x1b[2K" in terminal.getvalue().rpartition("8 of 20")[2], "the line is erased"
 
 
