@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 import gymnasium as gym
 import numpy as np
 
+import skillweave.toys  # registers their ids  # noqa: F401
 from skillweave.arguments import checked_names
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
