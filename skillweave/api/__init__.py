@@ -16,6 +16,7 @@ from skillweave.api.notebook_tables import agent_html, agent_line, hierarchy_htm
 from skillweave.api.run import Run
 from skillweave.api.running import begin, declared_of, evolving, go_on
 from skillweave.api.starting import StartFrom
+from skillweave.arguments import checked_names
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
@@ -44,6 +45,7 @@ class Agent(PlainAgent):
         """Return a table of what it declares, for notebooks."""
         return agent_html(self)
 
+    @checked_names
     def train(
         self,
         run_dir: str | Path,
@@ -68,6 +70,7 @@ class Agent(PlainAgent):
         content = self.manifest(whole_number(seed, "seed", 0), how)
         return begin(self, content, run_dir, quiet, track, evolve, cluster, start_from)
 
+    @checked_names
     def resume(
         self,
         run_dir: str | Path,
@@ -84,6 +87,7 @@ class Agent(PlainAgent):
         check_run(self, run)
         return go_on(self, run, quiet, evolve, cluster, told_differences(self, run))
 
+    @checked_names
     def load(self, run_dir: str | Path) -> Run:
         """The finished run of this agent in ``run_dir``."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
@@ -99,12 +103,14 @@ class Agent(PlainAgent):
         found.recorded = True
         return found
 
+    @checked_names
     def load_weights(self, path: str | Path) -> Run:
         """This agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
         path = as_path(path, "path")
         return Run(self, path, read_agent(self.spec, *open_weights(path), path))
 
     @classmethod
+    @checked_names
     def from_weights(cls, path: str | Path) -> Run:
         """A plain agent with its environment, from the file that ``Run.save_weights`` wrote.
 
@@ -145,6 +151,7 @@ class Hierarchy(Declaration):
         """Return tables of what it declares, for notebooks."""
         return hierarchy_html(self)
 
+    @checked_names
     def train(
         self,
         run_dir: str | Path,
@@ -198,6 +205,7 @@ class Hierarchy(Declaration):
         content = training.manifest(own, seed=seed, flat=flat, how=how)
         return begin(own, content, run_dir, quiet, track, evolve, cluster, start_from, note)
 
+    @checked_names
     def resume(
         self,
         run_dir: str | Path,
@@ -219,6 +227,7 @@ class Hierarchy(Declaration):
         own = adopted(self, run)
         return go_on(own, run, quiet, evolve, cluster, told_differences(self, run))
 
+    @checked_names
     def load(self, run_dir: str | Path) -> Run:
         """The finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
@@ -229,6 +238,7 @@ class Hierarchy(Declaration):
         """Return the flat baseline: one agent on the task itself, without skills and reflexes."""
         return Agent(**vars(super().plain_agent(algorithm)))
 
+    @checked_names
     def load_weights(self, path: str | Path) -> Run:
         """This hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
         path = as_path(path, "path")
@@ -238,6 +248,7 @@ class Hierarchy(Declaration):
         return Run(self.plain_agent() if plain else own, path, policy)
 
     @staticmethod
+    @checked_names
     def pretrained(name: str) -> Run:
         """The shipped recipe ``name`` with its shipped weights."""
         return recipes.load(name).load_weights(recipes.weights_path(name))
@@ -266,6 +277,7 @@ class Hierarchy(Declaration):
         return found
 
 
+@checked_names
 def train_agent(
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
     algorithm: AlgorithmConfig,

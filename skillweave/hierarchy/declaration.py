@@ -10,6 +10,7 @@ from typing import Any, Literal
 import gymnasium as gym
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.arguments import checked_names
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
@@ -40,6 +41,7 @@ RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
 """Names of stages that are not skills."""
 
 
+@checked_names
 @dataclass
 class Declaration(Nestable):
     """Skills, reflexes and a selector on one environment, with budgets in environment steps.

@@ -6,12 +6,14 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.selectors.ready import ReadyValue
 from skillweave.training.checks import check_fields
 from skillweave.types import SkillweaveError
 
 
+@checked_names
 @dataclass(frozen=True)
 class Apart:
     """Settings of skills and a selector that train one after another.
@@ -42,6 +44,7 @@ class Apart:
         check_fields(self)
 
 
+@checked_names
 @dataclass(frozen=True)
 class Selection:
     """Settings of how the selector chooses and how skills act under it.
@@ -73,6 +76,7 @@ class Selection:
             )
 
 
+@checked_names
 @dataclass(frozen=True)
 class Guide:
     """A ready selector beside one that learns.

@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.training.checks import check_algorithm, check_fields
 from skillweave.types import SkillweaveError
 
 
+@checked_names
 @dataclass(frozen=True)
 class TrainDefaults:
     """Values that ``train`` uses for arguments that its caller leaves out.

@@ -10,6 +10,7 @@ import gymnasium as gym
 
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.arguments import checked_names
 from skillweave.envs.make import EnvSpec
 from skillweave.runs.directory import RunDirectory
 from skillweave.spaces import action_codec, obs_codec
@@ -22,6 +23,7 @@ AGENT = "agent"
 """What a plain agent's stage is named."""
 
 
+@checked_names
 @dataclass
 class PlainAgent:
     """An environment and who learns its own reward, with a budget in environment steps.

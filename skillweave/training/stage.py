@@ -9,6 +9,7 @@ from typing import Any, Literal
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.config_checks import number, positive
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.arguments import checked_names
 from skillweave.collecting import levels
 from skillweave.envs.make import EnvSpec, workers_for
 from skillweave.messages import short
@@ -93,6 +94,7 @@ def target_of(
     return None
 
 
+@checked_names
 @dataclass(frozen=True)
 class Together:
     """Settings of a selector and skills that learn from the same steps.
