@@ -183,7 +183,12 @@ def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
     if origin in (Union, UnionType):
         if data is None and NoneType in inner:
             return None
-        options = [k for k in inner if k is not NoneType]
+        data_kinds = [k for k in inner if get_origin(k) is not Callable]
+        if len(data_kinds) < len(inner) and isinstance(data, str):
+            return fit(str, data, file, path)  # a function, recorded by its name
+        options = [k for k in data_kinds if k is not NoneType]
+        if is_dataclass(options[-1]):  # a plain value, or settings
+            return fit(options[-1 if isinstance(data, Mapping) else 0], data, file, path)
         if len(options) == 1:
             return fit(options[0], data, file, path)
         words = get_args(options[1])

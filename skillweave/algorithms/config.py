@@ -6,13 +6,14 @@ does not import torch, so that ``--help`` and argument errors are instant.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, TypeAlias
 
 import gymnasium as gym
 
 from skillweave.algorithms.config_off_policy import DQN, SAC, TD3, OffPolicy
 from skillweave.algorithms.config_on_policy import PPO, OnPolicy, SelfImitationPPO, SkillCritic
+from skillweave.named import Named
 from skillweave.reading import fit, shown
 from skillweave.types import SkillweaveError
 
@@ -113,7 +114,20 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
 
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
     """Settings as plain JSON, with the algorithm's name under ``algorithm``."""
-    return {"algorithm": type(config).__name__, **asdict(config)}
+    return {"algorithm": type(config).__name__, **_as_json(config)}
+
+
+def _as_json(value: Any) -> Any:
+    """Return settings as dicts; functions of the user are the names that are recorded."""
+    if is_dataclass(value):
+        return {f.name: _as_json(getattr(value, f.name)) for f in fields(value)}
+    return str(value) if isinstance(value, Named) else value
+
+
+def own_encoders(config: Any) -> list[str]:
+    """Return the functions of the user that settings need for acting, by name."""
+    networks = (getattr(config, name, None) for name in ("network", "critic"))
+    return [n.encoder for n in networks if n is not None and isinstance(n.encoder, Named)]
 
 
 def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConfig:

@@ -9,7 +9,7 @@ from dataclasses import fields
 from typing import Any
 
 from skillweave.messages import short
-from skillweave.networks.config import Network
+from skillweave.networks.config import Network, from_dict
 from skillweave.types import SkillweaveError
 
 INFINITY = float("inf")
@@ -81,7 +81,10 @@ def compiles(config: Any) -> None:
 
 
 def check_networks(config: Any) -> None:
-    """Raise where ``network`` or ``critic`` is no architecture."""
+    """Raise where ``network`` or ``critic`` is no architecture; a dict of settings becomes one."""
+    from_dict(config, "network", Network)
+    if hasattr(config, "critic"):
+        from_dict(config, "critic", Network)
     check(config, "network", isinstance(config.network, Network), "a Network()")
     critic = getattr(config, "critic", None)
     check(config, "critic", isinstance(critic, Network | None), "a Network() or None")

@@ -21,6 +21,7 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
+from skillweave.named import Named
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
 from skillweave.networks.stacked import Views
@@ -47,6 +48,12 @@ def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str
     if mutations.architecture == 0.0:
         return
     for name, network in networks_of(config).items():
+        if isinstance(network.encoder, Named):
+            raise SkillweaveError(
+                f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has an "
+                f"encoder of your own ({network.encoder}), whose architecture is its code: set it "
+                "to 0"
+            )
         if network.layer_norm:
             raise SkillweaveError(
                 f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has "

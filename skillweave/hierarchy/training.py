@@ -52,6 +52,8 @@ def manifest(
     if flat is not False:
         return declaration.plain_agent(None if flat is True else flat).manifest(seed, how)
     check_nested(declaration)
+    stages = stages_of(declaration)
+    code = any(stage.acts_by_code for stage in stages)
     return {
         "kind": "hierarchy",
         "env": declaration.spec.name,
@@ -65,9 +67,9 @@ def manifest(
             for path, s in every_skill(declaration.skills)
         ],
         **_hierarchy_entry(declaration, together=declaration.learns_together),
-        "resume_needs_recipe": not declaration.trains_from_data,
-        "needs_recipe": not declaration.is_data,
-        "stages": [stage.entry() for stage in stages_of(declaration)],
+        "resume_needs_recipe": code or not declaration.trains_from_data,
+        "needs_recipe": code or not declaration.is_data,
+        "stages": [stage.entry() for stage in stages],
     }
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeVar, get_args
 
 from skillweave.arguments import checked_names
-from skillweave.messages import short
+from skillweave.messages import close_matches, short
+from skillweave.named import named
 from skillweave.types import SkillweaveError
 
 T = TypeVar("T")
@@ -34,6 +36,7 @@ class CNN:
     """Stride of each convolution, in pixels."""
 
     def __post_init__(self) -> None:
+        as_tuples(self, "channels", "kernels", "strides")
         _choice(self, "kind", ("plain", "impala"))
         for name in ("channels", "kernels", "strides"):
             _widths(self, name)
@@ -96,7 +99,7 @@ class Network:
     """Images through a CNN, everything else as it is, then hidden layers, then a memory.
 
     Dict and Tuple observations need nothing more: their parts are joined before the hidden
-    layers.
+    layers. Lists are taken as tuples, and a dict as the settings that it names.
 
     ```python
     import skillweave as sw
@@ -104,6 +107,7 @@ class Network:
     wide = sw.Network((256, 256), "relu", layer_norm=True)
     with_memory = sw.Network((64,), rnn=sw.RNN("lstm", 32))
     pixels = sw.Network((512,), "relu", cnn=sw.CNN())
+    from_yaml = sw.PPO(network={"hidden": [64, 64], "rnn": {"kind": "gru"}})
     ```
 
     Raises:
@@ -120,19 +124,28 @@ class Network:
     """How images are encoded; None: CNN() from 36 pixels upwards, CNN.small() below."""
     rnn: RNN | None = None
     """A memory, for PPO; None: the policy sees one observation at a time."""
-    encoder: str | None = None
-    """A custom encoder by the name it was registered under; see ``register_encoder``."""
+    encoder: str | Callable[[Any], Any] | None = None
+    """A network of your own in front of the hidden layers: a function ``f(observation_space)`` that
+    returns a ``torch.nn.Module``, or such a class. Its ``forward`` turns observations (B, *shape)
+    into features (B, F), as a features extractor of Stable-Baselines3 does. The space describes
+    what ``forward`` gets, all of it float32: numbers as the algorithm's ``normalize_obs`` leaves
+    them, images as (C, H, W) from 0 to 1, choices one-hot, a Dict or Tuple as a dict or tuple. Its
+    parameters are learnt and saved with the policy; a run records its name, and needs its code to
+    be loaded. Or the name of an encoder that was registered; see ``register_encoder``."""
     sees: tuple[int, ...] | None = None
     """Which numbers of the observation it sees, by their places; None: all. The places are those of
     the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without images,
     which are seen in any case. For a skill that is not to know of the task around it."""
 
     def __post_init__(self) -> None:
+        as_tuples(self, "hidden", "sees")
+        for name, kind in (("cnn", CNN), ("rnn", RNN)):
+            from_dict(self, name, kind)
         _widths(self, "hidden")
         _choice(self, "activation", get_args(Activation))
         _choice(self, "layer_norm", (True, False))
-        if not isinstance(self.encoder, str | None):
-            raise SkillweaveError(f"Network.encoder is {short(self.encoder)}; it must be a name")
+        if self.encoder is not None:
+            object.__setattr__(self, "encoder", _encoder(self.encoder))
         if self.sees is not None:
             _places(self.sees)
             if self.encoder is not None:
@@ -143,6 +156,51 @@ class Network:
                 raise SkillweaveError(
                     f"Network.{name} is {short(value)}; it must be a {kind.__name__}() or None"
                 )
+
+
+def as_tuples(config: object, *names: str) -> None:
+    """Turn the lists in these fields of frozen settings into tuples."""
+    for name in names:
+        if isinstance(value := getattr(config, name), list):
+            object.__setattr__(config, name, tuple(value))
+
+
+def from_dict(config: object, name: str, kind: type[Any]) -> None:
+    """Turn a dict in a field of frozen settings into the settings that it names.
+
+    Raises:
+        SkillweaveError: it names one that does not exist.
+    """
+    value = getattr(config, name)
+    if not isinstance(value, Mapping):
+        return
+    known, where = [f.name for f in fields(kind)], f"{type(config).__name__}.{name}"
+    for setting in value:
+        if setting not in known:
+            raise SkillweaveError(
+                f"{where} has no setting {short(setting)}; {kind.__name__} has {', '.join(known)}"
+                f".{close_matches(str(setting), known)}"
+            )
+    try:
+        object.__setattr__(config, name, kind(**value))
+    except SkillweaveError as error:
+        raise SkillweaveError(f"{where}: {error}") from error
+
+
+def _encoder(value: Any) -> str:
+    """Return the name of an encoder; of a function of the user one that leads to it."""
+    if not isinstance(value, str) and hasattr(value, "state_dict") and not isinstance(value, type):
+        raise SkillweaveError(
+            f"Network.encoder is a {type(value).__name__}, a module; give the class, or a function "
+            "f(observation_space) that makes the module, because each network gets one of its own"
+        )
+    if not isinstance(value, str) and not callable(value):
+        raise SkillweaveError(
+            f"Network.encoder is {short(value)}; it must be a function f(observation_space) that "
+            "returns a torch.nn.Module, or the name of a registered encoder"
+        )
+    found: str = named(value, "Network.encoder")
+    return found
 
 
 def seeing_all(algorithm: T) -> T:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from skillweave.arguments import checked_names
+from skillweave.named import Named, known_names
 from skillweave.networks.config import CNN, Activation
 from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
 from skillweave.spaces import ObsCodec
@@ -61,16 +62,26 @@ def register_encoder(name: str, make: Callable[[ObsCodec], Encoder]) -> None:
     _REGISTERED[name] = make
 
 
-def make_encoder(name: str, obs: ObsCodec) -> Encoder:
-    """A registered encoder on one observation space.
+def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
+    """A registered encoder, or one of a module of the user, on one observation space.
 
     Raises:
-        SkillweaveError: nobody registered it.
+        SkillweaveError: it was not registered, or is a function that was not given.
     """
+    if isinstance(name, Named):
+        from skillweave.networks.own import ModuleEncoder
+
+        return ModuleEncoder(obs, name)
     if name == "cells" and name not in _REGISTERED:
         from skillweave.networks.cells import CellsEncoder
 
         return CellsEncoder(obs)
+    if name not in _REGISTERED and ":" in name:
+        raise SkillweaveError(
+            f"Network.encoder is {name!r}, a function of your own, and its code is not loaded: "
+            "load it by the declaration that has it, hierarchy.load(run), or on the command line by "
+            f"--recipe FILE.py (functions that are loaded: {known_names()})"
+        )
     if name not in _REGISTERED:
         raise SkillweaveError(
             f"Network.encoder is {name!r}, which is not registered: call "

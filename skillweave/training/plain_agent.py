@@ -85,6 +85,8 @@ class PlainAgent:
     def manifest(self, seed: int, how: TrainDefaults | None = None) -> dict[str, Any]:
         """Return the content of a new run's ``run.json``, for this ``seed``."""
         how = how or self.train_defaults
+        (stage,) = self.stages()
+        code = stage.acts_by_code or not self.spec.is_data
         return {
             "kind": "agent",
             "env": self.spec.name,
@@ -93,9 +95,9 @@ class PlainAgent:
             "checkpoint_every": how.checkpoint_every,
             "eval_every": how.eval_every,
             "eval_episodes": how.eval_episodes,
-            "needs_recipe": not self.spec.is_data,
-            "resume_needs_recipe": not (self.spec.is_data and self.spec.engine == "auto"),
-            "stages": [stage.entry() for stage in self.stages()],
+            "needs_recipe": code,
+            "resume_needs_recipe": code or self.spec.engine != "auto",
+            "stages": [stage.entry()],
         }
 
 

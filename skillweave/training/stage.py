@@ -6,7 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
+from skillweave.algorithms.config import (
+    AlgorithmConfig,
+    config_from_json,
+    config_to_json,
+    own_encoders,
+)
 from skillweave.algorithms.config_checks import number, positive
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.arguments import checked_names
@@ -169,6 +174,11 @@ class Stage:
     """What is learnt is kept only if it is better than what was there before."""
     greedy_judged: bool = False
     """At its end, evaluate whether skills and selector should act greedily or sample."""
+
+    @property
+    def acts_by_code(self) -> bool:
+        """Whether a policy of the stage can be loaded only with code of the user's."""
+        return any(own_encoders(config) for config in (self.config, *self.beside.values()))
 
     def inside(self, name: str) -> Stage:
         """This stage in a hierarchy that is the skill ``name`` of another one."""

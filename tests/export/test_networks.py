@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from torch import nn
 from toys import ASKS, SHOWS
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
@@ -38,6 +39,23 @@ NESTED = gym.spaces.Dict(
         (gym.spaces.Discrete(3, start=1), gym.spaces.Box(-1, 1, (2,), np.float64))
     ),
 )
+
+
+class Watching(nn.Module):
+    """Reads an image and what stands beside it."""
+
+    def __init__(self, space: Any) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(3, 2, 3)
+        self.layer = nn.Linear(18 + space["inner"][0].shape[0], 6)
+
+    def forward(self, obs: Any) -> torch.Tensor:
+        image = self.conv(obs["image"]).relu().flatten(1)
+        choice, place = obs["inner"]
+        seen = torch.cat([image, choice], -1)
+        return torch.cat([self.layer(seen).tanh(), place], -1)
+
+
 CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
     "ppo, normalised": (PPO(network=SMALL), SHOWS["vector"], ASKS["Discrete"][0]),
     "ppo, elu, layer norm": (
@@ -61,6 +79,9 @@ CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
     ),
     "ppo, cells with few kinds": (
         PPO(network=Network((8,), encoder="cells")), FEW, ASKS["Discrete"][0],
+    ),
+    "ppo, an encoder of the user's own": (
+        PPO(network=Network((8,), encoder=Watching)), NESTED, ASKS["Discrete"][0]
     ),
     "dqn, impala": (
         DQN(**REPLAY | {"network": Network((8,), cnn=CNN.impala((4,)))}),

@@ -18,7 +18,7 @@ class Upright(Skill):
     ("make", "says"),
     [
         (lambda: Network(hidden=(64, 0)), r"Network\.hidden is \(64, 0\).*at least 1"),
-        (lambda: Network(hidden=[64]), r"Network\.hidden is \[64\].*at least 1"),
+        (lambda: Network(hidden=64), r"Network\.hidden is 64.*at least 1"),
         (lambda: Network(hidden=(8.0,)), r"Network\.hidden is \(8\.0,\).*at least 1"),
         (lambda: Network(activation="sine"), r"Network\.activation is 'sine'.*tanh, relu, elu"),
         (lambda: Network(cnn="impala"), r"Network\.cnn is 'impala'.*a CNN\(\) or None"),
