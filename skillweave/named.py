@@ -103,7 +103,7 @@ def _name_of(function: Any, where: str) -> str:
             "record its name: wrap it in a function (def)"
         )
     if inspect.isfunction(inner):
-        values = inspect.getclosurevars(inner).nonlocals | values
+        values = {**inspect.getclosurevars(inner).nonlocals, **values}
         if "<lambda>" in name:
             name += f"#{_digest(inner)}"
     if any(not isinstance(value, _PLAIN) for value in values.values()):

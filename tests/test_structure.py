@@ -25,6 +25,7 @@ BASE = {
     "notebooks",
     "messages",
     "arguments",
+    "named",
     "reading",
     "experience",
     "shapes",
@@ -41,6 +42,7 @@ ROOMS: dict[str, set[str]] = {
     "shapes": set(),
     "messages": {"types", "tracebacks"},
     "arguments": {"types", "messages"},
+    "named": {"types", "messages"},
     "reading": {"types", "messages"},
     "experience": {"types"},
     "ops": BASE,
@@ -68,12 +70,13 @@ ROOMS: dict[str, set[str]] = {
 }
 # Modules that are stricter than their room: settings, which help and errors read, need no torch.
 LEAVES: dict[str, set[str]] = {
-    "networks.config": {"types", "messages", "arguments"},
+    "networks.config": {"types", "messages", "arguments", "named"},
     "reading": {"types", "messages"},
     "algorithms.config": {
         "types",
         "messages",
         "arguments",
+        "named",
         "reading",
         "networks.config",
         "algorithms.config_checks",
@@ -84,12 +87,14 @@ LEAVES: dict[str, set[str]] = {
     "algorithms.config_off_policy": {
         "types",
         "arguments",
+        "named",
         "networks.config",
         "algorithms.config_checks",
     },
     "algorithms.config_on_policy": {
         "types",
         "arguments",
+        "named",
         "networks.config",
         "algorithms.config_checks",
     },
@@ -97,6 +102,7 @@ LEAVES: dict[str, set[str]] = {
         "types",
         "messages",
         "arguments",
+        "named",
         "reading",
         "networks.config",
         "algorithms.config",

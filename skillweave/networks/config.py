@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar, get_args
 
 from skillweave.arguments import checked_names
-from skillweave.messages import close_matches, short
+from skillweave.messages import short
 from skillweave.named import named
 from skillweave.types import SkillweaveError
 
@@ -169,22 +169,14 @@ def from_dict(config: object, name: str, kind: type[Any]) -> None:
     """Turn a dict in a field of frozen settings into the settings that it names.
 
     Raises:
-        SkillweaveError: it names one that does not exist.
+        SkillweaveError: it names one that does not exist, or a value is wrong.
     """
     value = getattr(config, name)
-    if not isinstance(value, Mapping):
-        return
-    known, where = [f.name for f in fields(kind)], f"{type(config).__name__}.{name}"
-    for setting in value:
-        if setting not in known:
-            raise SkillweaveError(
-                f"{where} has no setting {short(setting)}; {kind.__name__} has {', '.join(known)}"
-                f".{close_matches(str(setting), known)}"
-            )
-    try:
-        object.__setattr__(config, name, kind(**value))
-    except SkillweaveError as error:
-        raise SkillweaveError(f"{where}: {error}") from error
+    if isinstance(value, Mapping) and all(isinstance(k, str) for k in value):
+        try:
+            object.__setattr__(config, name, kind(**value))
+        except SkillweaveError as error:
+            raise SkillweaveError(f"{type(config).__name__}.{name}: {error}") from error
 
 
 def _encoder(value: Any) -> str:

@@ -79,8 +79,8 @@ def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
     if name not in _REGISTERED and ":" in name:
         raise SkillweaveError(
             f"Network.encoder is {name!r}, a function of your own, and its code is not loaded: "
-            "load it by the declaration that has it, hierarchy.load(run), or on the command line by "
-            f"--recipe FILE.py (functions that are loaded: {known_names()})"
+            "load it by the declaration that has it, hierarchy.load(run), or on the command line "
+            f"by --recipe FILE.py (functions that are loaded: {known_names()})"
         )
     if name not in _REGISTERED:
         raise SkillweaveError(

@@ -30,7 +30,7 @@ from skillweave.types import SkillweaveError
 
 ROWS = 3
 """Observations that a new module is tried with."""
-_CLOSE = {"rtol": 1e-3, "atol": 1e-4}
+_CLOSE: dict[str, Any] = {"rtol": 1e-3, "atol": 1e-4}
 
 
 class ModuleEncoder:

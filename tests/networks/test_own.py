@@ -18,8 +18,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from small_runs import ON, Left, assert_same, stopped_again, stopped_run
-from toys import Echo, learn
 from torch import nn
+from toys import Echo, learn
 
 import skillweave as sw
 from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Mutations, Network, SkillweaveError
@@ -312,8 +312,8 @@ def hierarchy(**how: Any) -> Hierarchy:
 
 def small(**how: Any) -> Hierarchy:
     found = hierarchy(**how)
-    found.skill_steps = found.selector_steps = found.together_steps = 400
-    found.cut_every = 100
+    found.steps = 800
+
     return found
 
 
@@ -453,7 +453,7 @@ def test_lists_and_dicts_are_taken_for_what_they_say():
     assert Network(cnn={"channels": [4], "kernels": [3], "strides": [1]}).cnn == sw.CNN(
         "plain", (4,), (3,), (1,)
     )
-    with pytest.raises(SkillweaveError, match=r"PPO\.network has no setting 'hiden'.*hidden"):
+    with pytest.raises(SkillweaveError, match=r"PPO\.network: .*'hiden'.*'hidden' meant"):
         PPO(network={"hiden": [8]})
     with pytest.raises(SkillweaveError, match=r"DQN\.network: Network\.hidden is \(0,\)"):
         DQN(network={"hidden": [0]})
