@@ -132,7 +132,8 @@ def test_a_skill_that_acted_too_seldom_to_learn_is_told(tmp_path):
     heard = Heard()
     often = replace(ON, learning_rate=1e-5)
     few = chain(
-        GetKey(), Unlock(), Leave(), selector=often, together=Together(quota=1.0, epsilon=0.0, task_weight=0.0),
+        GetKey(), Unlock(), Leave(), selector=often,
+        together=Together(quota=1.0, epsilon=0.0, task_weight=0.0),
         together_steps=70,
     )  # fmt: skip
     run = new_run(few, tmp_path / "run")

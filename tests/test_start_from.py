@@ -303,15 +303,6 @@ def test_a_copy_that_is_lost_or_anothers_is_refused(source, tmp_path):
     declare().resume(run.path, quiet=True)
 
 
-def test_a_run_of_before_does_not_say_the_checksums_of_its_copies(source, tmp_path):
-    run = begun(tmp_path / "run", source)
-    said = [told for s in run.manifest["stages"] for told in s.get("starts", {}).values()]
-    assert [told.pop("copy") for told in said]
-    run.save()
-    run.close()
-    assert declare().resume(run.path, quiet=True).info()["stages"][-1]["status"] == "done"
-
-
 def test_runs_that_start_elsewhere_are_others(source, tmp_path):
     ids = [
         run.info()["id"]

@@ -110,7 +110,7 @@ class Bench:
     def _as_learnt(self, hierarchy: Hierarchy) -> Hierarchy:
         """Skills are greedy, or sample, as on the first task, if neither the suite says it nor a
         stage in which they go on learning finds it out."""
-        if hierarchy.selection.greedy_skills is None and hierarchy.learn == "apart":
+        if hierarchy.selection.greedy_skills is None and not hierarchy.learns_together:
             regroup(hierarchy, greedy_skills=self._source_policy().skills.greedy)
         return hierarchy
 

@@ -241,9 +241,16 @@ KINDS: dict[str, Kind] = {
     ),
     "populations of skills and selector": Kind(
         lambda: Hierarchy(
-            IN_PYTHON, [Leaning(), Balance()], call_steps=4, algorithm=PPO(
+            IN_PYTHON,
+            [Leaning(), Balance()],
+            call_steps=4,
+            algorithm=PPO(
                 **LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))
-            ), selector=DQN(**REPLAYS), learn="apart", apart=Apart(skill_steps=300, selector_steps=300)),
+            ),
+            selector=DQN(**REPLAYS),
+            learn="apart",
+            apart=Apart(skill_steps=300, selector_steps=300),
+        ),
         evolve=Evolution(**EVOLVES | {"population": 2, "generations": 2}),
     ),
     "together": Kind(lambda: together(1200)),

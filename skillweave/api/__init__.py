@@ -28,7 +28,6 @@ from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
 from skillweave.messages import as_path, whole_number
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill
-from skillweave.training.defaults import TrainDefaults
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
 

@@ -91,7 +91,7 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
     if path.exists():
         raise SkillweaveError(f"{path} is there already; choose another folder")
     found = hub.download(hub.check_name(name), revision)
-    manifest = hub.public(RunDirectory.open(found).manifest)  # older versions pushed all of it
+    manifest = hub.public(RunDirectory.open(found).manifest)  # others may have pushed all of it
     part = path.with_name(f".{path.name}.part")
     try:
         (part / "policies").mkdir(parents=True)

@@ -145,14 +145,9 @@ class Columns:
         """Go on from what ``written`` gave, of columns that were made with the same arguments.
 
         Raises:
-            SkillweaveError: it is of other settings, or of an older version.
+            SkillweaveError: it is of other settings.
             ValueError: a number in it is none that is written here.
         """
-        if "newest" not in state:
-            raise SkillweaveError(
-                "the checkpoint's replay buffer was written by an older version of Skillweave: "
-                "go on with that version, or begin a new run"
-            )
         self.data["kind"][:] = NOTHING
         for name in OPTIONAL:
             self.data.pop(name, None)

@@ -222,7 +222,7 @@ class ReplayStore:
         """Go on from the ``state`` of a store that was made with the same arguments.
 
         Raises:
-            SkillweaveError: it is of other settings, or of an older version.
+            SkillweaveError: it is of other settings.
             ValueError: a number in it is none that is written here.
         """
         self._columns.load(state)

@@ -24,8 +24,7 @@ from skillweave.runs.files import read_json, write_json
 from skillweave.types import SkillweaveError
 
 MARK = ".sweep"
-"""A file in the sweep's directory, by which a machine knows that it sees it; older versions left it
-empty."""
+"""A file in the sweep's directory, by which a machine knows that it sees it."""
 
 
 class Mark(TypedDict):
@@ -49,7 +48,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
     """
     file, code = out / MARK, _checksum(code_files(recipes.file_of(recipe)))
     learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
-    if not learnt or not file.exists() or not file.stat().st_size:
+    if not learnt or not file.exists():
         write_json(file, Mark(recipe=recipe, code=code), make_directories=False)
         return
     told: Mark = fit(Mark, read_json(file), str(file))

@@ -37,7 +37,7 @@ class Interruption:
 
     worth: Callable[[Array], Array]
     """Observations (n, …) to what each skill is worth there, and last what it is worth to decide
-    anew, (n, S + 1), in deviations of the return; of older versions the skills alone, (n, S)."""
+    anew, (n, S + 1), in deviations of the return."""
     margin: float
     """By how much deciding anew must be worth more, in the same unit."""
     critic: Policy | None = None

@@ -160,7 +160,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call i
             self.why = OWN
         if self.critic and self.why == RUNNING:
             worth, may, margin = self.critic.act(None), self.may_start(), self.told["margin"]
-            gain = (worth[len(may) :] if len(worth) > len(may) else worth[may]) - worth[self.skill]
+            gain = worth[len(may) :] - worth[self.skill]
             self.why = INTERRUPTED if may.any() and any(gain > margin) else RUNNING
         judge, self.succeeded = told["success"], self.why == OWN
         if judge and self.why != RUNNING:

@@ -183,6 +183,6 @@ def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
     def cheetah(render_mode: str | None = None) -> gym.Env[Any, Any]:
         return make(points, render_mode)
 
-    # The name says how x is seen: runs of older versions saw metres, and are not taken for these.
+    # The name says how x is seen, so that runs with another scale are not taken for these.
     cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)}; log x)"
     return EnvSpec(cheetah, pool=partial(many, points=points))

@@ -35,7 +35,7 @@ class Learnt:
     steps: int
     """Environment steps that it learnt from."""
     run: str | None
-    """That run's ``id``; runs of older versions have none."""
+    """That run's ``id``."""
     chooses: Chooses
     """From what it chooses, if it is a selector or a critic of skills."""
 
@@ -62,8 +62,7 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
             continue
         sums = entry.get("policies") or {entry["name"]: entry.get("sha256")}
         for name, policy in run.load_policies(entry["name"]).items():
-            # Runs of older versions do not say the checksum.
-            sha256 = sums[name] or read_signed(run.policy_path(entry["name"], name))[2]
+            sha256 = sums[name]
             steps = entry["steps"] + (found[name].steps if name in found else 0)
             chooses = chosen_from(run.manifest, name)
             found[name] = Learnt(policy, sha256, steps, run.manifest.get("id"), chooses)
@@ -162,7 +161,7 @@ def start_of(
     run.must_be_ours(header, path)
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise SkillweaveError(f"{path} does not hold what {name!r} is to begin with")
-    check_unchanged(path, sha256, told.get("copy", sha256))  # older runs do not say it
+    check_unchanged(path, sha256, told["copy"])
     policy = AgentPolicy.from_file(tensors, header, str(path))
     if not same_shapes(policy.algorithm, algorithm):
         raise SkillweaveError(f"{path} holds other networks than {name!r} has in this run")

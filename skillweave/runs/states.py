@@ -33,7 +33,7 @@ def save_state(run: RunDirectory, stage: str, name: str, state: Any) -> None:
 def load_state(run: RunDirectory, name: str, like: S) -> S | None:
     """The state that ``name`` ended its latest stage with; None: none was written.
 
-    A population writes none, and older versions did not. Where what was learnt in that stage was
+    A population writes none. Where what was learnt in that stage was
     not kept, its state is none of who goes on.
 
     Raises:

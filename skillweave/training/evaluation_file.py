@@ -59,7 +59,7 @@ def save_evaluation(
         deterministic=deterministic,
         evaluation=evaluation,
     )
-    if "id" in run.manifest:  # runs of older versions have none
+    if "id" in run.manifest:
         found["run"] = run.manifest["id"]
     plain = {**found, "evaluation": asdict(evaluation)}
     write_json(run.path / "evaluation.json", plain, make_directories=False)

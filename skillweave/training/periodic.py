@@ -18,7 +18,6 @@ class PeriodicEvaluation:
 
     def __init__(self, scene: Scene, seeds: Seeds, every: int | None, episodes: int) -> None:
         self._scene, self._episodes = scene, episodes
-        # The node's name is that of older versions, so that their runs have the same starts.
         self._seeds, self._every, self._last = seeds / "probe", every, 0
         self._arena: Collector | None = None
         self._counted = 0

@@ -46,7 +46,7 @@ class SkillReport:
     """Calls with which an episode began."""
     followed: dict[str, Count] = field(default_factory=dict, compare=False)
     """How many of its calls a call of each skill followed; the others were the last of an episode.
-    Empty: not known, as in files of older versions."""
+    Empty: not known."""
     idle: Count = field(default=0, compare=False)
     """Calls that ended by themselves after one step, right after a call of it that had ended so."""
     late: Count = field(default=0, compare=False)

@@ -108,8 +108,8 @@ def useless_skills(skills: Mapping[str, SkillReport], episodes: int) -> list[str
     for name, report in skills.items():
         if not report.calls:
             found.append(
-                f"Skill {name!r} was never chosen in {episodes} episodes. If the task needs it, see "
-                "that its initiation() is True where the other skills end, give it more steps, or "
+                f"Skill {name!r} was never chosen in {episodes} episodes. If the task needs it, "
+                "see that its initiation() is True where the other skills end, give it more steps, or "
                 "raise together.epsilon_final; else leave it out."
             )
         elif report.succeeded == 0:

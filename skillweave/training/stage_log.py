@@ -43,7 +43,7 @@ class Listener(Protocol):
 def never_succeeded(entry: Mapping[str, Any]) -> bool:
     """Whether a skill's stage has ended, and none of its calls was a success.
 
-    Skills without ``success`` are not judged, nor populations, nor stages of older versions.
+    Skills without ``success`` and populations are not judged.
     """
     return entry.get("succeeded") is False
 

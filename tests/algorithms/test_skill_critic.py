@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave.algorithms.config import SkillCritic, config_from_json, config_to_json
+from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.experience import Rollout
 from skillweave.networks.config import Network
@@ -107,12 +107,3 @@ def test_it_learns_what_deciding_is_worth_where_one_decided():
     assert abs(found[2, 2] - 1.0) > 0.1
     assert best[0, 0] == 0
     assert algorithm.value(state, eye[None])[0, 0].item() == pytest.approx(1.0, abs=0.03)
-
-
-def test_critics_of_older_versions_do_not_know_what_deciding_is_worth():
-    algorithm, state = critic()
-    told = config_to_json(algorithm.config)
-    del told["deciding"]
-    assert not config_from_json(told).deciding
-    worth = algorithm.act(algorithm.learning_params(state), torch.eye(3)[None], None, None)[1]
-    assert worth.shape == (1, 3, 2)

@@ -122,8 +122,8 @@ def test_the_lander_is_what_the_measured_table_says() -> None:
     assert passes(found) == [(3, 1024), (3, 1024)]
     recipe = recipes.load("lunar-lander")
     assert passes(CASES["apart"](TASKS["lander"], steps)) == passes(recipe)
-    assert [s.steps or found.skill_steps for s in found.skills] == [10_000, 10_000, 50_000]
-    assert (found.selector_steps, found.together.steps) == (50_000, 1_500_000)
+    assert [s.steps or found.apart.skill_steps for s in found.skills] == [10_000, 10_000, 50_000]
+    assert (found.apart.selector_steps, found.together.steps) == (50_000, 1_500_000)
     assert found.together.task_weight == 100
     asked = hierarchy.declared("lunar-lander", hierarchy.together())
     same = replace(asked, env=found.env)  # but for how many workers step it
@@ -167,7 +167,7 @@ def test_who_learns_is_the_same_but_for_what_a_case_names() -> None:
 
 def test_calls_cost_something_where_successes_come_early_or_skills_learn_apart() -> None:
     costs = {
-        (task, case): CASES[case](TASKS[task], 1_000).call_cost  # type: ignore[union-attr]
+        (task, case): CASES[case](TASKS[task], 1_000).selection.call_cost  # type: ignore[union-attr]
         for task in ("8x8", "16x16")
         for case in ("together", "apart", "then")
     }

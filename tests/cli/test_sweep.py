@@ -198,16 +198,6 @@ def test_of_a_shipped_recipe_its_parts_count_and_nothing_else_of_the_library():
     assert found[""] == source("mazes")
 
 
-def test_a_sweep_of_an_older_version_goes_on_and_knows_its_code_from_then_on(
-    capsys, asked, trained, tmp_path
-):
-    first = answer(capsys, asked("--seeds", "0:1"))
-    (tmp_path / "runs/.sweep").write_text("")  # as older versions left it
-    assert answer(capsys, asked("--seeds", "0:1")) == first
-    (tmp_path / "still.py").write_text(EDITED)
-    refused(capsys, asked("--seeds", "0:2"), str(tmp_path / "still.py"))
-
-
 DYING = """
 import os
 

@@ -198,7 +198,6 @@ POLICIES: dict[str, Any] = {
     "nested, waiting": waiting,
     "interrupted": lambda: interrupted(0.02, deciding=True),
     "interrupted where somebody may start": always_better,
-    "interrupted, of an older version": lambda: interrupted(0.5),
     "an automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
     "a guide": lambda: guided(AUTOMATON),
     "a guide of lengths": lambda: guided(

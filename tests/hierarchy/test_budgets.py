@@ -123,7 +123,7 @@ def test_a_weight_that_is_none_is_refused(weight):
     class Odd(Skill):
         task_weight = weight
 
-    with pytest.raises(SkillweaveError, match="task_weight is .*at least 0"):
+    with pytest.raises(SkillweaveError, match=r"task_weight is .*at least 0"):
         declare(Odd())
 
 

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from skillweave import SkillweaveError, Step, envpool
+from skillweave import Apart, SkillweaveError, Step, Together, envpool
 from skillweave.recipes import _rooms as world
 from skillweave.recipes import keys_and_doors as rooms
 
@@ -219,7 +219,7 @@ def test_the_extra_is_named(monkeypatch):
 
 def test_skills_that_are_there_learn_nothing_more():
     ready = {name: lambda obs: np.zeros(len(obs), np.int64) for name in SKILLS}
-    found = rooms.with_skills("multi-room", ready, selector_steps=4096)
+    found = rooms.with_skills("multi-room", ready, apart=Apart(selector_steps=4096))
     assert found.total_steps == 4096
     assert [s.name for s in found.skills] == list(SKILLS)
 
@@ -229,5 +229,5 @@ def test_who_goes_on_learns_together_by_the_advantage_of_the_task_too():
     assert (found.learn, found.total_steps) == ("together", 750_000)
     how = found.together
     assert (how.task_weight, how.epsilon, how.epsilon_final) == (1.0, 0.1, 0.0)
-    assert rooms.going_on("multi-room", together_steps=4096).total_steps == 4096
+    assert rooms.going_on("multi-room", together=Together(steps=4096)).total_steps == 4096
     assert [s.name for s in found.skills if s.policy is not None] == ["explore"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.pay.lander_missions import suite
-from skillweave import SkillweaveError, Step
+from skillweave import Apart, Selection, SkillweaveError, Step
 from skillweave.recipes import _missions as world
 from skillweave.recipes import lander_missions as missions
 
@@ -299,7 +299,8 @@ def test_skills_sample_and_a_selector_over_given_skills_takes_fewer_steps():
     first, further = missions.declare(), missions.with_skills("tour", skills)
     assert first.selection.greedy_skills is further.selection.greedy_skills is False
     assert (first.apart.selector_steps, further.apart.selector_steps) == (600_000, 300_000)
-    longer = missions.with_skills("tour", skills, greedy_skills=True, selector_steps=500_000)
+    how = {"selection": Selection(greedy_skills=True), "apart": Apart(selector_steps=500_000)}
+    longer = missions.with_skills("tour", skills, **how)
     assert (longer.selection.greedy_skills, longer.apart.selector_steps) == (True, 500_000)
 
 

@@ -26,7 +26,8 @@ def run(tmp_path: Path) -> RunDirectory:
     skill = {"name": "land", "max_steps": 10}
     hop = {"name": "hop", "max_steps": 5, "policy": {"kind": "onnx", "file": "hop.onnx"}}
     manifest = {
-        "kind": "hierarchy", "env": "CartPole-v1", "env_kwargs": {}, "seed": 3, "checkpoint_every": 100,
+        "kind": "hierarchy", "env": "CartPole-v1", "env_kwargs": {}, "seed": 3,
+        "checkpoint_every": 100,
         "needs_recipe": True, "recipe": "/home/ada/secret/my_recipe.py", "call_steps": 7,
         "greedy_skills": True, "skills": [skill, hop], "stages": [STAGE],
     }  # fmt: skip

@@ -229,11 +229,6 @@ def test_an_altered_json_file_is_told_by_its_checksum(tmp_path: Path) -> None:
         read_json(path)
 
 
-def test_json_without_a_checksum_is_of_an_older_version(tmp_path: Path) -> None:
-    (tmp_path / "x.json").write_text('{"schema": 1, "steps": 12}')
-    assert read_json(tmp_path / "x.json")["steps"] == 12
-
-
 def test_a_pipe_in_the_place_of_a_file_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "x")
     for read in (read_json, read_tensors):
