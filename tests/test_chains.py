@@ -57,7 +57,7 @@ def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monke
 def test_a_skill_that_found_no_start_in_all_its_steps_is_told_in_the_end(tmp_path):
     heard = Heard()
     hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart", skill_steps=300)
-    hierarchy.apart.selector_steps = 300
+    hierarchy.apart = replace(hierarchy.apart, selector_steps=300)
     run = new_run(hierarchy, tmp_path / "run")
     training.train(hierarchy, run, (heard,))
     run.close()

@@ -331,7 +331,8 @@ def stage_of(name: str, save_buffer: bool = True) -> Stage:
 def echo_run(path: Path, stage: Stage) -> RunDirectory:
     manifest = {
         "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "skills": [],
-        "checkpoint_every": 125,
+        "checkpoint_every": 125, "eval_every": None, "eval_episodes": 20,
+        "resume_needs_recipe": False,
         "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "stages": [stage.entry()],
     }  # fmt: skip
     return RunDirectory.create(path, manifest)

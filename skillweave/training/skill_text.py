@@ -109,8 +109,8 @@ def useless_skills(skills: Mapping[str, SkillReport], episodes: int) -> list[str
         if not report.calls:
             found.append(
                 f"Skill {name!r} was never chosen in {episodes} episodes. If the task needs it, "
-                "see that its initiation() is True where the other skills end, give it more steps, or "
-                "raise together.epsilon_final; else leave it out."
+                "see that its initiation() is True where the other skills end, give it more "
+                "steps, or raise together.epsilon_final; else leave it out."
             )
         elif report.succeeded == 0:
             found.append(

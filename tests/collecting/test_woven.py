@@ -65,12 +65,15 @@ class Learner(Choices):
 
 
 class Values(Learner):
-    """A critic to whom skill k is worth k where the position is odd, else nothing."""
+    """A critic to whom skill k is worth k where the position is odd, else nothing.
+
+    A new decision is worth as much as the best skill.
+    """
 
     def these(self, obs, mask, memory):
         found = super().these(obs, mask, memory)
         odd = obs[:, POSITION] % 2 == 1
-        return replace(found, head=odd[:, None] * np.arange(3, dtype=np.float32))
+        return replace(found, head=odd[:, None] * np.array([0, 1, 2, 2], np.float32))
 
 
 def collector_of(call_steps, margin=None, n=N):

@@ -27,7 +27,8 @@ def run(tmp_path: Path) -> RunDirectory:
     hop = {"name": "hop", "max_steps": 5, "policy": {"kind": "onnx", "file": "hop.onnx"}}
     manifest = {
         "kind": "hierarchy", "env": "CartPole-v1", "env_kwargs": {}, "seed": 3,
-        "checkpoint_every": 100,
+        "checkpoint_every": 100, "eval_every": None, "eval_episodes": 20,
+        "resume_needs_recipe": True,
         "needs_recipe": True, "recipe": "/home/ada/secret/my_recipe.py", "call_steps": 7,
         "greedy_skills": True, "skills": [skill, hop], "stages": [STAGE],
     }  # fmt: skip

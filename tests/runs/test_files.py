@@ -430,7 +430,7 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
     assert re.findall(r"\bpickle\.\w+", source) == ["pickle.Unpickler"]
     # The one that sends the user's own code to processes of the same user, as multiprocessing does:
     # no file is ever read by it, and only these send and receive (``sweep_code`` asks it which
-    # modules are the user's own).
+    # modules are the user's own, ``recipe_file`` names a recipe's folder).
     assert len(found.pop("collecting/shipping.py")) == 2
     sender = (LIBRARY / "collecting/shipping.py").read_text()
     assert not re.search(r"\bopen\(|\.read|\.load\(", sender)
@@ -439,5 +439,5 @@ def test_nothing_in_the_library_pickles_or_runs_text_as_code() -> None:
         "cli/sweep.py",
         *(f"collecting/{n}.py" for n in ("actors", "processes", "stationed")),
     }
-    assert users == senders | {"cli/sweep.py", "cli/sweep_code.py"}
+    assert users == senders | {"api/recipe_file.py", "cli/sweep_code.py"}
     assert {k: v for k, v in found.items() if v} == {}
