@@ -88,7 +88,8 @@ class Run:
                 reflexes are in force, also where it was trained without them.
             max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
             save: keep the result in the run's directory, where ``info`` finds it, instead of the
-                one before. Not with ``skill`` or another engine.
+                one before. A sampled one is kept beside the score, and does not replace it. Not
+                with ``skill`` or another engine.
             engine: sync: Gymnasium's environment; envpool, auto: see ``evaluate``.
             quiet: no progress; else it is shown where an evaluation takes longer than a second.
 
@@ -322,10 +323,16 @@ class Run:
 
     @checked_names
     def info(self) -> dict[str, Any]:
-        """The manifest of its run, and under ``evaluation`` the latest one that was saved."""
+        """Return its manifest, with the latest saved evaluation under ``evaluation``.
+
+        One that sampled actions on request is under ``evaluation_sampled``.
+        """
         run = RunDirectory.open(self.path)
-        saved = load_evaluation(run)
-        return run.manifest | ({} if saved is None else {"evaluation": saved.to_json()})
+        told = {
+            "evaluation": load_evaluation(run),
+            "evaluation_sampled": load_evaluation(run, deterministic=False),
+        }
+        return run.manifest | {k: v.to_json() for k, v in told.items() if v is not None}
 
     def _policy(self, skill: str | None) -> Policy:
         if skill is None:

@@ -163,8 +163,10 @@ def _info(command: commands.Info) -> None:
     found = RunDirectory.open(command.target)
     m = found.manifest
     saved = load_evaluation(found)
+    sampled = load_evaluation(found, deterministic=False)
     told = {} if saved is None else {"evaluation": saved.to_json()}
-    tell(command, m | told, "\n".join(run_lines(m, saved, command.target)))
+    told |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
+    tell(command, m | told, "\n".join(run_lines(m, [saved, sampled], command.target)))
 
 
 def _weights(command: commands.Weights) -> None:

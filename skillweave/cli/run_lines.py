@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skillweave.collecting.lengths import calls_from_json
@@ -10,8 +10,10 @@ from skillweave.runs.kept import kept_words
 from skillweave.training.evaluation_file import SavedEvaluation
 
 
-def run_lines(m: Mapping[str, Any], saved: SavedEvaluation | None, target: object) -> list[str]:
-    """A run's manifest and its latest evaluation, as lines."""
+def run_lines(
+    m: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
+) -> list[str]:
+    """Return a run's manifest and its saved evaluations, as lines."""
     lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
     calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
     calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
@@ -43,8 +45,9 @@ def run_lines(m: Mapping[str, Any], saved: SavedEvaluation | None, target: objec
         if kept := p.get("kept"):
             lines.append(f"    {kept_words(kept)}")
     lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
-    if saved is not None:
-        how = "greedy" if saved.deterministic else "sampled"
-        lines.append(f"  evaluated {saved.made}, seed {saved.seed}, {how}:")
-        lines += [f"    {line}" for line in saved.evaluation.for_people().splitlines()]
+    for told in saved:
+        if told is not None:
+            how = "greedy" if told.deterministic else "sampled"
+            lines.append(f"  evaluated {told.made}, seed {told.seed}, {how}:")
+            lines += [f"    {line}" for line in told.evaluation.for_people().splitlines()]
     return lines

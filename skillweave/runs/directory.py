@@ -3,7 +3,8 @@
 run.json                     what is trained, with which settings, seeds and versions; stages
 metrics.jsonl                a line for every update
 lineage.jsonl                a line for every member of every generation, where populations evolve
-evaluation.json              the latest evaluation (``training/evaluation_file.py``)
+evaluation.json              its score: the latest evaluation (``training/evaluation_file.py``)
+evaluation-sampled.json      the latest evaluation that sampled actions on request
 checkpoint.safetensors       the stage under way, at its latest clean cut (and the one before)
 policies/<stage>.safetensors finished stages
 states/<who>.safetensors      what learns on in a later stage, until that is done

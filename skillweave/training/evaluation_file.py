@@ -1,4 +1,9 @@
-"""``evaluation.json`` in a run: the latest evaluation of the whole policy, for ``info``."""
+"""Saved evaluations of a run's whole policy.
+
+``evaluation.json`` holds the run's score: the latest evaluation in which it acted as it does by
+default. An evaluation that samples actions on request goes to ``evaluation-sampled.json``, so that
+it never replaces the score.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +19,7 @@ from skillweave.runs.trackers import steps_of, trackers_of
 from skillweave.training.evaluation import Evaluation
 from skillweave.types import SkillweaveError
 
+SCORE, SAMPLED = "evaluation.json", "evaluation-sampled.json"
 CHARTS = {"usage": "share", "call_length": "length_mean", "success": "success_rate"}
 """What trackers are sent of each skill, and where it stands in its report."""
 
@@ -48,6 +54,8 @@ def save_evaluation(
 ) -> None:
     """Write it into the run, in place of the one before, and send it to the run's trackers.
 
+    One that samples on request (``deterministic=False``) replaces only the one that sampled before.
+
     Raises:
         SkillweaveError: the disk is full or cannot be written; what was there is intact. Or the
             run is one of ``from_hub``.
@@ -62,8 +70,13 @@ def save_evaluation(
     if "id" in run.manifest:
         found["run"] = run.manifest["id"]
     plain = {**found, "evaluation": asdict(evaluation)}
-    write_json(run.path / "evaluation.json", plain, make_directories=False)
+    write_json(run.path / _name(deterministic), plain, make_directories=False)
     _track(run, evaluation)
+
+
+def _name(deterministic: bool) -> str:
+    """Return the name of the file that holds evaluations of this kind."""
+    return SCORE if deterministic else SAMPLED
 
 
 def _track(run: RunDirectory, evaluation: Evaluation) -> None:
@@ -78,13 +91,16 @@ def _track(run: RunDirectory, evaluation: Evaluation) -> None:
             tracker.tick("evaluation", steps_of(run), 0.0, scores)
 
 
-def load_evaluation(run: RunDirectory) -> SavedEvaluation | None:
-    """The latest evaluation that was saved in the run; None: there is none.
+def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEvaluation | None:
+    """Return the latest evaluation that was saved in the run, or None.
+
+    Args:
+        deterministic: True: the run's score. False: the evaluation that sampled on request.
 
     Raises:
         SkillweaveError: the file is damaged, or belongs to another run.
     """
-    path = run.path / "evaluation.json"
+    path = run.path / _name(deterministic)
     if not path.exists():
         return None
     data = read_json(path, lambda data: fit(EvaluationFile, data, str(path)))

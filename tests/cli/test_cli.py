@@ -426,6 +426,23 @@ def test_info_tells_the_latest_evaluation_as_evaluate_did(
     assert kept == {k: v for k, v in told.items() if k not in ("target", "env", "skill")}
 
 
+def test_a_sampled_evaluation_is_kept_beside_the_score(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    ignored = shutil.ignore_patterns("evaluation*.json")
+    shutil.copytree(trained.plain_run, run, ignore=ignored)
+    call("evaluate", run, "--episodes", 2)
+    score = read_json(run / "evaluation.json")
+    call("evaluate", run, "--episodes", 3, "--stochastic")
+    assert read_json(run / "evaluation.json") == score
+    told = call("info", run, "--json").json
+    assert (told["evaluation"]["episodes"], told["evaluation_sampled"]["episodes"]) == (2, 3)
+    text = call("info", run).out
+    assert "seed 0, greedy:" in text
+    assert "seed 0, sampled:" in text
+
+
 def test_an_evaluation_that_cannot_be_kept_is_told_all_the_same(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:

@@ -202,7 +202,7 @@ def _scores(
     run: RunDirectory, played: Played | None, seed: int, deterministic: bool
 ) -> dict[str, Any]:
     """The score and the skills' table: of the saved evaluation, or of the report's episodes."""
-    saved = load_evaluation(run)
+    saved = load_evaluation(run, deterministic=deterministic)
     score = None if played is None else played.score
     words = _how("played for this report", seed, deterministic)
     if saved is not None and (score is None or len(saved.evaluation.returns) > len(score.returns)):
