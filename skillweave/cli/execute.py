@@ -133,7 +133,8 @@ def _compare(command: commands.Compare) -> None:
 
 
 def _tell_page(command: commands.Output, told: dict[str, Any]) -> None:
-    lines = [f"{told['path']}: {told['bytes'] / 1e6:.1f} MB, written in {told['seconds']:.1f} s"]
+    lines = [told["verdict"].replace("`", "")] if "verdict" in told else []
+    lines += [f"{told['path']}: {told['bytes'] / 1e6:.1f} MB, written in {told['seconds']:.1f} s"]
     lines += [f"missing: {line}" for line in told["missing"]]
     tell(command, told, "\n".join(lines))
 

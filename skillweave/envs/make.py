@@ -18,6 +18,7 @@ from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, random_actions
+from skillweave.envs.obs_names import ObsNames, checked_names, names_in
 from skillweave.envs.pool import MakePool, envpool
 from skillweave.messages import close_matches, short, shortened, told, whole_number
 from skillweave.types import MissingExtra, SkillweaveError
@@ -58,6 +59,8 @@ class EnvSpec:
             for each core if a step takes long enough to be worth it. The run keeps the choice, as
             results depend on it. The members of a population are split among them; None: they stay
             in one.
+        obs_names: what the numbers of an observation are called in reports: a name for each, or for
+            a Dict such lists by key. None: those of the environment's attribute ``obs_names``.
 
     Raises:
         SkillweaveError: a field is of another kind, or fields do not fit each other; the message
@@ -70,6 +73,8 @@ class EnvSpec:
     engine: EngineName = "auto"
     workers: int | None = None
     pool: MakePool | None = None
+    # What numbers are called makes no other environment.
+    obs_names: ObsNames | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         made = isinstance(self.env, gym.Env)
@@ -95,6 +100,7 @@ class EnvSpec:
             )
         if self.workers is not None:
             whole_number(self.workers, f"{self.name}: workers", 1)
+        checked_names(self.obs_names, self.name)
         if self.engine not in get_args(EngineName):
             known = ", ".join(get_args(EngineName))
             raise SkillweaveError(
@@ -156,6 +162,21 @@ class EnvSpec:
         except (gym.error.Error, ImportError) as error:
             why, near = shortened(str(error)).rstrip("."), close_matches(env_id, gym.registry)
             raise SkillweaveError(f"no environment {short(env_id)}: {why}.{near}") from error
+
+    def observation_names(self) -> ObsNames | None:
+        """Return the names of an observation's numbers; None: they have none.
+
+        They are ``obs_names``, or else what the environment's own attribute ``obs_names`` says, or
+        what Gymnasium documents of its own environments.
+        """
+        if self.obs_names is not None:
+            return self.obs_names
+        env = self.make()
+        try:
+            plain = isinstance(self.env, str) and not self.wrappers
+            return names_in(env, str(self.env) if plain else None)
+        finally:
+            env.close()
 
     @property
     def name(self) -> str:

@@ -12,7 +12,8 @@ from urllib.parse import quote
 
 from skillweave.reporting.report.curves import reached_steps, read_curves
 from skillweave.reporting.report.facts import facts, plain, settings, stage_rows
-from skillweave.reporting.report.skills_table import WHY, percent, skill_rows
+from skillweave.reporting.report.numbers import percent
+from skillweave.reporting.report.skills_table import WHY, skill_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import public
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation

@@ -241,11 +241,19 @@ class Reflex:
         Raises:
             SkillweaveError: what it answers is not what was asked for; the message names it.
         """
-        holds = answer(self.condition, obs, len(obs), bool, self._who, "condition")
+        holds = self.holds(obs)
         if holds.any():
             action = action.copy()
             action[holds] = self._actions(obs[holds], space)
         return action, holds
+
+    def holds(self, obs: Array) -> Array:
+        """Evaluate its condition: ``obs`` (N, *obs_shape) to (N,) bool.
+
+        Raises:
+            SkillweaveError: the condition returned something else; the message names it.
+        """
+        return answer(self.condition, obs, len(obs), bool, self._who, "condition")
 
     def fixed(self, space: Space[Any]) -> Array:
         """Its action, where that is no function, as one of ``space``; (...)."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
+from skillweave.envs.infos import told_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.messages import whole_number
 from skillweave.notebooks import joined, paragraph, table
@@ -22,8 +23,9 @@ from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
+from skillweave.training.reflex_tally import ReflexTally
 from skillweave.training.skill_report import SkillReport, SkillTally, all_steps
-from skillweave.training.skill_text import hints, skill_rows, skill_table
+from skillweave.training.skill_text import hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
@@ -45,6 +47,10 @@ class Evaluation:
     threshold: float | None  # the environment's reward_threshold
     skills: dict[str, SkillReport] = field(default_factory=dict)  # none: a plain agent
     cut: Count = 0  # episodes that nothing had ended when they were cut
+    succeeded: Count | None = None
+    """Episodes that succeeded by ``info["success"]`` of their last step; None: it is not there."""
+    reflexes: dict[str, Count] = field(default_factory=dict)
+    """Steps in which each reflex acted, by its path."""
 
     def __post_init__(self) -> None:
         if not self.returns or len(self.returns) != len(self.lengths):
@@ -75,6 +81,11 @@ class Evaluation:
             return None
         return float(np.mean(np.array(self.returns) >= self.threshold))
 
+    @property
+    def success_rate(self) -> float | None:
+        """Share of episodes that succeeded; None: the environment does not say."""
+        return None if self.succeeded is None else self.succeeded / len(self.returns)
+
     def to_json(self) -> dict[str, Any]:
         """The summary as plain JSON."""
         returns = np.array(self.returns)
@@ -94,17 +105,23 @@ class Evaluation:
             "max": float(returns.max()),
             "threshold": self.threshold,
             "solved_fraction": self.solved_fraction,
+            "success_rate": self.success_rate,
             "length_mean": float(np.mean(self.lengths)),
             "cut": self.cut,
             "skill_usage": {k: v["share"] for k, v in skills.items()},
             "call_length_mean": {k: v["length_mean"] for k, v in skills.items() if v["calls"]},
             "skills": skills,
+            "reflexes": {
+                name: {"steps": steps, "share": steps / sum(self.lengths)}
+                for name, steps in self.reflexes.items()
+            },
         }
 
     def for_people(self) -> str:
         """``str()``, and for a hierarchy a table of its skills, and what looks like a mistake."""
         skills = [skill_table(self.skills)] if self.skills else []
-        return "\n".join([str(self), *skills, *hints(self.skills)])
+        reflexes = reflex_lines(self.reflexes, sum(self.lengths))
+        return "\n".join([str(self), *skills, *reflexes, *hints(self.skills)])
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -113,7 +130,8 @@ class Evaluation:
         """Return the same as ``for_people``, for notebooks."""
         head, *rows = skill_rows(self.skills)
         parts = [table(head, rows)] if rows else []
-        return joined([paragraph(self), *parts, *map(paragraph, hints(self.skills))])
+        told = [*reflex_lines(self.reflexes, sum(self.lengths)), *hints(self.skills)]
+        return joined([paragraph(self), *parts, *map(paragraph, told)])
 
     def __str__(self) -> str:
         j = self.to_json()
@@ -124,6 +142,8 @@ class Evaluation:
         line = f"{mean} ± {std} over {j['episodes']} episodes (95 % CI {low} to {high}, IQM {iqm})"
         if j["solved_fraction"] is not None:
             line += f", {j['solved_fraction']:.0%} at {self.threshold:g} or more"
+        if self.success_rate is not None:
+            line += f", {self.success_rate:.0%} succeed"
         line += f", {j['length_mean']:.0f} steps an episode"
         if self.cut:
             line += f"; {self.cut} never ended and were cut after {max(self.lengths):,} steps"
@@ -233,15 +253,28 @@ def _scored(
 ) -> Evaluation:
     """The scores of episodes as they are played."""
     returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
-    tally = SkillTally(policy, episodes)
+    tally, reflexes = SkillTally(policy, episodes), ReflexTally(policy)
+    success = np.full(episodes, np.nan)
     for played in moments:
         returns[played.episode] += played.reward
         lengths[played.episode] += played.lasted
         cut += int(played.cut.sum())
         tally.add(played)
+        reflexes.add(played)
+        told = told_success(played.step.info, len(played.rows))
+        if told is not None:
+            success[played.episode[played.over]] = told[played.over]
         if watch is not None:
             watch(played)
-    return Evaluation(tuple(returns.tolist()), tuple(lengths.tolist()), None, tally.reports(), cut)
+    return Evaluation(
+        tuple(returns.tolist()),
+        tuple(lengths.tolist()),
+        None,
+        tally.reports(),
+        cut,
+        None if np.isnan(success).any() else int(success.sum()),
+        reflexes.steps(),
+    )
 
 
 def _check_spaces(policy: Policy, observation: Any, action: Any, name: str) -> None:

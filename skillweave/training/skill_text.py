@@ -51,6 +51,14 @@ def hints(skills: Mapping[str, SkillReport]) -> list[str]:
     return [*idle_calls(skills), *late_calls(skills), *hasty_calls(skills)]
 
 
+def reflex_lines(reflexes: Mapping[str, int], total: int) -> list[str]:
+    """A line for each reflex: in how many of ``total`` steps it acted."""
+    return [
+        f"reflex {name} acted in {steps:,} of {total:,} steps ({steps / total:.1%})"
+        for name, steps in reflexes.items()
+    ]
+
+
 def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
     """A sentence about each skill most of whose calls are idle, while the others take time.
 

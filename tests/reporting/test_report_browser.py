@@ -203,8 +203,8 @@ def test_an_episode_without_film_is_told_and_the_film_stays(film: Any) -> None:
 
 def test_charts_follow_what_is_chosen(browser: Any, pages: dict[str, Path]) -> None:
     page = Opened(browser, pages["evolved"]).page
-    page.select_option("#up", label="obs[2]")
-    page.wait_for_function("document.getElementById('choices').textContent.includes('obs[2]')")
+    page.select_option("#up", label="pole angle")
+    page.wait_for_function("document.getElementById('choices').textContent.includes('pole angle')")
     page.select_option("#hue", "success")
     page.wait_for_function("document.getElementById('choices').textContent.includes('no success')")
     page.locator("#curve-2 svg").scroll_into_view_if_needed()

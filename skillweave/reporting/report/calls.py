@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from skillweave.envs.obs_names import ObsNames
 from skillweave.reporting.report.film import Film
-from skillweave.training.call_log import CallLog, EpisodeLog
+from skillweave.training.call_log import Call, CallLog, EpisodeLog
 from skillweave.types import Array
 
 MOST_COORDINATES = 16
@@ -24,10 +25,15 @@ def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
     return [int(i) for i in order[places]]
 
 
-def episode_data(log: CallLog, film: Film | None) -> tuple[list[dict[str, Any]], list[str]]:
+def episode_data(
+    log: CallLog, film: Film | None, named: ObsNames | None = None
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Each episode with its calls, and sentences on what is left out.
 
     Those in the film come first, in its order.
+
+    Args:
+        named: names of an observation's numbers; with them, each call has what was observed.
     """
     first = {} if film is None else film.first
     numbers = [*first, *(i for i in range(len(log.episodes)) if i not in first)]
@@ -40,7 +46,7 @@ def episode_data(log: CallLog, film: Film | None) -> tuple[list[dict[str, Any]],
         if part > left and shown:
             continue
         left -= part
-        shown.append(_episode(log.episodes[i], i, first.get(i)))
+        shown.append(_episode(log.episodes[i], i, first.get(i), named))
         if part < count:
             missing.append(f"Of the {count:,} calls of episode {i + 1}, {part:,} are shown.")
     if len(shown) < len(numbers):
@@ -50,25 +56,53 @@ def episode_data(log: CallLog, film: Film | None) -> tuple[list[dict[str, Any]],
     return shown, missing
 
 
-def _episode(episode: EpisodeLog, number: int, first: int | None) -> dict[str, Any]:
-    totals = np.cumsum(episode.rewards).round(2).tolist() if first is not None else []
+def _episode(
+    episode: EpisodeLog, number: int, first: int | None, named: ObsNames | None
+) -> dict[str, Any]:
+    sums = np.cumsum(episode.rewards, dtype=np.float64) if first is not None else ()
+    totals = [rounded(total) for total in sums]
     calls = [
         [
-            c.skill, c.start, c.steps, c.why, round(c.reward, 2),
-            None if c.own is None else round(c.own, 2), c.succeeded,
+            c.skill, c.start, c.steps, c.why, rounded(c.reward),
+            None if c.own is None else rounded(c.own), c.succeeded,
         ]
         for c in episode.calls[:MOST_CALLS_OF_ONE]
     ]  # fmt: skip
     told: dict[str, Any] = {
         "number": number + 1,
         "seed": episode.seed,
-        "return": round(episode.total, 2),
+        "return": rounded(episode.total),
     }
     told |= {"steps": len(episode.rewards), "cut": episode.cut, "frame": first}
+    _, observed = seen(episode.calls[:MOST_CALLS_OF_ONE], named)
+    told |= {"seen": observed} if observed else {}
     return told | {"totals": totals, "calls": calls}
 
 
-def decision_data(log: CallLog) -> dict[str, Any]:
+def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
+    """Return a sentence on names that do not fit observations (n, …); None: they do."""
+    if names is None:
+        return None
+    if isinstance(names, Mapping) != (obs.dtype.names is not None):
+        kind = "a Dict" if obs.dtype.names is not None else "no Dict"
+        return f"obs_names is not used: an observation is {kind}, and the names are not for one."
+    keys = obs.dtype.names or ()
+    parts = {k: obs[k] for k in keys} if isinstance(names, Mapping) else {"": obs}
+    named = names if isinstance(names, Mapping) else {"": names}
+    for key, own in named.items():
+        where = f" of {key!r}" if key else ""
+        if key not in parts:
+            return f"obs_names is not used{where}: an observation has no such key."
+        count = int(np.prod(parts[key].shape[1:]))
+        if len(own) != count:
+            return (
+                f"obs_names is not used{where}: it has {len(own):,} names, and an observation "
+                f"{count:,} numbers."
+            )
+    return None
+
+
+def decision_data(log: CallLog, named: ObsNames | None = None) -> dict[str, Any]:
     """What was chosen at which observation: names of coordinates, and a row for each decision.
 
     A row is the coordinates, then the skill, then whether its call succeeded (None: not known).
@@ -77,30 +111,57 @@ def decision_data(log: CallLog) -> dict[str, Any]:
     calls = [call for episode in log.episodes for call in episode.calls]
     every = -(-len(calls) // MOST_DECISIONS)
     calls = calls[::every]
-    columns = coordinates(np.stack([call.obs for call in calls]))
+    columns = coordinates(np.stack([call.obs for call in calls]), named)
     columns = dict([(k, v) for k, v in columns.items() if np.ptp(v) > 0][:MOST_COORDINATES])
     if columns:
         columns["step of the episode"] = np.array([float(call.start) for call in calls])
     table = [
-        [*(float(f"{v[i]:.5g}") for v in columns.values()), call.skill, call.succeeded]
+        [*(rounded(v[i]) for v in columns.values()), call.skill, call.succeeded]
         for i, call in enumerate(calls)
     ]
     return {"names": list(columns), "rows": table if columns else [], "every": every}
 
 
-def coordinates(obs: Array) -> dict[str, Array]:
-    """The numbers of a batch of observations by name, (n,) each; none where they are images."""
+def seen(calls: Sequence[Call], named: ObsNames | None) -> tuple[list[str], list[list[float]]]:
+    """Return the named numbers of what was observed when calls began, and their values of each.
+
+    There are none where observations have no names, or more than the page has room for.
+    """
+    if named is None or not calls:
+        return [], []
+    columns = coordinates(np.stack([call.obs for call in calls]), named)
+    columns = {name: v for name, v in columns.items() if not name.startswith("obs[")}
+    columns = {} if len(columns) > MOST_COORDINATES else columns
+    rows = [[rounded(v[i]) for v in columns.values()] for i in range(len(calls))]
+    return list(columns), rows if columns else []
+
+
+def rounded(value: float) -> float:
+    """Return a number as the page's data hold it: five significant digits."""
+    return float(f"{value:.5g}")
+
+
+def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
+    """The numbers of a batch of observations by name, (n,) each; none where they are images.
+
+    Args:
+        names: what they are called, where these are as many; see ``names_misfit``.
+    """
+    named = names if isinstance(names, Mapping) else {}
     if obs.dtype.names is not None:
-        parts = [(f'obs["{name}"]', obs[name]) for name in obs.dtype.names]
+        keys = obs.dtype.names
+        parts = [(f'obs["{key}"]', obs[key], named.get(key)) for key in keys]
     else:
-        parts = [("obs", obs)]
+        parts = [("obs", obs, None if isinstance(names, Mapping) else names)]
     found: dict[str, Array] = {}
-    for name, part in parts:
+    for name, part, own in parts:
         if part.dtype.names is not None:
             continue  # a Dict in a Dict
         flat = np.asarray(part).reshape(len(part), -1)
         if flat.shape[1] <= LARGEST_VECTOR:
             alone = part.ndim == 1
             for i in range(flat.shape[1]):
-                found[name if alone else f"{name}[{i}]"] = flat[:, i].astype(float)
+                usual = name if alone else f"{name}[{i}]"
+                told = own[i] if own is not None and len(own) == flat.shape[1] else usual
+                found[usual if told in found else told] = flat[:, i].astype(float)
     return {k: v for k, v in found.items() if np.isfinite(v).all()}

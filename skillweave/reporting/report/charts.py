@@ -59,7 +59,7 @@ def curve(label: str, color: str) -> Spec:
     own = {"value": color}
     told = [
         {"field": "x", "type": "quantitative", "title": STEPS, "format": ",d"},
-        {"field": "y", "type": "quantitative", "title": "value", "format": ",.4~g"},
+        {"field": "y", "type": "quantitative", "title": "value", "format": ",.4~r"},
     ]
     mark = {"type": "line", "strokeWidth": 2, "strokeJoin": "round", "aria": False}
     layers = [{"mark": mark, "encoding": {"color": own}}, *hover(told, own)]
@@ -77,8 +77,8 @@ def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
         "x": number_axis("x", "", axis={"tickCount": 8}), "y": number_axis("y", ""),
         "color": {"field": "what", "type": "nominal", "scale": scale, "legend": legend},
         "shape": {"field": "what", "type": "nominal", "scale": shape},
-        "tooltip": [{"field": "what", "title": "chosen"}, {"field": "x", "format": ".4~g"},
-                    {"field": "y", "format": ".4~g"}],
+        "tooltip": [{"field": "what", "title": "chosen"}, {"field": "x", "format": ",.4~r"},
+                    {"field": "y", "format": ",.4~r"}],
     }  # fmt: skip
     mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}
     return chart("What the selector chose over two coordinates", 360, mark=mark, encoding=encoding)
@@ -112,7 +112,7 @@ def family_tree(lineage: Lineage, color: str) -> Spec:
     tooltip = [
         {"field": "member"},
         {"field": "x", "title": "generation"},
-        {"field": "y", "title": "fitness", "format": ",.1f"},
+        {"field": "y", "title": "fitness", "format": ",.4~r"},
         {"field": "how", "title": "changed"},
     ]
     joined = {"x": x, "y": y, "x2": {"field": "x2"}, "y2": {"field": "y2"}, "color": hue}

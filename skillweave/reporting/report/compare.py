@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,11 @@ from skillweave.reporting.palette import color_of
 from skillweave.reporting.report import charts, facts, group_charts
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
 from skillweave.reporting.report.groups import Group, differences, grouped
+from skillweave.reporting.report.numbers import NOTHING, number, percent, scale_of
 from skillweave.reporting.report.page import library, write_page
 from skillweave.reporting.report.seeds import OverSeeds, on_one_grid, over_seeds
-from skillweave.reporting.report.skills_table import (
-    NOTHING,
-    number,
-    percent,
-    transition_rows,
-    transitions,
-)
+from skillweave.reporting.report.skills_table import transition_rows, transitions
+from skillweave.reporting.report.verdict import is_binary, solved
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
@@ -53,15 +50,17 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     everything = [c for own in told.values() for c in own]
     data = {"curves": curves, "metrics": metrics_of(everything), "charts": {}}
     scores = [_scores(group, saved) for group in groups]
+    say = _sayer(saved)
     if any(scores):
-        data["charts"] = {
-            "scores-chart": group_charts.scores(keys, colors, _score_rows(groups, saved, scores))
-        }
+        rows = _score_rows(groups, saved, scores)
+        binary = say is percent
+        data["charts"] = {"scores-chart": group_charts.scores(keys, colors, rows, binary)}
     missing = _missing(runs, saved)
     differ = differences(groups)
     context = {
         "title": f"Comparison of {len(runs)} runs",
-        "groups": [_group_words(g, s) for g, s in zip(groups, scores, strict=True)],
+        "groups": [_group_words(g, s, say) for g, s in zip(groups, scores, strict=True)],
+        "binary": say is percent,
         "legend": [(g.key, g.name, c) for g, c in zip(groups, colors, strict=True)],
         "has_scores": any(scores),
         "skills": [
@@ -69,7 +68,7 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
             for g in groups
             if (own := _skill_rows(g, saved))
         ],
-        "runs": [_run_row(g, run, saved[run.path]) for g in groups for run in g.runs],
+        "runs": [_run_row(g, run, saved[run.path], say) for g in groups for run in g.runs],
         "differences": differ[:MOST_DIFFERENCES],
         "more_differences": max(0, len(differ) - MOST_DIFFERENCES),
         "curves": [c["label"] for c in curves],
@@ -81,6 +80,16 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
 
 
 Saved = dict[Path, SavedEvaluation | None]
+Say = Callable[[float | None], str]
+"""Write a return for people."""
+
+
+def _sayer(saved: Saved) -> Say:
+    """Return how returns are written: as percent where all are 0 or 1, else to one scale."""
+    returns = [r for e in saved.values() if e is not None for r in e.evaluation.returns]
+    if returns and is_binary(returns):
+        return percent
+    return functools.partial(number, scale=scale_of(returns))
 
 
 def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
@@ -112,7 +121,7 @@ def _scores(group: Group, saved: Saved) -> list[float]:
     return [e.evaluation.mean for run in group.runs if (e := saved[run.path]) is not None]
 
 
-def _group_words(group: Group, scores: list[float]) -> dict[str, Any]:
+def _group_words(group: Group, scores: list[float], say: Say) -> dict[str, Any]:
     seeds = ", ".join(str(run.manifest["seed"]) for run in group.runs)
     words: dict[str, Any] = {
         "key": group.key,
@@ -123,14 +132,14 @@ def _group_words(group: Group, scores: list[float]) -> dict[str, Any]:
     if not scores:
         return words | {"iqm": None}
     found = over_seeds(np.array(scores))
-    return words | {"iqm": number(float(found.mean)), "interval": interval(found)}
+    return words | {"iqm": say(float(found.mean)), "interval": interval(found, say)}
 
 
-def interval(found: OverSeeds) -> str:
+def interval(found: OverSeeds, say: Say = number) -> str:
     """An interval in words."""
     if found.low is None or found.high is None:
         return "one seed: no interval"
-    return f"{number(float(found.low))} to {number(float(found.high))}"
+    return f"{say(float(found.low))} to {say(float(found.high))}"
 
 
 def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) -> dict[str, Any]:
@@ -179,17 +188,21 @@ def _followed(group: Group, saved: Saved) -> list[dict[str, Any]]:
     return transition_rows(list(reports[0]), rows)
 
 
-def _told(values: Sequence[float | None], say: Any) -> str:
+def _told(values: Sequence[float | None], say: Say) -> str:
     known = [v for v in values if v is not None]
     if not known:
         return NOTHING
+    if say is number:
+        say = functools.partial(number, scale=scale_of(known))
     found = over_seeds(np.array(known))
     if found.low is None or found.high is None:
         return str(say(float(found.mean)))
     return f"{say(float(found.mean))} ({say(float(found.low))} to {say(float(found.high))})"
 
 
-def _run_row(group: Group, run: RunDirectory, saved: SavedEvaluation | None) -> dict[str, str]:
+def _run_row(
+    group: Group, run: RunDirectory, saved: SavedEvaluation | None, say: Say
+) -> dict[str, str]:
     told = None if saved is None else saved.evaluation.to_json()
     stages = run.manifest["stages"]
     return {
@@ -199,12 +212,22 @@ def _run_row(group: Group, run: RunDirectory, saved: SavedEvaluation | None) -> 
         "status": "finished" if run.finished else "not finished",
         "steps": f"{sum(s.get('steps', 0) for s in stages):,}",
         "seconds": f"{sum(s.get('seconds', 0.0) for s in stages):,.0f}",
-        "mean": number(None if told is None else told["mean"]),
-        "iqm": number(None if told is None else told["iqm"]),
-        "solved": percent(None if told is None else told["solved_fraction"]),
+        "mean": say(None if told is None else told["mean"]),
+        "iqm": say(None if told is None else told["iqm"]),
+        "solved": percent(_solved(saved)),
         "length": number(None if told is None else told["length_mean"]),
         "episodes": NOTHING if told is None else str(told["episodes"]),
     }
+
+
+def _solved(saved: SavedEvaluation | None) -> float | None:
+    """The share of episodes that are solved, or else at the environment's threshold."""
+    if saved is None:
+        return None
+    count = solved(saved.evaluation)
+    if count is None:
+        return saved.evaluation.solved_fraction
+    return count / len(saved.evaluation.returns)
 
 
 def _curves(

@@ -14,22 +14,30 @@ def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str,
     return {"field": field, "type": "nominal", "scale": scale, "legend": None}
 
 
-def scores(names: Sequence[str], colors: Sequence[str], rows: dict[str, Any]) -> Spec:
-    """A dot for each run; of each group the interquartile mean and its interval."""
+def scores(
+    names: Sequence[str], colors: Sequence[str], rows: dict[str, Any], binary: bool = False
+) -> Spec:
+    """A dot for each run; of each group the interquartile mean and its interval.
+
+    Args:
+        binary: returns are 0 or 1, so that their mean is the share of episodes that are solved.
+    """
+    what, form = ("episodes solved", ".0%") if binary else ("mean return", ",.4~r")
     y = {"field": "group", "type": "nominal", "title": None, "sort": list(names),
          "axis": {"labelFontSize": 14, "labelFontWeight": "bold"}}  # fmt: skip
     color = _color("group", names, colors)
-    x = number_axis("x", "mean return of a run", axis={"tickCount": 8})
+    axis: dict[str, Any] = {"tickCount": 8} | ({"format": "%"} if binary else {})
+    x = number_axis("x", f"{what} of a run", axis=axis)
     told = [
         {"field": "group"},
-        {"field": "x", "title": "interquartile mean", "format": ",.1f"},
-        {"field": "low", "title": "from", "format": ",.1f"},
-        {"field": "high", "title": "to", "format": ",.1f"},
+        {"field": "x", "title": "interquartile mean", "format": form},
+        {"field": "low", "title": "from", "format": form},
+        {"field": "high", "title": "to", "format": form},
     ]
     run = [
         {"field": "group"},
         {"field": "seed"},
-        {"field": "x", "title": "mean return", "format": ",.1f"},
+        {"field": "x", "title": what, "format": form},
     ]
     between = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
     layer: list[Spec] = [
@@ -55,9 +63,9 @@ def group_curves(label: str, names: Sequence[str], colors: Sequence[str]) -> Spe
     told = [
         {"field": "what", "title": "group"},
         {"field": "x", "title": STEPS, "format": ",d"},
-        {"field": "y", "title": "value", "format": ",.4~g"},
-        {"field": "lo", "title": "from", "format": ",.4~g"},
-        {"field": "hi", "title": "to", "format": ",.4~g"},
+        {"field": "y", "title": "value", "format": ",.4~r"},
+        {"field": "lo", "title": "from", "format": ",.4~r"},
+        {"field": "hi", "title": "to", "format": ",.4~r"},
     ]
     band = {"type": "area", "opacity": 0.2, "aria": False, "tooltip": False}
     line = {"type": "line", "strokeWidth": 2, "aria": False}

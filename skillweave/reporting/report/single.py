@@ -10,6 +10,7 @@ from typing import Any
 
 from skillweave.envs.checks import LONGEST_FILM
 from skillweave.envs.make import EnvSpec
+from skillweave.envs.obs_names import ObsNames
 from skillweave.messages import whole_number
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.palette import RGB, color_of
@@ -18,6 +19,8 @@ from skillweave.reporting.report.calls import (
     chosen_episodes,
     decision_data,
     episode_data,
+    names_misfit,
+    seen,
 )
 from skillweave.reporting.report.curves import (
     Curves,
@@ -27,15 +30,17 @@ from skillweave.reporting.report.curves import (
     thinned,
 )
 from skillweave.reporting.report.film import Film, make_film
+from skillweave.reporting.report.numbers import number, percent, scale_of, share_interval
 from skillweave.reporting.report.page import library, write_page
 from skillweave.reporting.report.skills_table import (
     WHY,
-    number,
-    percent,
+    about,
+    reflex_rows,
     skill_rows,
     transition_rows,
     transitions,
 )
+from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.skills.base import RecordedSkill
@@ -62,6 +67,10 @@ class Played:
     """Sentences on what there is not."""
     colors: list[RGB]
     """Of each of the log's labels."""
+    docs: list[str]
+    """What the docstrings of the log's skills say."""
+    named: ObsNames | None
+    """Names of the numbers in an observation."""
 
 
 def play_episodes(
@@ -85,8 +94,12 @@ def play_episodes(
     wanted = [skill.color for skill in log.skills]
     wanted += [None] * (len(log.labels) - len(wanted))
     colors = [color_of(i, color) for i, color in enumerate(wanted)]
-    shown, left_out = episode_data(log, film)
-    return Played(score, log, film, shown, missing + left_out, colors)
+    named = spec.observation_names()
+    if misfit := names_misfit(log.episodes[0].calls[0].obs[None], named):
+        missing.append(misfit)
+    shown, left_out = episode_data(log, film, named)
+    docs = [about(skill) for skill in log.skills]
+    return Played(score, log, film, shown, missing + left_out, colors, docs, named)
 
 
 def write_report(
@@ -112,7 +125,8 @@ def write_report(
         deterministic: act greedily, else sample.
 
     Returns:
-        ``path``, ``bytes``, ``seconds``, and ``missing``: sentences on what is not in it.
+        ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
+        ``missing``: sentences on what is not in it.
 
     Raises:
         SkillweaveError: the run is damaged, or the file cannot be written.
@@ -146,8 +160,10 @@ def write_report(
         context |= _skills(played)
         data |= _episodes(played)
     film = None if played is None else played.film
-    told = write_page(path, "report.html", context, {**data, "why": WHY}, film)
-    return told | {"seconds": round(time.perf_counter() - began, 2), "missing": missing}
+    data |= {"why": WHY, "binary": context["binary"]}
+    told = write_page(path, "report.html", context, data, film)
+    told |= {"seconds": round(time.perf_counter() - began, 2)}
+    return told | {"verdict": context["verdict"], "missing": missing}
 
 
 def _sentence(error: SkillweaveError) -> str:
@@ -209,28 +225,49 @@ def _scores(
         score = saved.evaluation
         words = _how("of the run's evaluation", saved.seed, saved.deterministic)
     if score is None:
-        return {"score": None, "skill_table": [], "transitions": []}
-    told = score.to_json()
+        text = no_verdict(run.manifest["stages"])
+        nothing = {"score": None, "skill_table": [], "reflexes": [], "transitions": []}
+        return nothing | {"verdict": text, "binary": False}
+    docs = {} if played is None else dict(zip(played.log.labels, played.docs, strict=False))
     return {
-        "score": {
-            "mean": number(told["mean"]),
-            "low": number(told["ci95"][0]),
-            "high": number(told["ci95"][1]),
-            "iqm": number(told["iqm"]),
-            "range": f"{number(told['min'])} to {number(told['max'])}",
-            "solved": percent(told["solved_fraction"]),
-            "threshold": None if score.threshold is None else f"{score.threshold:g}",
-            "length": number(told["length_mean"]),
-            "cut": told["cut"],
-            "of": f"{told['episodes']} episodes {words}",
-        },
-        "skill_table": skill_rows(score.skills),
+        "verdict": verdict(score, deterministic),
+        "binary": is_binary(score.returns),
+        "score": score_words(score) | {"of": f"{len(score.returns)} episodes {words}"},
+        "skill_table": [
+            row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills)
+        ],
+        "reflexes": reflex_rows(score.reflexes, sum(score.lengths)),
         "transitions": [
             (path, transition_rows(list(own), counts))
             for path, own in levels_of(score.skills).items()
             if (counts := transitions(own)) is not None
         ],
     }
+
+
+def score_words(score: Evaluation) -> dict[str, Any]:
+    """Return the score as texts; digits fit the scale of the returns."""
+    told = score.to_json()
+    scale = scale_of(score.returns)
+    low, high = (number(value, scale) for value in told["ci95"])
+    count = solved(score)
+    words: dict[str, Any] = {
+        "mean": number(told["mean"], scale),
+        "interval": None if len(score.returns) == 1 else f"{low} to {high}",
+        "iqm": number(told["iqm"], scale),
+        "range": f"{number(told['min'], scale)} to {number(told['max'], scale)}",
+        "reached": percent(told["solved_fraction"]),
+        "threshold": None if score.threshold is None else f"{score.threshold:g}",
+        "length": number(told["length_mean"], max(told["length_mean"], 10)),
+        "cut": told["cut"],
+        "binary": is_binary(score.returns),
+        "solved": None,
+    }
+    if count is None:
+        return words
+    low, high = map(percent, share_interval(count, len(score.returns)))
+    share = percent(count / len(score.returns))
+    return words | {"solved": share, "solved_interval": f"{low} to {high}"}
 
 
 def _how(whose: str, seed: int, deterministic: bool) -> str:
@@ -249,8 +286,9 @@ def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
         data["trees"].append(
             {"tree": charts.family_tree(lineage, color), "paths": [spec for _, spec in paths]}
         )
+        scale = scale_of(b.fitness for b in lineage.born.values())
         line = [
-            (b.generation + 1, b.member, charts.what_changed(b), number(b.fitness))
+            (b.generation + 1, b.member, charts.what_changed(b), number(b.fitness, scale))
             for b in lineage.path(lineage.winner)
         ]
         names = [
@@ -283,10 +321,11 @@ def _episodes(played: Played) -> dict[str, Any]:
         "inks": [charts.ink_on(c) for c in played.colors],
         "episodes": played.shown,
     }
+    found["seen"], _ = seen(log.episodes[0].calls[:1], played.named)
     if played.film is not None:
         found["film"] = {"fps": played.film.fps, "every": played.film.every}
     if log.labels != (AGENT,):
-        decisions = decision_data(log)
+        decisions = decision_data(log, played.named)
         used = sorted({row[-2] for row in decisions["rows"]})
         names = [log.labels[i] for i in used]
         decisions["spec"] = charts.choices(names, [colors[i] for i in used])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from skillweave.reporting.report.numbers import number, percent, scale_of
+from skillweave.skills import Skill
 from skillweave.training.skill_report import SkillReport, all_steps
 
 WHY = {
@@ -14,12 +17,12 @@ WHY = {
     "episode": "with the episode",
 }
 """Why a call ended, as the page says it."""
-NOTHING = "–"
 
 
 def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
     """A row for each skill."""
     total = all_steps(reports)
+    longest = max(scale_of(report.length_mean for report in reports.values()), 10)
     rows = []
     for name, report in reports.items():
         calls = report.calls
@@ -27,13 +30,35 @@ def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
         rows.append({
             "name": name,
             "share": report.steps / total if total else 0.0,
+            "percent": percent(report.steps / total if total else 0.0),
             "calls": f"{calls:,}",
-            "length": number(report.length_mean),
+            "length": number(report.length_mean, longest),
             "ends": [percent(report.ended[w] / calls if known else None) for w in WHY],
             "success": percent(report.success_rate),
             "return": number(report.return_mean),
         })  # fmt: skip
     return rows
+
+
+def about(skill: Skill) -> str:
+    """Return the first paragraph of a skill's docstring; empty where it has none."""
+    for kind in type(skill).__mro__[: type(skill).__mro__.index(Skill)]:
+        if text := inspect.cleandoc(kind.__doc__ or ""):
+            return " ".join(text.split("\n\n")[0].split()).replace("``", "`")
+    return ""
+
+
+def reflex_rows(reflexes: Mapping[str, int], total: int) -> list[dict[str, Any]]:
+    """Return a row for each reflex: in how many of ``total`` steps it acted."""
+    return [
+        {
+            "name": name,
+            "steps": f"{steps:,}",
+            "share": steps / total,
+            "percent": percent(steps / total),
+        }
+        for name, steps in reflexes.items()
+    ]
 
 
 def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
@@ -58,16 +83,10 @@ def transition_rows(
     rows = []
     for name, row in zip(("start of an episode", *labels), counts, strict=True):
         total = sum(row)
-        cells = [{"count": f"{n:,.0f}", "share": n / total if total else 0.0} for n in row]
+        shares = [n / total if total else 0.0 for n in row]
+        cells = [
+            {"count": f"{n:,.0f}", "share": share, "percent": percent(share)}
+            for n, share in zip(row, shares, strict=True)
+        ]
         rows.append({"name": name, "total": total, "cells": cells})
     return rows
-
-
-def percent(value: float | None) -> str:
-    """A share: 42 %."""
-    return NOTHING if value is None else f"{100 * value:.0f} %"
-
-
-def number(value: float | None) -> str:
-    """A number with one decimal."""
-    return NOTHING if value is None else f"{round(value, 1) + 0.0:,.1f}".replace("-", "−")

@@ -9,7 +9,8 @@
     element.append(...children);
     return element;
   };
-  const signed = (x) => (x > 0 ? "+" : "") + x.toLocaleString("en", { maximumFractionDigits: 2 }).replace("-", "−");
+  const plain = (x) => x.toLocaleString("en", { maximumSignificantDigits: 4 }).replace("-", "−");
+  const signed = (x) => (x > 0 ? "+" : "") + plain(x);
 
   // Charts
 
@@ -137,12 +138,14 @@
     `call ${i + 1}: ${data.labels[skill]}, from step ${start}, ${steps} steps, ended ${data.why[why] ?? "–"}, ` +
     `reward ${signed(reward)}${succeeded === null ? "" : succeeded ? ", success" : ", no success"}`;
 
+  const result = ({ return: total }) =>
+    data.binary ? (total > 0 ? "solved" : "not solved") : `return ${signed(total)}`;
   const timeline = (episode, place) => {
     const called = nameOf(episode);
     const cut = episode.cut ? ", cut before its end" : "";
     const count = episode.calls.length === 1 ? "1 call" : `${episode.calls.length} calls`;
     const title = make("h3", { id: `episode-${place}` }, make("strong", {}, `Episode ${episode.number}`),
-      `${called ? ` (${called})` : ""}: return ${signed(episode.return)}, ${episode.steps} steps, ${count}${cut}`);
+      `${called ? ` (${called})` : ""}: ${result(episode)}, ${episode.steps} steps, ${count}${cut}`);
     const track = make("div", {
       class: "track", role: "listbox", tabindex: 0, "aria-labelledby": `episode-${place}`,
       "aria-orientation": "horizontal", style: `width:${(100 * episode.steps) / longest[shownFirst(episode, place) ? 0 : 1]}%`,
@@ -208,6 +211,10 @@
     if (own !== null) rows.push(["Its own reward", signed(own)]);
     if (succeeded !== null) rows.push(["Success", outcome(succeeded)]);
     if (video && episode.frame === null) rows.push(["Film", "this episode is not in it"]);
+    const observed = (episode.seen?.[i] ?? []).map((x, k) => [data.seen[k], plain(x)]);
+    $("seen").hidden = !observed.length;
+    $("seen").querySelector("dl").replaceChildren(
+      ...observed.map(([k, v]) => make("div", {}, make("dt", {}, k), make("dd", {}, v))));
     $("call").replaceChildren(...rows.map(([k, v]) => make("div", {}, make("dt", {}, k), make("dd", {}, v))));
   };
 
