@@ -18,7 +18,7 @@ from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, random_actions
-from skillweave.envs.obs_names import ObsNames, checked_names, names_in
+from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
 from skillweave.messages import close_matches, short, shortened, told, whole_number
 from skillweave.types import MissingExtra, SkillweaveError
@@ -100,7 +100,7 @@ class EnvSpec:
             )
         if self.workers is not None:
             whole_number(self.workers, f"{self.name}: workers", 1)
-        checked_names(self.obs_names, self.name)
+        checked_obs_names(self.obs_names, self.name)
         if self.engine not in get_args(EngineName):
             known = ", ".join(get_args(EngineName))
             raise SkillweaveError(

@@ -29,7 +29,7 @@ GYMNASIUM: dict[str, tuple[str, ...]] = {
 """By id without its version: names of Gymnasium's own environments, from its documentation."""
 
 
-def checked_names(names: object, where: str) -> ObsNames | None:
+def checked_obs_names(names: object, where: str) -> ObsNames | None:
     """Return the names, if they are texts in a list, or such lists by key.
 
     Raises:
@@ -37,7 +37,7 @@ def checked_names(names: object, where: str) -> ObsNames | None:
     """
     if names is None:
         return None
-    parts = list(names.values()) if isinstance(names, Mapping) else [names]
+    parts: list[Any] = list(names.values()) if isinstance(names, Mapping) else [names]
     for part in parts:
         listed = isinstance(part, Sequence) and not isinstance(part, str)
         if not listed or not all(isinstance(name, str) and name for name in part):
@@ -62,5 +62,5 @@ def names_in(env: gym.Env[Any, Any], env_id: str | None) -> ObsNames | None:
     except AttributeError:
         own = None
     if own is not None:
-        return checked_names(own, type(env.unwrapped).__name__)
+        return checked_obs_names(own, type(env.unwrapped).__name__)
     return GYMNASIUM.get((env_id or "").rpartition("-v")[0])

@@ -63,7 +63,7 @@ class ReflexTally:
         """Return the steps in which each reflex acted, by its path."""
         found: dict[str, int] = {}
         for reflex, count in zip(self._reflexes, self._count, strict=True):
-            name = self._path + reflex.name
+            name = f"{self._path}{reflex.name}"
             found[name] = found.get(name, 0) + count
         for tally in self._below.values():
             found |= tally.steps()

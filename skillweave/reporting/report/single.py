@@ -226,7 +226,12 @@ def _scores(
         words = _how("of the run's evaluation", saved.seed, saved.deterministic)
     if score is None:
         text = no_verdict(run.manifest["stages"])
-        nothing = {"score": None, "skill_table": [], "reflexes": [], "transitions": []}
+        nothing: dict[str, Any] = {
+            "score": None,
+            "skill_table": [],
+            "reflexes": [],
+            "transitions": [],
+        }
         return nothing | {"verdict": text, "binary": False}
     docs = {} if played is None else dict(zip(played.log.labels, played.docs, strict=False))
     return {

@@ -58,9 +58,8 @@ def _outcome(score: Evaluation) -> str:
     if count is not None:
         if n < FEW:
             return f"Solves {count} of {n} {'episode' if n == 1 else 'episodes'}: too few to judge"
-        low, high = share_interval(count, n)
-        text = f"Solves {percent(count / n)} of {episodes}"
-        return f"{text}, so probably {percent(low)} to {percent(high)} of all"
+        least, most = map(percent, share_interval(count, n))
+        return f"Solves {percent(count / n)} of {episodes}, so probably {least} to {most} of all"
     told = score.to_json()
     mean = number(score.mean, scale_of(score.returns))
     if n < FEW:
