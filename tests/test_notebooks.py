@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -179,6 +180,67 @@ def test_an_mp4_is_a_video_and_a_film_that_is_gone_is_told(tmp_path: Path) -> No
     assert f"data:video/mp4;base64,{base64.b64encode(b'film').decode()}" in film._repr_html_()
     (tmp_path / "a.mp4").unlink()
     assert "cannot be read" in film._repr_html_()
+
+
+# A notebook as a user writes one
+
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "notebook.ipynb"
+
+
+BRIEFLY = {
+    "STEPS = 120_000": """STEPS = 4_096
+from skillweave.hierarchy import select_best
+from skillweave.runs import kept
+select_best.EPISODES = kept.EPISODES = 4""",
+    "run.evaluate(50)": "run.evaluate(5)",
+    "run.render(episodes=2)": "run.render(max_steps=20)",
+}
+"""What takes long in the example, and what the test does instead."""
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Any]]:
+    """What each cell of code of the example shows, with few steps."""
+    client = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(EXAMPLE, as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells), "clear all outputs, then save"
+    for cell in notebook.cells:
+        for long, brief in BRIEFLY.items():
+            cell.source = cell.source.replace(long, brief)
+    text = "".join(cell.source for cell in notebook.cells)
+    assert all(brief in text for brief in BRIEFLY.values())
+    path = os.pathsep.join(filter(None, (str(EXAMPLE.parents[1]), os.environ.get("PYTHONPATH"))))
+    folder = str(tmp_path_factory.mktemp("notebook"))
+    running = client.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": folder}})
+    running.execute(env=os.environ | {"PYTHONPATH": path})
+    return [cell.outputs for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def test_the_example_shows_tables_and_films_and_nothing_raw(outputs: list[list[Any]]) -> None:
+    shown = [output for cell in outputs for output in cell]
+    assert {output.output_type for output in shown} == {"execute_result", "display_data"}
+    for output in shown:
+        assert "text/html" in output.data
+        assert " at 0x" not in output.data["text/plain"]
+        assert "<script" not in output.data["text/html"]
+    results = {
+        output.data["text/plain"].split()[0]: output.data["text/html"]
+        for output in shown
+        if output.output_type == "execute_result"
+    }
+    assert set(results) == {"<Hierarchy", "<Run", "<Evaluation:", "<Film"}
+    assert all("<table>" in results[k] for k in ("<Hierarchy", "<Run", "<Evaluation:"))
+    assert "data:image/gif;base64,R0lGOD" in results["<Film"]
+
+
+def test_training_in_the_example_leaves_its_last_progress(outputs: list[list[Any]]) -> None:
+    html = outputs[2][0].data["text/html"]
+    assert "<progress" in html
+    assert "done in" in html
+    assert "get_key" in html
 
 
 # Progress
