@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from skillweave.algorithms.config import DQN, PPO, SAC, TD3, OnPolicy, SelfImitationPPO
     from skillweave.algorithms.parameters import ParameterGroup
     from skillweave.algorithms.registry import register_algorithm
+    from skillweave.algorithms.schedules import Linear
     from skillweave.api import Agent, Hierarchy, Run, train_agent
     from skillweave.api.hub import from_hub
     from skillweave.api.options import make_options_env
@@ -67,6 +68,7 @@ _HOME = {
     "LastCall": "selectors",
     "Layout": "networks.stacked",
     "Lengths": "collecting.lengths",
+    "Linear": "algorithms.schedules",
     "Mutations": "evolution.config",
     "Net": "networks.net",
     "Network": "networks.config",
@@ -145,6 +147,7 @@ __all__ = [
     "LastCall",
     "Layout",
     "Lengths",
+    "Linear",
     "Mutations",
     "Net",
     "Network",

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = """
 ActingParams ActionHead Agent AgentState Algorithm Apart Array Automaton CNN DQN Encoder EnvSpec
-Evaluation Evolution Export Guide Heir Hierarchy HierarchyPolicy LastCall Layout Lengths Mutations
+Evaluation Evolution Export Guide Heir Hierarchy HierarchyPolicy LastCall Layout Lengths Linear Mutations
 Net Network OnPolicy OptionsEnv PPO ParameterGroup ParentSelection Player Policy PoolWrapper RNN
 Range Ray Reflex Report Rollout Run SAC Sample Seeds Selection SelfImitationPPO Skill
 SkillweaveError Step TD3 Together Tournament TrainDefaults Truncation adam_ clip_grad_norm_

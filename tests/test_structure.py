@@ -83,8 +83,10 @@ LEAVES: dict[str, set[str]] = {
         "algorithms.config_off_policy",
         "algorithms.config_on_policy",
     },
+    "algorithms.schedules": {"types", "messages", "arguments", "named"},
     "algorithms.config_checks": {"types", "messages", "networks.config"},
     "algorithms.config_off_policy": {
+        "algorithms.schedules",
         "types",
         "arguments",
         "named",
@@ -92,6 +94,7 @@ LEAVES: dict[str, set[str]] = {
         "algorithms.config_checks",
     },
     "algorithms.config_on_policy": {
+        "algorithms.schedules",
         "types",
         "arguments",
         "named",
@@ -107,6 +110,7 @@ LEAVES: dict[str, set[str]] = {
         "networks.config",
         "algorithms.config",
         "algorithms.config_checks",
+        "algorithms.schedules",
     },
 }
 

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.config import check_spaces
-from skillweave.algorithms.parameters import ParameterGroup, setting_number
+from skillweave.algorithms.parameters import ParameterGroup, member_setting
+from skillweave.algorithms.schedules import is_schedule
 from skillweave.experience import Report
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -86,6 +87,8 @@ class Algorithm:
     """The dataclass of tensors that it learns."""
     member_hyperparameters: ClassVar[tuple[str, ...]] = ("learning_rate", "gamma")
     """Fields of the config that each member has its own value of, and the state a tensor (P,)."""
+    follows_schedules: ClassVar[bool] = False
+    """Whether ``update`` takes its learning rate from ``rate_now``: then it may be a schedule."""
     config: Any
     layout: Layout
     acting: Layout
@@ -97,6 +100,11 @@ class Algorithm:
         self, config: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
     ) -> None:
         check_spaces(config, action_space)
+        if is_schedule(config.learning_rate) and not self.follows_schedules:
+            raise SkillweaveError(
+                f"{type(config).__name__}.learning_rate is a schedule, but {type(self).__name__} "
+                "does not follow schedules: give a number"
+            )
         self.config = config
         self.observation_space, self.action_space = observation_space, action_space
         self.obs, self.codec = obs_codec(observation_space), action_codec(action_space)
@@ -177,7 +185,7 @@ class Algorithm:
             "return_var": torch.ones(members, 1),
             "return_count": torch.full((members,), 1e-4),
             **{
-                k: torch.full((members,), setting_number(getattr(self.config, k)))
+                k: torch.full((members,), member_setting(self.config, k))
                 for k in self.member_hyperparameters
             },
         }

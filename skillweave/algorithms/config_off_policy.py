@@ -5,6 +5,7 @@ This module does not import torch; see ``config``, which has the rest.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -19,6 +20,7 @@ from skillweave.algorithms.config_checks import (
     positive,
     whole,
 )
+from skillweave.algorithms.schedules import Linear, check_rate, is_schedule
 from skillweave.arguments import checked_names
 from skillweave.networks.config import Network
 from skillweave.types import SkillweaveError
@@ -51,10 +53,11 @@ class OffPolicy:
     """How strongly priorities count; 0: not at all."""
     priority_beta: float = 0.4
     """Correction of the bias that they bring, at the start; 1 at the end of the budget."""
-    learning_rate: float = 3e-4
-    """Adam's step size, at the start."""
+    learning_rate: float | Linear | Callable[[float], float] = 3e-4
+    """Adam\'s step size, at the start; or ``Linear(start, end)``, or a function of the share of the
+    budget that remains, 1 at the start and 0 at the end, as in Stable-Baselines3."""
     learning_rate_schedule: Schedule = "constant"
-    """constant; linear: falls to 0 over the budget."""
+    """constant; linear: falls to 0 over the budget. Counts where ``learning_rate`` is a number."""
     adam_eps: float = 1e-8
     """Adam's ε."""
     gamma: float = 0.99
@@ -99,7 +102,10 @@ class OffPolicy:
         whole(self, "num_envs", "train_freq", "buffer_size", "batch_size", "n_step", "threads")
         whole(self, "action_repeat_steps")
         number(self, "gamma", "tau", "priority_alpha", "priority_beta", "action_repeat", high=1.0)
-        positive(self, "learning_rate", "adam_eps", "update_ratio")
+        check_rate(self)
+        if not is_schedule(self.learning_rate):
+            positive(self, "learning_rate")
+        positive(self, "adam_eps", "update_ratio")
         if self.max_grad_norm is not None:
             positive(self, "max_grad_norm")
         number(self, "learning_starts")
@@ -191,10 +197,11 @@ class ActorCritic(OffPolicy):
 
     update_ratio: float = 0.5
     """Gradient steps per transition collected (the update-to-data ratio)."""
-    learning_rate: float = 1e-3
-    """Adam's step size, at the start."""
+    learning_rate: float | Linear | Callable[[float], float] = 1e-3
+    """Adam\'s step size, at the start; or ``Linear(start, end)``, or a function of the share of the
+    budget that remains, 1 at the start and 0 at the end, as in Stable-Baselines3."""
     learning_rate_schedule: Schedule = "linear"
-    """constant; linear: falls to 0 over the budget."""
+    """constant; linear: falls to 0 over the budget. Counts where ``learning_rate`` is a number."""
     tau: float = 0.01
     """Share of the new weights in the target's at each target update."""
     normalize_obs: bool = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -16,6 +17,7 @@ from skillweave.algorithms.config_checks import (
     positive,
     whole,
 )
+from skillweave.algorithms.schedules import Linear, check_rate, is_schedule
 from skillweave.arguments import checked_names
 from skillweave.networks.config import Network
 
@@ -33,8 +35,9 @@ class OnPolicy:
     """Environments stepped side by side."""
     n_steps: int = 64
     """Environment steps of each environment between updates, for selectors too."""
-    learning_rate: float = 1e-3
-    """Adam's step size, at the start."""
+    learning_rate: float | Linear | Callable[[float], float] = 1e-3
+    """Adam\'s step size, at the start; or ``Linear(start, end)``, or a function of the share of the
+    budget that remains, 1 at the start and 0 at the end, as in Stable-Baselines3."""
     gamma: float = 0.995
     """Discount γ of one step."""
     normalize_obs: bool = True
@@ -53,7 +56,9 @@ class OnPolicy:
         flags(self)
         whole(self, "num_envs", "n_steps", "threads")
         number(self, "gamma", high=1.0)
-        positive(self, "learning_rate")
+        check_rate(self)
+        if not is_schedule(self.learning_rate):
+            positive(self, "learning_rate")
         one_of(self, "device", ("cpu", "cuda", "auto"))
 
 
@@ -71,7 +76,8 @@ class PPO(OnPolicy):
     update_epochs: int = 10
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
-    """constant; linear: falls to 0 over the budget; kl: follows target_kl."""
+    """constant; linear: falls to 0 over the budget; kl: follows target_kl. Counts where
+    ``learning_rate`` is a number."""
     adam_eps: float = 1e-5
     """Adam's ε."""
     gae_lambda: float = 0.95

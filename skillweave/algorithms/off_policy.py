@@ -12,6 +12,7 @@ from torch import Tensor
 
 from skillweave.algorithms.base import AgentState, Algorithm
 from skillweave.algorithms.compiled import Compiled
+from skillweave.algorithms.parameters import rate_now
 from skillweave.experience import Report, Sample
 from skillweave.networks.stacked import Views
 from skillweave.ops.distributions import mask_logits
@@ -33,6 +34,7 @@ class OffPolicyAlgorithm(Algorithm):
     """Learns from samples of a replay buffer, one gradient step at a time."""
 
     store = "replay"
+    follows_schedules = True
     member_hyperparameters: ClassVar[tuple[str, ...]] = (
         "learning_rate", "gamma", "tau", "max_grad_norm",
     )  # fmt: skip
@@ -115,9 +117,7 @@ class OffPolicyAlgorithm(Algorithm):
 
     def rate(self, state: Any, progress: float) -> Tensor:
         """The learning rate now, (P,)."""
-        rate: Tensor = state.learning_rate
-        linear = self.config.learning_rate_schedule == "linear"
-        return rate * (1.0 - progress) if linear else rate
+        return rate_now(self.config, state.learning_rate, progress)
 
     def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor) -> Tensor:
         """One gradient step on ``state.params``; the gradient's norm before clipping, (P,)."""

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from skillweave.algorithms.schedules import is_schedule, scheduled, start_rate
 from skillweave.networks.stacked import Layout
 
 
@@ -25,6 +27,18 @@ class ParameterGroup:
     """The field with the optimiser's steps: (P,), or (..., D) where parameters differ in age."""
 
 
+def rate_now(config: Any, rate: Tensor, progress: float) -> Tensor:
+    """Return the learning rate (P,) at this share of the budget.
+
+    Args:
+        rate: (P,), that of each member at the start.
+    """
+    if is_schedule(config.learning_rate):
+        return torch.full_like(rate, scheduled(config, 1.0 - progress))
+    linear = getattr(config, "learning_rate_schedule", "linear") == "linear"
+    return rate * (1.0 - progress) if linear else rate
+
+
 LARGEST = torch.finfo(torch.float32).max
 
 
@@ -34,3 +48,8 @@ def setting_number(value: float | None) -> float:
     Not infinity: in a state that is not finite something has diverged.
     """
     return LARGEST if value is None else float(value)
+
+
+def member_setting(config: Any, name: str) -> float:
+    """Return the number that a state has for a hyperparameter; of a schedule its first value."""
+    return start_rate(config) if name == "learning_rate" else setting_number(getattr(config, name))

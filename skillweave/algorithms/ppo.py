@@ -55,6 +55,7 @@ class PPOAlgorithm(Algorithm):
     """PPO on one pair of spaces. Holds no learnt state: that is in ``State``."""
 
     store = "rollout"
+    follows_schedules = True
     state_type: ClassVar[type[State]] = State
     member_hyperparameters = (
         "learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "vf_coef",

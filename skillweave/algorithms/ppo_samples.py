@@ -10,6 +10,7 @@ from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import PPO, SkillCritic
+from skillweave.algorithms.parameters import rate_now
 from skillweave.algorithms.rollouts import Cells, Samples, values_after
 from skillweave.experience import Anchor, Rollout
 from skillweave.networks.stacked import take_rows
@@ -33,9 +34,8 @@ class Terms:
     def of(cls, config: PPO, state: Any, rollout: Rollout) -> Terms:
         """Those of an update from this rollout."""
         progress = rollout.progress
-        rate, ent_coef, final = state.learning_rate, state.ent_coef, config.ent_coef_final
-        if config.learning_rate_schedule == "linear":
-            rate = rate * (1.0 - progress)
+        rate = rate_now(config, state.learning_rate, progress)
+        ent_coef, final = state.ent_coef, config.ent_coef_final
         if final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
         return cls(rate, ent_coef, rollout.anchor)

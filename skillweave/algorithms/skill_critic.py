@@ -19,7 +19,7 @@ from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
 from skillweave.algorithms.config import SkillCritic
-from skillweave.algorithms.parameters import ParameterGroup
+from skillweave.algorithms.parameters import ParameterGroup, rate_now
 from skillweave.algorithms.ppo_samples import epsilon_now
 from skillweave.algorithms.rollouts import values_after
 from skillweave.experience import Report, Rollout
@@ -39,6 +39,7 @@ class SkillCriticAlgorithm(Algorithm):
     """
 
     store = "rollout"
+    follows_schedules = True
     action_spaces = (gym.spaces.Discrete,)
 
     def __init__(
@@ -122,7 +123,8 @@ class SkillCriticAlgorithm(Algorithm):
         if cfg.deciding:
             assert batch.decided is not None
             decided = _valid(batch, batch.decided)
-        rate, loss = state.learning_rate * (1.0 - batch.progress), target.new_zeros(len(target))
+        rate = rate_now(cfg, state.learning_rate, batch.progress)
+        loss = target.new_zeros(len(target))
         parts = max(1, round(size / cfg.batch_size))
         for _ in range(cfg.update_epochs):
             order = torch.stack([torch.randperm(size, generator=g) for g in rng]).to(target.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import re
 import types
 import typing
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from skillweave.algorithms.config import named_config
+from skillweave.algorithms.schedules import Linear
 from skillweave.collecting.lengths import Lengths
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.skills import Skill
@@ -152,6 +154,9 @@ def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> An
     return replace(config, **values)
 
 
+_LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
+
+
 def _parse(name: str, text: str, hint: Any) -> Any:
     """``text`` as a value of the annotated type."""
     options = [hint]
@@ -172,6 +177,8 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return int(value)
         if option is float and whole:
             return float(value)
+        if option is Linear and (linear := _LINEAR.fullmatch(text)):
+            return Linear(*(_parse(name, part.strip(), float) for part in linear[1].split(",")))
         if option is Lengths and isinstance(value, tuple | list):
             return Lengths(*value)
         if origin is tuple and isinstance(value, tuple | list | int):

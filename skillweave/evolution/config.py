@@ -9,6 +9,7 @@ from typing import Any, Literal, TypedDict, get_args
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.config_checks import check, number, one_of, whole
+from skillweave.algorithms.schedules import is_schedule
 from skillweave.arguments import checked_names
 from skillweave.networks.config import Activation
 from skillweave.reading import fit
@@ -161,8 +162,10 @@ class Mutations:
         """
         own = {f.name for f in fields(config)}
         learnt = {"ent_coef"} if getattr(config, "learn_ent_coef", False) else set()
+        scheduled = is_schedule(getattr(config, "learning_rate", 0.0))
         if self.ranges is None:
-            usual = {k: USUAL[k] for k in _MUTATED if k in own - learnt}
+            fixed = learnt | ({"learning_rate"} if scheduled else set())
+            usual = {k: USUAL[k] for k in _MUTATED if k in own - fixed}
             return {k: r for k, r in usual.items() if r.low <= getattr(config, k) <= r.high}
         for name, found in self.ranges.items():
             kind = type(config).__name__
@@ -176,6 +179,11 @@ class Mutations:
                 raise SkillweaveError(
                     f"Mutations.ranges: {kind} learns {name} (learn_{name}=True), so a mutation "
                     f"would change nothing: leave it out, or set learn_{name}=False"
+                )
+            if name == "learning_rate" and scheduled:
+                raise SkillweaveError(
+                    f"Mutations.ranges: {kind}.learning_rate is a schedule, which cannot mutate: "
+                    "leave it out, or give a number"
                 )
             value = getattr(config, name)
             if start and (value is None or not found.low <= value <= found.high):

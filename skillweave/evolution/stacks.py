@@ -19,6 +19,7 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.schedules import is_schedule
 from skillweave.networks.config import Network
 from skillweave.networks.stacked import Layout
 
@@ -69,6 +70,8 @@ def stack_key(config: AlgorithmConfig, settings: Sequence[str]) -> AlgorithmConf
     """
     kind = type(config)
     changes: dict[str, Any] = {k: kind.__dataclass_fields__[k].default for k in settings}
+    if is_schedule(config.learning_rate):
+        del changes["learning_rate"]  # one for all members of a stack
     for name, network in networks_of(config).items():
         if not network.layer_norm:
             changes[name] = replace(network, hidden=(1,) * len(network.hidden))

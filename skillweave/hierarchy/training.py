@@ -54,6 +54,7 @@ def manifest(
     check_nested(declaration)
     stages = stages_of(declaration)
     code = any(stage.acts_by_code for stage in stages)
+    learns = any(stage.learns_by_code for stage in stages)
     return {
         "kind": "hierarchy",
         "env": declaration.spec.name,
@@ -67,7 +68,7 @@ def manifest(
             for path, s in every_skill(declaration.skills)
         ],
         **_hierarchy_entry(declaration, together=declaration.learns_together),
-        "resume_needs_recipe": code or not declaration.trains_from_data,
+        "resume_needs_recipe": learns or not declaration.trains_from_data,
         "needs_recipe": code or not declaration.is_data,
         "stages": [stage.entry() for stage in stages],
     }

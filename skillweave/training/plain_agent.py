@@ -96,7 +96,7 @@ class PlainAgent:
             "eval_every": how.eval_every,
             "eval_episodes": how.eval_episodes,
             "needs_recipe": code,
-            "resume_needs_recipe": code or self.spec.engine != "auto",
+            "resume_needs_recipe": code or stage.learns_by_code or self.spec.engine != "auto",
             "stages": [stage.entry()],
         }
 

@@ -14,6 +14,7 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.config_checks import number, positive
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.schedules import own_schedules
 from skillweave.arguments import checked_names
 from skillweave.collecting import levels
 from skillweave.envs.make import EnvSpec, workers_for
@@ -179,6 +180,12 @@ class Stage:
     def acts_by_code(self) -> bool:
         """Whether a policy of the stage can be loaded only with code of the user's."""
         return any(own_encoders(config) for config in (self.config, *self.beside.values()))
+
+    @property
+    def learns_by_code(self) -> bool:
+        """Whether the stage can be trained only with functions of the user in its settings."""
+        configs = (self.config, *self.beside.values())
+        return self.acts_by_code or any(own_schedules(config) for config in configs)
 
     def inside(self, name: str) -> Stage:
         """This stage in a hierarchy that is the skill ``name`` of another one."""

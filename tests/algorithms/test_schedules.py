@@ -1,0 +1,196 @@
+"""Learning rates that are schedules: their values, how they are recorded, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+from small_runs import OFF, ON, Left, assert_same, lines, stopped_again, stopped_run
+
+import skillweave as sw
+from skillweave import DQN, PPO, SAC, TD3, Hierarchy, Linear, SelfImitationPPO, SkillweaveError
+from skillweave.algorithms.config import SkillCritic, config_from_json, config_to_json
+from skillweave.algorithms.parameters import rate_now
+from skillweave.algorithms.policy import make_algorithm
+from skillweave.cli.overrides import apply_overrides
+from skillweave.runs.manifest import read_manifest
+from skillweave.seeding import Seeds
+
+KINDS = (PPO, SelfImitationPPO, SkillCritic, DQN, SAC, TD3)
+
+
+def halving(remaining: float) -> float:
+    return 1e-3 * 0.5 ** (4.0 * (1.0 - remaining))
+
+
+def closing(start: float) -> Any:
+    def schedule(remaining: float) -> float:
+        return start * remaining
+
+    return schedule
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_algorithm_follows_it_from_the_start_to_the_end_of_the_budget(kind):
+    rate = torch.tensor([7.0, 7.0])
+    for progress, want in ((0.0, 3e-4), (0.25, 2.5e-4), (1.0, 1e-4)):
+        found = rate_now(kind(learning_rate=Linear(3e-4, 1e-4)), rate, progress)
+        assert found.tolist() == pytest.approx([want, want])
+        found = rate_now(kind(learning_rate=halving), rate, progress)
+        assert found.tolist() == pytest.approx([halving(1.0 - progress)] * 2)
+    number = kind(learning_rate=1e-3)
+    falls = getattr(number, "learning_rate_schedule", "linear") == "linear"
+    assert rate_now(number, rate, 0.25).tolist() == [7.0 * (0.75 if falls else 1.0)] * 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_recorded_as_data_and_read_as_what_it_was(kind):
+    line = kind(learning_rate=Linear(3e-4, 0))
+    assert config_to_json(line)["learning_rate"] == {"start": 3e-4, "end": 0}
+    assert config_from_json(config_to_json(line)) == line
+    assert kind(learning_rate={"start": 3e-4, "end": 0}) == line
+    function = kind(learning_rate=halving)
+    assert config_to_json(function)["learning_rate"] == f"{__name__}:halving"
+    again = config_from_json(config_to_json(function))
+    assert again == function
+    assert again.learning_rate(0.5) == halving(0.5)
+    for made in (closing(2e-3), lambda remaining: 2e-3 * remaining):
+        named = config_from_json(config_to_json(kind(learning_rate=made)))
+        assert named.learning_rate(0.5) == 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_schedule_is_a_sentence(kind):
+    name = kind.__name__
+    for rate, says in (
+        (lambda remaining: math.nan, rf"{name}\.learning_rate: .* returned nan; it must return"),
+        (lambda remaining: remaining - 0.6, r"\(0\.5\) returned -0\.09"),
+        (lambda remaining: 1.0 / remaining, r"\(0\) raised ZeroDivisionError.*test_schedules\.py"),
+        (lambda remaining: "a", "raised ValueError"),
+        (-1.0, rf"{name}\.learning_rate is -1\.0; it must be positive"),
+        ("fast", rf"{name}\.learning_rate is 'fast'; it must be a number, Linear"),
+        ((1, 2), rf"{name}\.learning_rate is \(1, 2\); it must be positive"),
+    ):
+        with pytest.raises(SkillweaveError, match=says):
+            kind(learning_rate=rate)
+    for values, says in (((math.inf, 0), "Linear.start is inf"), ((1e-3, -1), "Linear.end is -1")):
+        with pytest.raises(SkillweaveError, match=says):
+            Linear(*values)
+
+
+def test_a_schedule_leaves_no_place_for_another_one():
+    with pytest.raises(SkillweaveError, match="learning_rate_schedule is 'kl', which adapts a num"):
+        PPO(learning_rate=Linear(1e-3, 0), learning_rate_schedule="kl", target_kl=0.01)
+
+
+def test_a_function_is_checked_each_time_it_is_used():
+    bad = SimpleNamespace(value=1e-3)
+
+    def schedule(remaining: float) -> float:
+        return bad_values[0]
+
+    bad_values = [bad.value]
+    config = PPO(learning_rate=_named_global(schedule))
+    bad_values[0] = math.inf
+    with pytest.raises(SkillweaveError, match=r"returned inf; it must return a finite number"):
+        rate_now(config, torch.ones(1), 0.3)
+
+
+def _named_global(function: Any) -> Any:
+    """A schedule whose name can be recorded, whatever it reads."""
+    from skillweave.named import Named
+
+    found = Named("test_schedules:changing")
+    found.function = function
+    return found
+
+
+def test_an_algorithm_of_the_users_own_that_does_not_follow_schedules_refuses_them(monkeypatch):
+    from skillweave.algorithms.ppo import PPOAlgorithm
+
+    monkeypatch.setattr(PPOAlgorithm, "follows_schedules", False)
+    spaces = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(2)
+    with pytest.raises(SkillweaveError, match="does not follow schedules: give a number"):
+        make_algorithm(PPO(learning_rate=Linear(1e-3, 0)), *spaces)
+
+
+@pytest.mark.parametrize("how", [Linear(2e-3, 5e-4), halving, lambda remaining: 2e-3 * remaining])
+@pytest.mark.parametrize("config", [ON, OFF], ids=["ppo", "dqn"])
+def test_a_stopped_run_has_the_same_rates_as_one_that_was_not(tmp_path, config, how):
+    def declare() -> Hierarchy:
+        changed = replace(config, learning_rate=how)
+        return Hierarchy(
+            "CartPole-v1",
+            [Left()],
+            algorithm=changed,
+            selector=changed,
+            steps=600,
+            learn="apart",
+            train_defaults=sw.TrainDefaults(checkpoint_every=100),
+        )
+
+    declare().train(tmp_path / "whole", seed=3, quiet=True)
+    run = stopped_run(declare(), tmp_path / "run", 3)
+    stopped_again(declare(), run.path, 2)
+    declare().resume(run.path, quiet=True)
+    assert_same(run.path, tmp_path / "whole")
+    schedule = how if callable(how) else None
+    assert schedule is not None
+    rates = [row["learning_rate"] for row in lines(run.path) if "learning_rate" in row]
+    assert rates
+    assert all(schedule(0.0) <= rate <= schedule(1.0) * 1.0001 for rate in rates)
+    assert rates[0] > rates[len(rates) // 2 - 1]
+    assert read_manifest(run.path)["resume_needs_recipe"]  # of the skill in any case
+
+
+def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, monkeypatch):
+    for rate, needs in ((Linear(1e-3, 0), False), (halving, True)):
+        config = replace(ON, learning_rate=rate)
+        run = sw.train_agent("CartPole-v1", config, 100, tmp_path / str(needs), quiet=True)
+        manifest = read_manifest(run.path)
+        assert (manifest["resume_needs_recipe"], manifest["needs_recipe"]) == (needs, False)
+    from skillweave import named
+
+    monkeypatch.setattr(named, "_KNOWN", {})
+    agent = sw.Agent.from_manifest(manifest)
+    assert agent.load(run.path).policy is not None
+    with pytest.raises(SkillweaveError, match="a function of your own, and its code is not loaded"):
+        rate_now(agent.algorithm, torch.ones(1), 0.0)
+
+
+def test_it_does_not_mutate():
+    config = replace(ON, learning_rate=Linear(1e-3, 0))
+    assert "learning_rate" not in sw.Mutations().ranges_of(config)
+    assert "gamma" in sw.Mutations().ranges_of(config)
+    ranges = {"learning_rate": sw.Range(1e-4, 1e-2)}
+    with pytest.raises(SkillweaveError, match="learning_rate is a schedule, which cannot mutate"):
+        sw.Mutations(ranges=ranges).ranges_of(config)
+
+
+def test_a_population_follows_it(tmp_path):
+    config = replace(ON, learning_rate=Linear(2e-3, 1e-3))
+    evolution = sw.Evolution(population=2, generations=2, episodes=1)
+    run = sw.train_agent("CartPole-v1", config, 400, tmp_path / "run", quiet=True, evolve=evolution)
+    assert run.policy.algorithm.config.learning_rate == Linear(2e-3, 1e-3)
+
+
+def test_the_command_line_writes_it_as_a_call():
+    declared = Hierarchy("CartPole-v1", [Left()], algorithm=ON, selector=ON)
+    apply_overrides(declared, ["selector.learning_rate=linear(3e-4,0)"])
+    apply_overrides(declared, ["algorithm.learning_rate=1e-4"])
+    assert declared.selector.learning_rate == Linear(3e-4, 0.0)
+    assert declared.algorithm.learning_rate == 1e-4
+    with pytest.raises(SkillweaveError, match=r"selector\.learning_rate=linear"):
+        apply_overrides(declared, ["selector.learning_rate=linear(3)"])
+
+
+def test_a_states_rate_is_the_schedules_first_value():
+    algorithm = make_algorithm(
+        PPO(learning_rate=Linear(3e-4, 0)), gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(2)
+    )
+    assert algorithm.init([Seeds(0)]).learning_rate.tolist() == pytest.approx([3e-4])
