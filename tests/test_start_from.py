@@ -386,6 +386,75 @@ def test_a_run_that_is_not_finished_gives_what_it_has(source, tmp_path):
     assert_near(weights_of(tmp_path / "run")["left"], weights_of(path)["left"])
 
 
+@pytest.fixture(scope="module")
+def other_runs(tmp_path_factory):
+    """A second run of the same skills, and one of a plain agent."""
+    folder = tmp_path_factory.mktemp("others")
+    declare().train(folder / "second", seed=8, quiet=True)
+    Agent("CartPole-v1", ON, 300).train(folder / "plain", seed=9, quiet=True)
+    return folder / "second", folder / "plain"
+
+
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_several_runs_are_a_start_by_the_name_of_who_begins(learn, source, other_runs, tmp_path):
+    second, plain = other_runs
+    start = {"other": second, "left": str(plain), "selector": source}
+    how = {"together": Together(reference_kl=None, task_weight=0.0)}
+    declare(learn, STILL, **how).train(tmp_path / "run", seed=6, quiet=True, start_from=start)
+    after = weights_of(tmp_path / "run")
+    assert_near(after["other"], weights_of(second)["other"])
+    assert_near(after["left"], weights_of(plain)["agent"])
+    assert_near(after["selector"], weights_of(source)["selector"])
+    stages = json.loads((tmp_path / "run" / "run.json").read_text())["stages"]
+    runs = {k: v["run"] for stage in stages for k, v in stage.get("starts", {}).items()}
+    ids = [json.loads((p / "run.json").read_text())["id"] for p in (second, plain, source)]
+    assert runs == dict(zip(("other", "left", "selector"), ids, strict=True))
+
+
+def test_who_is_not_named_begins_afresh(source, tmp_path):
+    start = {"left": source}
+    declare(rate=STILL).train(tmp_path / "run", seed=6, quiet=True, start_from=start)
+    after, before = weights_of(tmp_path / "run"), weights_of(source)
+    assert_near(after["left"], before["left"])
+    assert differ(after["selector"], before["selector"])
+
+
+def test_what_is_wrong_with_several_runs_is_a_sentence(source, other_runs, tmp_path):
+    _, plain = other_runs
+    for start, says in (
+        ({}, r"start_from is \{\}; name who begins"),
+        ({"lefft": source}, r"names 'lefft', which does not learn here.*Close matches: left"),
+        ({"push": source}, r"names 'push', which does not learn here; here learn left, other"),
+        ({"left": tmp_path / "no"}, "holds no run"),
+        ({"left": 5}, r"start_from\['left'\] is 5; it must be a path"),
+        ({"selector": plain}, r"'selector' cannot begin with what it learnt in .*plain"),
+    ):
+        with pytest.raises(SkillweaveError, match=says):
+            declare().train(tmp_path / "run", quiet=True, start_from=start)
+    declare(skills=(Left, Push)).train(tmp_path / "less", seed=1, quiet=True)
+    with pytest.raises(
+        SkillweaveError, match=r"'other' has not learnt in .*; there learnt left, s"
+    ):
+        declare().train(tmp_path / "run", quiet=True, start_from={"other": tmp_path / "less"})
+
+
+def test_the_command_takes_several_runs(source, other_runs, tmp_path, capsys):
+    recipe = tmp_path / "cart.py"
+    recipe.write_text("from test_start_from import declare\nhierarchy = declare(rate=1e-12)\n")
+    out = ["--out", str(tmp_path / "run"), "--evaluate", "0", "--quiet"]
+    both = ["--start-from", f"left={source}", "--start-from", f"other={other_runs[0]}"]
+    assert main(["train", str(recipe), *both, *out]) == 0
+    after = weights_of(tmp_path / "run")
+    assert_near(after["left"], weights_of(source)["left"])
+    assert_near(after["other"], weights_of(other_runs[0])["other"])
+    again = ["--start-from", str(source), "--start-from", f"left={source}"]
+    assert main(["train", str(recipe), *again, *out]) == 1
+    assert "write who begins with each" in capsys.readouterr().err
+    twice = ["--start-from", f"left={source}", "--start-from", f"left={source}"]
+    assert main(["train", str(recipe), *twice, *out]) == 1
+    assert "names left twice" in capsys.readouterr().err
+
+
 def test_the_command_takes_a_run(source, tmp_path, capsys):
     recipe = tmp_path / "cart.py"
     recipe.write_text("from test_start_from import declare\nhierarchy = declare(rate=1e-12)\n")

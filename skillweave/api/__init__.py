@@ -185,7 +185,9 @@ class Hierarchy(Declaration):
             cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
                 where it pays.
             start_from: another run, or its directory: whoever learns here and has learnt there, by
-                the same name, begins with its policy (of PPO and DQN all networks, of SAC and TD3
+                the same name, begins with its policy. Or several runs, by the name of who begins:
+                ``{"left": run, "right": other}``; a run of a plain agent fits any name. What is
+                taken over is the policy (of PPO and DQN all networks, of SAC and TD3
                 the actor). The task may be another one; spaces, networks and the names of a
                 selector's skills must be the same.
 

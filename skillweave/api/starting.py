@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +13,18 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.run import Run
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.messages import as_path
+from skillweave.messages import as_path, close_matches, short
 from skillweave.runs.starts import Chooses, Learnt, begin_with, chosen_from, learnt_in, same_shapes
 from skillweave.spaces import same_space
+from skillweave.training.plain_agent import AGENT
 from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy
 
-StartFrom = str | Path | Run | None
-"""A run in which those who are to learn have learnt before."""
+OneRun = str | Path | Run
+StartFrom = OneRun | Mapping[str, OneRun] | None
+"""A run in which those who are to learn have learnt before, or such runs by the learners' names."""
 Spaces = tuple[gym.Space[Any], gym.Space[Any]]
 """Of observations and of actions."""
 
@@ -35,8 +38,14 @@ def starts(
     """
     if start_from is None:
         return {}, ""
-    where = start_from.path if isinstance(start_from, Run) else as_path(start_from, "start_from")
-    learnt = learnt_in(where)
+    if isinstance(start_from, Mapping):
+        learnt, places = _learnt_by_name(content, start_from)
+    else:
+        place = _place(start_from, "start_from")
+        learnt = learnt_in(place)
+        places = dict.fromkeys(learnt, place)
+    # A dict rather than a set: the runs in the order in which they were given.
+    where = ", ".join(dict.fromkeys(map(str, places.values())))
     begun = begin_with(content["stages"], learnt, where)
     observation_space, action_space = spaces
     for stage in content["stages"]:
@@ -47,8 +56,49 @@ def starts(
                 acts = declared.chooses_from(name, action_space)
             algorithm = make_algorithm(config_from_json(own), observation_space, acts)
             chooses = chosen_from(content, name)
-            _check_start(name, algorithm, chooses, learnt[name], where)
+            _check_start(name, algorithm, chooses, learnt[name], places[name])
     return learnt, f"start from {where}: {', '.join(sorted(begun))}"
+
+
+def _place(run: OneRun, argument: str) -> Path:
+    """Return the directory of a run."""
+    return run.path if isinstance(run, Run) else as_path(run, argument)
+
+
+def _learnt_by_name(
+    content: dict[str, Any], start_from: Mapping[str, OneRun]
+) -> tuple[dict[str, Learnt], dict[str, Path]]:
+    """Return what each named learner begins with, and in which run that is.
+
+    Raises:
+        SkillweaveError: a name does not learn here, or has not learnt in its run.
+    """
+    here = sorted({name for entry in content["stages"] for name in entry["learns"]})
+    learnt: dict[str, Learnt] = {}
+    places: dict[str, Path] = {}
+    known: dict[Path, dict[str, Learnt]] = {}
+    if not start_from:
+        raise SkillweaveError('start_from is {}; name who begins with which run: {"left": run}')
+    for name, run in start_from.items():
+        if name not in here:
+            near = close_matches(str(name), here)
+            raise SkillweaveError(
+                f"start_from names {short(name)}, which does not learn here; here learn "
+                f"{', '.join(here)}.{near}"
+            )
+        place = _place(run, f"start_from[{name!r}]")
+        if place not in known:
+            known[place] = learnt_in(place)
+        there = known[place]
+        # A plain agent's run has one learner, whatever it is to be here.
+        found = there.get(name) or (there.get(AGENT) if set(there) == {AGENT} else None)
+        if found is None:
+            raise SkillweaveError(
+                f"start_from[{name!r}]: {name!r} has not learnt in {place}; there learnt "
+                f"{', '.join(there) or 'nobody: no stage was finished'}"
+            )
+        learnt[name], places[name] = found, place
+    return learnt, places
 
 
 def _check_start(

@@ -51,8 +51,9 @@ class Train(OnRay):
     """Afterwards train the baseline too, on the same number of steps, and say which is better."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
-    start_from: Path | None = None
-    """Another run: whoever has learnt there, too, begins with that (not --versus-flat's agent)."""
+    start_from: UseAppendAction[tuple[str, ...]] = ()
+    """Another run: whoever has learnt there, too, begins with that (not --versus-flat's agent).
+    Several runs, by the name of who begins: --start-from left=RUN --start-from right=RUN."""
     evolve: UseAppendAction[tuple[str, ...]] = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
     track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()

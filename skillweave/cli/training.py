@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -82,10 +83,34 @@ def _trained(
             track=command.track,
             evolve=evolve,
             cluster=cluster,
-            start_from=None if baseline else command.start_from,
+            start_from=None if baseline else _start_from(command.start_from),
         )
     except KeyboardInterrupt:
         raise _interrupted(path, command.ray) from None
+
+
+def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
+    """Return the run that ``--start-from`` means, or several by name.
+
+    Raises:
+        SkillweaveError: there are several, and one of them has no name, or a name has two.
+    """
+    if not words:
+        return None
+    if len(words) == 1 and ("=" not in words[0] or Path(words[0]).exists()):
+        return words[0]
+    found: dict[str, str] = {}
+    for word in words:
+        name, sign, run = word.partition("=")
+        if not sign or not name or not run:
+            raise SkillweaveError(
+                f"--start-from {word}: with several runs, write who begins with each: "
+                "--start-from left=RUN --start-from right=RUN"
+            )
+        if name in found:
+            raise SkillweaveError(f"--start-from names {name} twice; give it one run")
+        found[name] = run
+    return found
 
 
 def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:

@@ -83,11 +83,11 @@ def chosen_from(manifest: Mapping[str, Any], name: str) -> Chooses:
     return skills, tuple(told.get("call_lengths", ())) if own == "selector" else ()
 
 
-def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where: Path) -> set[str]:
+def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where: str) -> set[str]:
     """Write into the entries of a new run's stages who begins with what; their names.
 
     Args:
-        where: the other run.
+        where: the other run, or runs, for messages.
 
     Raises:
         SkillweaveError: nobody who learns here has learnt there, or a population is to begin.
