@@ -1,12 +1,15 @@
-# make demo   train, score and film the lunar-lander recipe, and compare it with a flat agent
-# make test   the tests            make check   ruff, mypy, import order, tests
-# make bench  the benchmarks       make weights the shipped weights, made anew
-# make docs   the documentation, as a site in site/
-# make torture  mutated files, kills, bad disks, hostile code: an hour
+# make demo     train, score and film the lunar-lander recipe, and compare it with a flat agent
+# make test     the fast tests                 make test-all  all tests
+# make check    ruff, mypy, the fast tests     make docs      the documentation, as a site in site/
+# make bench    the benchmarks                 make weights   train the shipped weights again
+# make torture  damaged files, kills, full disks, hostile code: an hour
 PYTHON ?= python3
-# One torch for everything, installed first: a plain `torch` may pull gigabytes of CUDA.
+# Torch is installed first, from its CPU index where that can be reached: PyPI's torch brings gigabytes of
+# CUDA on Linux. With a GPU: make demo TORCH_INDEX=
 TORCH ?= torch==2.13.0
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 BIN := .venv/bin
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SEED ?= 0
 # Recipes whose weights are shipped (those of keys-and-doors would be 10 MB), as two cores make them: on
 # as many, pick-and-place's are the same, as one process for each core steps its environments.
@@ -18,17 +21,17 @@ CORES := $(BIN)/python -c 'import os; a = getattr(os, "sched_getaffinity", None)
 # processes that import the same ones.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $$(($$($(CORES)) + 1)) --dist worksteal
 
-.PHONY: demo test check docs torture bench figures weights smoke clean
+.PHONY: demo test test-slow test-all check docs torture bench figures weights smoke clean
 
 .venv/demo: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("Skillweave needs Python 3.11 or newer, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[demo]"
+	$(PIP) --retries 2 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) "$(TORCH)"
+	$(PIP) -e ".[demo]"
 	touch $@
 
 .venv/dev: .venv/demo
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	$(PIP) -e ".[dev]"
 	touch $@
 
 demo: .venv/demo
@@ -38,16 +41,22 @@ smoke: .venv/demo
 	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --versus-flat --scale 0.02 --evaluate 5
 
 test: .venv/dev
+	$(PYTEST) -m "not slow"
+
+test-slow: .venv/dev
+	$(PYTEST) -m slow
+
+test-all: .venv/dev
 	$(PYTEST)
 
 check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(PYTEST)
+	$(PYTEST) -m "not slow"
 
 docs: .venv/demo
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
+	$(PIP) -e ".[docs]"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 torture: .venv/dev
@@ -57,11 +66,11 @@ bench: .venv/dev
 	$(BIN)/python -m benchmarks
 
 figures: .venv/dev
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]"
+	$(PIP) -e ".[bench]"
 	$(BIN)/python -m benchmarks --all
 
 weights: .venv/demo
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[robotics]"
+	$(PIP) -e ".[robotics]"
 	$(foreach r,$(WITH_WEIGHTS),rm -rf runs/weights-$(r) && \
 	$(BIN)/skillweave train $(r) --seed 0 --out runs/weights-$(r) && \
 	$(BIN)/skillweave weights runs/weights-$(r) --out skillweave/recipes/$(subst -,_,$(r)).safetensors &&) true

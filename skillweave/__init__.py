@@ -201,3 +201,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'skillweave' has no attribute {name!r}")
     return getattr(importlib.import_module(f"skillweave.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

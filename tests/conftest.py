@@ -37,6 +37,19 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(50_000, 20, 100)
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail a run of CI in which a test was skipped for want of a package."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is None or not os.environ.get("SKILLWEAVE_TESTS_NEED_ALL"):
+        return
+    skipped = [(report.nodeid, report.longrepr[2]) for report in reporter.stats.get("skipped", ())]
+    missing = [f"{name}: {reason}" for name, reason in skipped if "CUDA" not in reason]
+    if missing:
+        print("\nskipped, where only tests that need a GPU may be:", *missing, sep="\n  ")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
 @pytest.fixture(scope="session", autouse=True)
 def few_episodes() -> Iterator[None]:
     """Who learnt together is judged by few episodes: here it is of no matter who wins."""

@@ -15,18 +15,24 @@ ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/-][^\s/]*:\S*")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 1 on an error, 2 on wrong arguments, 130 on Ctrl-C."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if list(words) == ["--version"]:
+        from skillweave import __version__
+
+        print(f"skillweave {__version__}")
+        return 0
     import tyro
 
     from skillweave.cli import commands
 
-    words = sys.argv[1:] if arguments is None else arguments
     given = ["--no-deterministic" if word == "--stochastic" else word for word in words]
     given = _with_addresses(given)
     parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         parser,
         prog="skillweave",
-        description="Teach agents skills and weave them into one policy.",
+        description="Teach agents skills and weave them into one policy. "
+        "skillweave --version prints the version.",
         args=given,
     )
     from skillweave.tracebacks import all_frames_wanted

@@ -1,0 +1,91 @@
+"""The package as users install it: names, version, types and extras."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import skillweave
+from skillweave.cli import main
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+
+
+def test_dir_lists_the_public_names_alone() -> None:
+    assert set(dir(skillweave)) == {*skillweave.__all__, "__version__"}
+
+
+def test_the_command_prints_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"skillweave {skillweave.__version__}\n"
+
+
+def test_help_names_the_version_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert "--version" in capsys.readouterr().out
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    (cited,) = re.findall(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)
+    (latest, *_) = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert cited == latest == skillweave.__version__
+
+
+def packages_of(extra: str) -> set[str]:
+    """Return the packages that an extra installs, those of the extras in it included."""
+    packages: set[str] = set()
+    for requirement in EXTRAS[extra]:
+        inner = re.fullmatch(r"skillweave\[(.*)\]", requirement)
+        if inner is None:
+            packages.add(requirement)
+            continue
+        for name in inner[1].split(","):
+            packages |= packages_of(name)
+    return packages
+
+
+def test_all_has_every_extra_for_users_and_dev_has_everything() -> None:
+    for extra in set(EXTRAS) - {"docs", "bench", "dev"}:
+        assert packages_of(extra) <= packages_of("all"), extra
+    for extra in EXTRAS:
+        assert packages_of(extra) <= packages_of("dev"), extra
+
+
+def test_the_page_about_installing_names_every_extra() -> None:
+    page = (ROOT / "docs/install.md").read_text()
+    table = page.split("## Extras")[1].split("\n## ")[0]
+    named = {
+        name
+        for line in table.splitlines()
+        if line.startswith("| `")
+        for name in re.findall(r"`([\w]+)`", line.split(" | ")[0])
+    }
+    assert named == set(EXTRAS)
+
+
+def test_the_wheel_says_that_it_has_types_and_has_every_file_of_the_package(tmp_path: Path) -> None:
+    pytest.importorskip("hatchling")
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel"]
+    subprocess.run([*command, "--directory", str(tmp_path)], cwd=ROOT, check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        (metadata,) = (name for name in names if name.endswith("/METADATA"))
+        described = archive.read(metadata).decode()
+    assert f"Version: {skillweave.__version__}" in described.splitlines()
+    files = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "skillweave").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert "skillweave/py.typed" in files
+    assert files == {name for name in names if name.startswith("skillweave/")}
