@@ -18,7 +18,7 @@ from skillweave import PPO, RNN, Automaton, Lengths, Network, Reflex, Skillweave
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.guide import Guide
+from skillweave.collecting.guide import ActiveGuide
 from skillweave.export import states
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
@@ -149,7 +149,7 @@ def waiting() -> HierarchyPolicy:
 def guided(guide: Any, **how: Any) -> HierarchyPolicy:
     skills = skill_set(Careful, Left, Zigzag, Right, **how)
     asked: Any = ready(guide, skills).selector
-    return HierarchyPolicy(network(skills.choices, seed=6), skills, Guide(asked))
+    return HierarchyPolicy(network(skills.choices, seed=6), skills, ActiveGuide(asked))
 
 
 def critic_of(skills: int, **how: Any) -> Any:
