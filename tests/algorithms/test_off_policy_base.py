@@ -251,18 +251,3 @@ def test_the_slow_networks_turn_comes_beyond_what_a_float_can_count():
         moved.append(not torch.equal(state.params, before))
     assert moved == [False, True, False, True]
     assert state.updates.tolist() == [(1 << 24) + 4]
-
-
-@pytest.mark.parametrize("kind", [DQN, SAC, TD3])
-def test_a_run_that_began_before_there_were_bouts_goes_on_without_them(kind):
-    told = config_to_json(kind(action_repeat=0.5))
-    assert config_from_json(told).action_repeat == 0.5
-    del told["action_repeat"]
-    assert config_from_json(told).action_repeat == 0.0
-
-
-def test_a_run_of_td3_from_before_large_outputs_cost_anything_goes_on_as_it_was():
-    told = config_to_json(TD3(action_l2=0.5))
-    assert config_from_json(told).action_l2 == 0.5
-    del told["action_l2"]
-    assert config_from_json(told).action_l2 == 0.0

@@ -1,4 +1,4 @@
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -7,11 +7,8 @@ from gymnasium.spaces import Box, Discrete
 from torch import nn
 from toys import Echo, learn, random_critic, training
 
-from skillweave.algorithms import config as configs
 from skillweave.algorithms.config import (
     PPO,
-    Registration,
-    SkillCritic,
     config_from_json,
     config_to_json,
 )
@@ -480,20 +477,6 @@ def test_settings_survive_json():
     config = replace(CONFIG, critic=Network((8,), "relu", True), target_kl=0.1)
     assert config_from_json(config_to_json(config)) == config
     assert config_from_json(config_to_json(PPO())) == PPO()
-
-
-@dataclass(frozen=True)
-class Mine(PPO):
-    """A user's own kind of PPO."""
-
-
-@pytest.mark.parametrize("kind", [PPO, SkillCritic, Mine])
-def test_older_settings_are_read_with_no_least_deviation_of_advantages(kind, monkeypatch):
-    known = {"Mine": Registration(Mine, PPOAlgorithm, (Discrete,))}
-    monkeypatch.setattr(configs, "_REGISTERED", configs._REGISTERED | known)
-    recorded = config_to_json(kind())
-    del recorded["min_advantage_std"]
-    assert config_from_json(recorded) == kind(min_advantage_std=0.0)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from skillweave import PPO, Hierarchy, Skill
+from skillweave import PPO, Hierarchy, Skill, TrainDefaults
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.types import SkillweaveError
 
@@ -61,4 +61,6 @@ def test_a_flat_baseline_sees_the_whole_observation():
     assert (found.network, found.critic) == (Network((8,)), Network((9,)))
     assert hierarchy.algorithm is config
     own = PPO(network=part)
-    assert replace(hierarchy, flat=own).plain_agent().algorithm is own, "what is asked is done"
+    assert hierarchy.plain_agent(own).algorithm is own, "what is asked is done"
+    with_defaults = replace(hierarchy, train_defaults=TrainDefaults(flat=own))
+    assert with_defaults.plain_agent().algorithm is own
