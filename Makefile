@@ -1,4 +1,4 @@
-# make demo     train, score and film the lunar-lander recipe, and compare it with a flat agent
+# make demo     train, score and film two tasks: where skills pay, and where not (3 minutes)
 # make test     the fast tests                 make test-all  all tests
 # make check    ruff, mypy, the fast tests     make docs      the documentation, as a site in site/
 # make bench    the benchmarks                 make weights   train the shipped weights again
@@ -13,7 +13,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SEED ?= 0
 # Recipes whose weights are shipped (those of keys-and-doors would be 10 MB), as two cores make them: on
 # as many, pick-and-place's are the same, as one process for each core steps its environments.
-WITH_WEIGHTS := lunar-lander lunar-lander-tuned lander-missions mazes shuttle pick-and-place
+WITH_WEIGHTS := lunar-lander lander-missions mazes shuttle pick-and-place
 # One process for each core, and one more, as some tests wait for other processes; a process that
 # has no tests left takes some of another's.
 CORES := $(BIN)/python -c 'import os; a = getattr(os, "sched_getaffinity", None); print(len(a(0)) if a else os.cpu_count())'
@@ -35,10 +35,12 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $$(($$($(CORES)) +
 	touch $@
 
 demo: .venv/demo
-	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --versus-flat
+	rm -rf runs/demo
+	$(BIN)/skillweave demo --seed $(SEED)
 
 smoke: .venv/demo
-	$(BIN)/skillweave train lunar-lander --seed $(SEED) --render --versus-flat --scale 0.02 --evaluate 5
+	rm -rf runs/smoke
+	$(BIN)/skillweave demo --seed $(SEED) --scale 0.02 --out runs/smoke
 
 test: .venv/dev
 	$(PYTEST) -m "not slow"

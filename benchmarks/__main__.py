@@ -23,7 +23,7 @@ ALL = (
     ["speed"],
     ["flat"],
     ["hierarchy"],
-    ["hierarchy", "--recipe", "lunar-lander-tuned"],
+    ["hierarchy", "--apart", "--no-flat"],
     ["ablation"],
     ["replay"],
     ["off_policy"],

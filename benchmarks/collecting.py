@@ -27,7 +27,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from benchmarks.chains import LANDER_TOGETHER
 from benchmarks.common import machine
 from skillweave import (
     PPO,
@@ -161,8 +160,7 @@ def calls(random_lengths: bool, steps: int) -> float:
 
 TOGETHER: dict[str, list[str]] = {
     "as in the recipe": [],
-    "and the task's advantage": ["together.task_weight=10"],
-    "as the lander learns together": LANDER_TOGETHER,
+    "without the task's advantage": ["together.task_weight=0"],
 }
 """By name, what is changed in the recipe."""
 

@@ -1,10 +1,10 @@
 """Figures 1 to 3 and 10: a whole hierarchy, and the flat baseline on as many steps.
 
     python -m benchmarks.hierarchy [--recipe lunar-lander] [--seeds 0 1 2 3 4] [--no-flat]
-    python -m benchmarks.hierarchy --together --no-flat
+    python -m benchmarks.hierarchy --apart --no-flat
 
-With ``--together`` skills and selector of ``lunar-lander`` learn from the same steps, with the
-settings and budgets of ``chains.LANDER_TOGETHER`` and ``chains.LANDER_STEPS``.
+With ``--apart`` the skills of ``lunar-lander`` learn one by one, then the selector, with the
+settings and budgets of ``chains.LANDER_APART`` and ``chains.LANDER_APART_STEPS``.
 Every run is a process of its own, so that its peak memory is its own. Training time is the sum
 of the stages' seconds, without imports; scores are greedy over 100 episodes of Gymnasium's
 environment with seeds that training never saw.
@@ -33,11 +33,11 @@ def declared(recipe: str, settings: list[str]) -> Any:
     return hierarchy
 
 
-def together() -> list[str]:
-    """The settings with which the skills of ``lunar-lander`` learn together."""
-    from benchmarks.chains import LANDER_TOGETHER, lander_budgets
+def apart() -> list[str]:
+    """Return the settings with which the skills of ``lunar-lander`` learn apart."""
+    from benchmarks.chains import LANDER_APART, LANDER_APART_STEPS
 
-    return LANDER_TOGETHER + lander_budgets()
+    return LANDER_APART + LANDER_APART_STEPS
 
 
 def one(recipe: str, seed: int, flat: bool, settings: list[str]) -> dict[str, object]:
@@ -75,15 +75,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--no-flat", action="store_true")
     parser.add_argument("--no-hierarchy", action="store_true")
-    parser.add_argument("--together", action="store_true")
+    parser.add_argument("--apart", action="store_true")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--one", type=int)
     parser.add_argument("--flat-one", action="store_true")
     given = parser.parse_args()
-    if given.together and given.recipe != "lunar-lander":
-        parser.error("--together: its settings are those of the recipe lunar-lander")
-    if given.together:
-        given.set = together() + given.set
+    if given.apart and given.recipe != "lunar-lander":
+        parser.error("--apart: its settings are those of the recipe lunar-lander")
+    if given.apart:
+        given.set = apart() + given.set
     if given.one is not None:
         print(json.dumps(one(given.recipe, given.one, given.flat_one, given.set)))
         return
@@ -102,7 +102,7 @@ def main() -> None:
             result[f"{kind}_{key}_median"] = median(r[key] for r in rows)
             result[f"{kind}_{key}_worst"] = worst(r[key] for r in rows)
         result[kind] = rows
-    how = ["together"] if given.together else []
+    how = ["apart"] if given.apart else []
     report("-".join([*kinds, given.recipe, *how]), result)
 
 

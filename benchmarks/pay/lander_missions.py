@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from benchmarks.pay.suite import Policies, Suite, Task
@@ -55,9 +53,7 @@ def suite() -> Suite:
         source=source,
         further=further,
         skills=lambda: [skill() for skill in missions.SKILLS],
-        # Pays at the end of a leg only, so it is to look further ahead than a skill.
-        # It sees the mission.
-        flat=replace(missions.PILOT, gamma=0.999, gae_lambda=0.98, network=missions.RELU),
+        flat=missions.FLAT,
         weights=(
             {s.name: 0.001 for s in missions.SKILLS},
             {"land": 0.003, "hover": 0.001, "go_left": 0.001, "go_right": 0.001},

@@ -70,6 +70,18 @@ class Train(OnRay):
 
 
 @dataclass(frozen=True)
+class Demo(Output):
+    """Train, score and film two tasks in three minutes: where skills pay, and where not."""
+
+    out: Annotated[Path, arg(aliases=["-o"])] = Path("runs/demo")
+    """A new directory for runs, films and the report."""
+    seed: int = 0
+    """The root of every random stream."""
+    scale: float = 1.0
+    """Multiply every training budget and number of episodes: 0.02 for a quick look."""
+
+
+@dataclass(frozen=True)
 class Resume(OnRay):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
@@ -263,6 +275,7 @@ class ImportAgilerl(Output):
 
 
 COMMANDS = (
+    Demo,
     Train,
     Resume,
     Sweep,
@@ -280,7 +293,8 @@ COMMANDS = (
     ImportAgilerl,
 )
 Command = (
-    Train
+    Demo
+    | Train
     | Resume
     | Sweep
     | Evaluate

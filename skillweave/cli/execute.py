@@ -8,6 +8,7 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave.cli import commands, share
+from skillweave.cli.demo import demo
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.run_lines import run_lines
 from skillweave.cli.sweep import sweep
@@ -26,6 +27,8 @@ from skillweave.types import SkillweaveError
 def run(command: commands.Command) -> int:
     """Carry a command out and print its result."""
     match command:
+        case commands.Demo():
+            demo(command)
         case commands.Train():
             train(command)
         case commands.Resume():

@@ -16,6 +16,7 @@ Needs box2d: ``pip install 'skillweave[box2d]'``; with EnvPool it trains several
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from skillweave import (
     Skill,
     SkillweaveError,
     Step,
+    TrainDefaults,
 )
 from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
 
@@ -190,6 +192,9 @@ SELECTOR = PPO(
     ent_coef_final=0.0,
     network=RELU,
 )
+FLAT = replace(PILOT, gamma=0.999, gae_lambda=0.98, network=RELU)
+"""The flat agent sees the mission. It is paid at the end of a leg only, so it looks further ahead
+than a skill."""
 SKILLS = (Hover, GoLeft, GoRight, Land)
 
 
@@ -214,6 +219,7 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
         "selection": Selection(greedy_skills=False),
         "algorithm": PILOT,
         "selector": SELECTOR,
+        "train_defaults": TrainDefaults(flat=FLAT),
     } | how
     found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
     found.skill("hover").steps = 300_000

@@ -11,6 +11,9 @@ return is the share of episodes that succeed. It lasts 50 steps at most, as Gymn
 Observations: the gripper's place (0 to 2), the block's (3 to 5), the block as seen from the gripper
 (6 to 8), the fingers (9, 10), angles and velocities (11 to 24), the goal (25 to 27); in metres.
 
+With the shipped weights the selector never calls ``recover``: they are of calm, where nothing goes
+wrong. It is there for disturbances (``declare(Disturbances())``).
+
     skillweave train pick-and-place
 
 Needs gymnasium-robotics: ``pip install 'skillweave[robotics]'``.

@@ -10,6 +10,10 @@ to, so that skills serve other points, too), z and the angles (1 to 8), velociti
 leg of the patrol that is run now, one-hot (18 to 20; the paper's task has two legs, so the last
 number is always 0). The selector sees all of it, skills all but the leg.
 
+With the shipped weights the selector never calls ``stop``: ``forward`` and ``backward`` brake
+before a point by themselves, as their reward is higher the slower they pass it. It
+stays as an example of a skill that a selector leaves alone, as the task does not need it.
+
     skillweave train shuttle
 
 Needs mujoco: ``pip install 'skillweave[mujoco]'``.
