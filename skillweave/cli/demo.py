@@ -97,7 +97,8 @@ class Demo:
         self.say(f"   {steps} in {seconds:.0f} s. Whole missions done: {complete(score):.0%}.")
         self.say(
             "   Skills, by the share of steps in which they act: "
-            f"{shares(self.result['mission']['skill_usage'])}."
+            f"{shares(self.result['mission']['skill_usage'])}.\n"
+            "   (This mission has no part for hover. Others have: skillweave train lander-missions.)"
         )
         _, flat, seconds = self._learn(hierarchy, MISSION, "mission-flat", flat=True)
         self.say(
