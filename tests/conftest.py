@@ -4,6 +4,7 @@ import gc
 import importlib.util
 import os
 import signal
+from collections import Counter
 from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # here, in each worker, and in what tests start
@@ -25,6 +26,20 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
 
     # Before anything else imports these: `from … import gae` then finds what is checked.
     check_shapes("returns", "losses", "distributions", "optim")
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as slow all but the first n cases of a test with ``@pytest.mark.fast_cases(n)``."""
+    seen: Counter[str] = Counter()
+    for item in items:
+        limit = item.get_closest_marker("fast_cases")
+        if limit is None:
+            continue
+        name = item.nodeid.split("[")[0]
+        seen[name] += 1
+        if seen[name] > limit.args[0]:
+            item.add_marker("slow")
 
 
 def pytest_collection_finish() -> None:
