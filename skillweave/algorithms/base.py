@@ -77,6 +77,9 @@ class Algorithm:
     first of them, which acting needs. It defines ``fresh_state``, ``parameter_groups``, ``act``,
     ``value`` and ``update``. It holds nothing that is learnt: that is in the state. It is made
     of its settings (``config``), ``observation_space`` and ``action_space``.
+
+    Raises:
+        SkillweaveError: a setting is one that this algorithm does not support.
     """
 
     store: ClassVar[Literal["rollout", "replay"]]

@@ -61,7 +61,8 @@ class Agent(PlainAgent):
     ) -> Run:
         """Train the agent and write everything to ``run_dir``.
 
-        The arguments are those of ``Hierarchy.train``.
+        ``seed``, ``eval_every``, ``eval_episodes``, ``checkpoint_every``, ``quiet``, ``track``,
+        ``evolve``, ``cluster`` and ``start_from`` are as in ``Hierarchy.train``.
         """
         how = self.train_defaults.given(
             eval_every=eval_every, eval_episodes=eval_episodes, checkpoint_every=checkpoint_every
@@ -236,7 +237,10 @@ class Hierarchy(Declaration):
         return Run(declared_of(own, run), run.path, training.load(own, run))
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> Agent:
-        """Return the flat baseline: one agent on the task itself, without skills and reflexes."""
+        """Return the flat baseline: one agent on the task itself, without skills and reflexes.
+
+        ``algorithm``: its settings; None: those of ``train_defaults``, or of the skills.
+        """
         return Agent(**vars(super().plain_agent(algorithm)))
 
     @checked_names

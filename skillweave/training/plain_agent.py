@@ -83,7 +83,10 @@ class PlainAgent:
         return [Stage(AGENT, "agent", *how)]
 
     def manifest(self, seed: int, how: TrainDefaults | None = None) -> dict[str, Any]:
-        """Return the content of a new run's ``run.json``, for this ``seed``."""
+        """Return the content of a new run's ``run.json``, for this ``seed``.
+
+        ``how``: evaluation and checkpoints; None: as ``train_defaults`` says.
+        """
         how = how or self.train_defaults
         (stage,) = self.stages()
         code = stage.acts_by_code or not self.spec.is_data
