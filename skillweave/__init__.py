@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from skillweave.ops.moments import masked_mean, normalise
     from skillweave.ops.optim import adam_, clip_grad_norm_
     from skillweave.ops.returns import gae
+    from skillweave.reporting.curves_figure import plot_curves
     from skillweave.seeding import Seeds
     from skillweave.selectors import Automaton, LastCall, tree
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
@@ -114,6 +115,7 @@ _HOME = {
     "mask_logits": "ops.distributions",
     "masked_mean": "ops.moments",
     "normalise": "ops.moments",
+    "plot_curves": "reporting.curves_figure",
     "register_algorithm": "algorithms.registry",
     "register_encoder": "networks.encoders",
     "train_agent": "api",
@@ -189,6 +191,7 @@ __all__ = [
     "mask_logits",
     "masked_mean",
     "normalise",
+    "plot_curves",
     "register_algorithm",
     "register_encoder",
     "train_agent",

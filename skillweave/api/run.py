@@ -241,6 +241,7 @@ class Run:
         films: int = 3,
         seed: int = 0,
         deterministic: bool = True,
+        quiet: bool = False,
     ) -> dict[str, Any]:
         """Write one HTML file about the run: film, calls, skills, curves, settings.
 
@@ -250,9 +251,11 @@ class Run:
             films: how many of them to film, from the worst to the best.
             seed: picks the episodes.
             deterministic: act greedily, else sample.
+            quiet: no progress; else it is shown where a part takes longer than a second.
 
         Returns:
-            ``path``, ``bytes``, ``seconds``, and ``missing``: sentences on what is not in it.
+            ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
+            ``missing``: sentences on what is not in it.
 
         Raises:
             SkillweaveError: this is no run but a weights file, or the file cannot be written.
@@ -267,6 +270,7 @@ class Run:
             filmed=films,
             seed=seed,
             deterministic=deterministic,
+            quiet=quiet,
         )
 
     @checked_names

@@ -157,12 +157,28 @@ class Render(Watched):
 
 @dataclass(frozen=True)
 class Plot(Output):
-    """Draw how a run's populations evolved, or its agents learnt, as PNG and SVG."""
+    """Draw learning curves as PNG and SVG: of one run, or of many seeds with bands, for a paper.
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
+    Of one run: how each agent learnt, or how its population evolved.
+    """
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")] = (
+        tyro.MISSING
+    )
+    """Runs or sweeps. Of several, those that differ by their seed alone are one line."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """A directory for the files; default: plots, in the run."""
+    """Of one run a directory; default: plots, in the run. Of several the files, without suffix;
+    default: curves."""
+    metric: str | None = None
+    """Of several runs: what to draw; default: eval_return where all have it, else return."""
+    agent: str | None = None
+    """Of several runs: a skill, or selector; default: the whole policy."""
+    band: Literal["iqr", "range", "none"] = "iqr"
+    """Of several runs: from the 25th to the 75th percentile of the seeds, or lowest to highest."""
+    label: UseAppendAction[tuple[str, ...]] = ()
+    """Of several runs: the name of a line, once for each, in their order."""
+    width: float = 3.3
+    """Of several runs: inches; a column of a paper has 3.3."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +208,7 @@ class Compare(Output):
     runs: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")] = (
         tyro.MISSING
     )
-    """The runs' directories."""
+    """Directories of runs, or of sweeps."""
     out: Annotated[Path, arg(aliases=["-o"])] = Path("compare.html")
     """The file to write."""
 

@@ -16,10 +16,12 @@ from skillweave.cli.targets import declared_by_run, target
 from skillweave.cli.telling import save_score, tell
 from skillweave.cli.training import resume, train
 from skillweave.compat.agilerl_files import convert
+from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.several import open_runs
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import SkillweaveError
 
@@ -100,8 +102,28 @@ def _render(command: commands.Render) -> None:
 
 
 def _plot(command: commands.Plot) -> None:
-    paths = [str(path) for path in plot_run(RunDirectory.open(command.run), command.out)]
-    tell(command, {"paths": paths}, "\n".join(paths))
+    runs = open_runs(command.runs)
+    own = (command.metric, command.agent, *command.label)
+    if len(runs) == 1 and all(word is None for word in own) and command.band == "iqr":
+        paths = [str(path) for path in plot_run(runs[0], command.out)]
+        tell(command, {"paths": paths}, "\n".join(paths))
+        return
+    figure = plot_curves(
+        command.runs,
+        command.out or "curves",
+        metric=command.metric,
+        agent=command.agent,
+        band=command.band,
+        labels=command.label or None,
+        width=command.width,
+    )
+    result = {
+        "paths": [str(path) for path in figure.paths],
+        "caption": figure.caption,
+        "metric": figure.metric,
+        "lines": {line.label: line.seeds for line in figure.lines},
+    }
+    tell(command, result, "\n".join([*map(str, figure.paths), figure.caption]))
 
 
 def _report(command: commands.Report) -> None:
@@ -126,13 +148,13 @@ def _report(command: commands.Report) -> None:
         filmed=command.films,
         seed=command.seed,
         deterministic=command.deterministic,
+        quiet=command.quiet,
     )
     _tell_page(command, page)
 
 
 def _compare(command: commands.Compare) -> None:
-    runs = [RunDirectory.open(path) for path in command.runs]
-    _tell_page(command, write_comparison(runs, command.out))
+    _tell_page(command, write_comparison(open_runs(command.runs), command.out))
 
 
 def _tell_page(command: commands.Output, told: dict[str, Any]) -> None:

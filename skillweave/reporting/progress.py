@@ -227,10 +227,15 @@ class EpisodeProgress:
 
     def watch(self, played: Any) -> None:
         """See a step of some episodes (``Played``)."""
+        over = np.count_nonzero(played.over & (played.episode >= 0))
+        self.count(int(played.lasted.sum()), int(over))
+
+    def count(self, steps: int, over: int) -> None:
+        """See ``steps`` more steps, and ``over`` more episodes that have ended."""
         if self._quiet:
             return
-        self._steps += int(played.lasted.sum())
-        self._over += int(np.count_nonzero(played.over & (played.episode >= 0)))
+        self._steps += steps
+        self._over += over
         now = time.monotonic()
         pause = PATIENCE if self._display is None else self._display.every
         if now - self._shown < pause:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from reporting.walkway import declare
 
 from skillweave.reporting import progress as module
 from skillweave.reporting.progress import EpisodeProgress, Progress
@@ -339,3 +340,20 @@ def test_episodes_are_not_shown_without_a_terminal_where_quiet_or_under_another_
             evaluate(EpisodeProgress(20))
     assert "evaluation" not in terminal.getvalue()
     assert capsys.readouterr().err == ""
+
+
+def test_a_report_shows_the_episodes_that_it_plays_and_films(
+    terminal: Terminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("vl_convert")
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setattr(module, "PATIENCE", 0.0)
+    monkeypatch.setattr("skillweave.reporting.displays.Bars.every", 0.0)
+    run = declare().train(tmp_path / "run", quiet=True)
+    with redirect_stderr(terminal):
+        run.report(episodes=4, films=2, quiet=True)
+        assert terminal.getvalue() == ""
+        run.report(episodes=4, films=2)
+    lines = [" ".join(line.split()) for line in screen(terminal)]
+    assert any(re.match(r"report \S+ \d of 4 episodes", line) for line in lines)
+    assert any(re.match(r"film \S+ 2 of 2 episodes 18 steps", line) for line in lines)

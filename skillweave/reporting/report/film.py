@@ -12,6 +12,7 @@ import numpy as np
 
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
+from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import frame_of
 from skillweave.reporting.video_file import VideoWriter
@@ -39,8 +40,13 @@ class Film:
 
 
 @without_screen()
-def make_film(spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[int]) -> Film:
+def make_film(
+    spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[int], *, quiet: bool = True
+) -> Film:
     """Play the chosen episodes again from their seeds, with the same actions, and film them.
+
+    Args:
+        quiet: no progress.
 
     Raises:
         SkillweaveError: the environment gives no frames, or does not repeat itself.
@@ -57,17 +63,23 @@ def make_film(spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[in
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            with VideoWriter(path, fps, bits) as video:
+            progress = EpisodeProgress(len(chosen), quiet=quiet, name="film")
+            with VideoWriter(path, fps, bits) as video, progress:
                 for i in chosen:
                     first[i] = video.frames
-                    _replay(env, engine, episodes[i], video, every)
+                    _replay(env, engine, episodes[i], video, every, progress)
             return Film(path.read_bytes(), fps, every, first)
     finally:
         engine.close()
 
 
 def _replay(
-    env: Any, engine: GymnasiumEngine, episode: EpisodeLog, video: VideoWriter, every: int
+    env: Any,
+    engine: GymnasiumEngine,
+    episode: EpisodeLog,
+    video: VideoWriter,
+    every: int,
+    progress: EpisodeProgress,
 ) -> None:
     row = np.arange(1)
     engine.reset_some(row, [episode.seed])
@@ -75,6 +87,7 @@ def _replay(
         if i % every == 0:
             video.add(_enlarged(frame_of(env)))
         raw = engine.step(action[None], row)
+        progress.count(1, i + 1 == len(episode.actions))
         over = bool(raw.terminated[0] | raw.truncated[0])
         if float(raw.reward[0]) != reward or (over and i + 1 < len(episode.actions)):
             raise SkillweaveError(

@@ -14,6 +14,7 @@ from skillweave.envs.obs_names import ObsNames
 from skillweave.messages import whole_number
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.palette import RGB, color_of
+from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report import charts, facts
 from skillweave.reporting.report.calls import (
     chosen_episodes,
@@ -48,6 +49,7 @@ from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import AGENT
+from skillweave.training.play import Played as PlayedStep
 from skillweave.training.skill_report import levels_of
 from skillweave.types import Policy, SkillweaveError
 
@@ -74,16 +76,29 @@ class Played:
 
 
 def play_episodes(
-    policy: Policy, spec: EnvSpec, episodes: int, filmed: int, seed: int, deterministic: bool
+    policy: Policy,
+    spec: EnvSpec,
+    episodes: int,
+    filmed: int,
+    seed: int,
+    deterministic: bool,
+    quiet: bool = True,
 ) -> Played:
     """Play episodes with seeds that training never used, and film some of them."""
     log = CallLog(policy, episode_seeds(seed, episodes))
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
-    score = evaluate(policy, spec, watch=log.add, max_steps=LONGEST_FILM, **how)
+    with EpisodeProgress(episodes, quiet=quiet, name="report") as progress:
+
+        def watch(played: PlayedStep) -> None:
+            log.add(played)
+            progress.watch(played)
+
+        score = evaluate(policy, spec, watch=watch, max_steps=LONGEST_FILM, **how)
     film, missing = None, []
     if filmed:
         try:
-            film = make_film(spec, log.episodes, chosen_episodes(log.episodes, filmed))
+            chosen = chosen_episodes(log.episodes, filmed)
+            film = make_film(spec, log.episodes, chosen, quiet=quiet)
         except SkillweaveError as error:
             missing.append(f"There is no film: {_sentence(error)}")
     if any(isinstance(skill, RecordedSkill) for skill in log.skills):
@@ -113,6 +128,7 @@ def write_report(
     filmed: int = FILMED,
     seed: int = 0,
     deterministic: bool = True,
+    quiet: bool = True,
 ) -> dict[str, Any]:
     """Write a run's report: one HTML file.
 
@@ -123,6 +139,7 @@ def write_report(
         filmed: of these, so many are in the film, from the worst to the best.
         seed: picks the episodes, as in ``evaluate``.
         deterministic: act greedily, else sample.
+        quiet: no progress.
 
     Returns:
         ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
@@ -144,7 +161,7 @@ def write_report(
     played = None
     if policy is not None and spec is not None:
         try:
-            played = play_episodes(policy, spec, episodes, filmed, seed, deterministic)
+            played = play_episodes(policy, spec, episodes, filmed, seed, deterministic, quiet)
             missing += played.missing
         except SkillweaveError as error:
             missing.append(f"There are no episodes and no film: {_sentence(error)}")

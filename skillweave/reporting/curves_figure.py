@@ -1,0 +1,297 @@
+"""A figure for papers: learning curves of several seeds, as PNG and SVG."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from skillweave.arguments import checked_names
+from skillweave.messages import as_path, close_matches, short
+from skillweave.reporting.report.curves import read_curves
+from skillweave.reporting.report.groups import grouped
+from skillweave.reporting.report.seeds import on_one_grid
+from skillweave.reporting.report.verdict import is_binary
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import must_be_own
+from skillweave.runs.several import open_runs
+from skillweave.training.evaluation_file import load_evaluation
+from skillweave.types import Array, MissingExtra, SkillweaveError
+
+Band = Literal["iqr", "range", "none"]
+Paths: TypeAlias = str | Path | Sequence[str | Path]
+Curve: TypeAlias = list[tuple[int, float]]
+
+WIDTH = 3.3
+"""Inches: a column of a two-column paper."""
+FONT = 8.0
+"""Points, at that width."""
+DPI = 300
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe & Ito (2008): colours that people with a colour deficiency tell apart."""
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1.5, 1.5, 1.5)))
+"""Styles of lines, for prints without colours."""
+BANDS = {"iqr": "interquartile range", "range": "lowest to highest", "none": ""}
+WHOLE = ("selector", "together", "agent")
+"""Kinds of stages in which the whole policy acts."""
+AXES = {
+    "return": "mean return",
+    "eval_return": "mean return of evaluations",
+    "success": "episodes solved",
+    "eval_success": "episodes solved in evaluations",
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """What is drawn of several seeds; arrays (G,)."""
+
+    label: str
+    seeds: int
+    steps: Array
+    middle: Array
+    low: Array | None
+    """None: there is no band."""
+    high: Array | None
+
+
+@dataclass(frozen=True)
+class CurvesFigure:
+    """The files of a figure, and what stands in it."""
+
+    paths: tuple[Path, ...]
+    lines: tuple[Line, ...]
+    metric: str
+    caption: str
+    """A sentence for the paper: what lines and bands are."""
+
+
+@checked_names
+def plot_curves(
+    runs: Paths | Mapping[str, Paths],
+    out: str | Path = "curves",
+    *,
+    metric: str | None = None,
+    agent: str | None = None,
+    band: Band = "iqr",
+    labels: Sequence[str] | None = None,
+    width: float = WIDTH,
+    height: float | None = None,
+) -> CurvesFigure:
+    """Draw the learning curves of several seeds: their median, and a band around it.
+
+    The curve is that of the whole policy. Its steps count from the start of the run, those in
+    which skills learnt before included, so hierarchies and flat agents can be compared.
+
+    Args:
+        runs: directories of runs, or of sweeps; runs that differ by their seed alone are one line.
+            A dict gives the lines their names: ``{"ours": "runs/a", "flat": ["b", "c"]}``.
+        out: the files to write, without suffix: ``out.png`` and ``out.svg``.
+        metric: of ``metrics.jsonl``; None: ``eval_return`` where every run has it, else ``return``.
+        agent: a skill's name, or ``"selector"``, for a curve of it over the steps of its stages.
+        band: "iqr": from the 25th to the 75th percentile of the seeds; "range": from the lowest to
+            the highest; "none". One seed has no band.
+        labels: names of the lines, in place of those made from settings.
+        width: of the figure in inches; letters have 8 points.
+        height: in inches; None: two thirds of the width, and room for the names.
+
+    Returns:
+        The files, the lines that are in them, and a sentence for the caption.
+
+    Raises:
+        SkillweaveError: there is no such metric, the runs have no steps in common, or the files
+            cannot be written.
+        MissingExtra: the extra 'plot' is not installed.
+    """
+    out = as_path(out, "out")
+    if band not in get_args(Band):
+        raise SkillweaveError(f"band is {short(band)}; it must be one of {', '.join(BANDS)}")
+    for name, size in (("width", width), ("height", height)):
+        if size is not None and not (isinstance(size, int | float) and 1 <= size <= 40):
+            raise SkillweaveError(f"{name} is {short(size)}; it must be from 1 to 40 inches")
+    must_be_own(out.parent)
+    groups = _groups(runs)
+    groups = _renamed(groups, labels) if labels is not None else groups
+    everyone = [run for own in groups.values() for run in own]
+    metric = _metric(everyone, metric, agent)
+    lines = tuple(_line(label, own, metric, agent, band) for label, own in groups.items())
+    binary = metric.endswith("success") or (metric in AXES and agent is None and _binary(everyone))
+    paths = _draw(lines, out, metric, agent, binary, width, height)
+    return CurvesFigure(paths, lines, metric, _caption(lines, band))
+
+
+def _groups(runs: Paths | Mapping[str, Paths]) -> dict[str, list[RunDirectory]]:
+    """The runs of each line, by its name."""
+    if isinstance(runs, Mapping):
+        return {str(label): open_runs(_paths(own)) for label, own in runs.items()}
+    return {group.name: group.runs for group in grouped(open_runs(_paths(runs)))}
+
+
+def _paths(paths: Paths) -> list[Path]:
+    listed = [paths] if isinstance(paths, str | Path) else list(paths)
+    return [as_path(path, "runs") for path in listed]
+
+
+def _renamed(
+    groups: dict[str, list[RunDirectory]], labels: Sequence[str]
+) -> dict[str, list[RunDirectory]]:
+    names = [labels] if isinstance(labels, str) else list(labels)
+    if len(names) != len(groups) or len(set(names)) < len(names):
+        raise SkillweaveError(
+            f"{len(names)} labels for {len(groups)} lines; give each line a name of its own, in "
+            f"this order: {'; '.join(groups)}"
+        )
+    return dict(zip(names, groups.values(), strict=True))
+
+
+def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None) -> str:
+    """The metric that is drawn; every run has it."""
+    known = [set(_curves_of(run, agent)) for run in runs]
+    common = set.intersection(*known)
+    if metric is None:
+        metric = next((m for m in ("eval_return", "return") if m in common), "return")
+    for run, own in zip(runs, known, strict=True):
+        if metric not in own:
+            whose = "the whole policy" if agent is None else repr(agent)
+            if not own:
+                agents = ", ".join(dict.fromkeys(c.agent for c in read_curves(run))) or "none yet"
+                raise SkillweaveError(
+                    f"{run.path} has no metrics of {whose}; there are metrics of: {agents}"
+                )
+            raise SkillweaveError(
+                f"{run.path} has no metric {short(metric)} of {whose}."
+                f"{close_matches(metric, own) or ' There are: ' + ', '.join(sorted(own))}"
+            )
+    return metric
+
+
+def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
+    """Curves by metric: of an agent, or of the whole policy over all steps of the run."""
+    all_curves = read_curves(run)
+    if agent is not None:
+        wanted = {c.stage: c.points for c in all_curves if c.agent == agent}
+    else:
+        whole = {e["name"] for e in run.manifest["stages"] if e["kind"] in WHOLE}
+        wanted = {c.stage: c.points for c in all_curves if c.agent == c.stage and c.stage in whole}
+    before, parts = 0, list[tuple[int, dict[str, Curve]]]()
+    for entry in run.manifest["stages"]:
+        if entry["name"] in wanted:
+            parts.append((before, wanted[entry["name"]]))
+        # An agent's steps are those of the stages in which it learns.
+        if agent is None or entry["name"] in wanted:
+            before += int(entry.get("steps", entry["budget"]))
+    names = dict.fromkeys(name for _, points in parts for name in points)
+    return {m: _joined([(b, points[m]) for b, points in parts if m in points]) for m in names}
+
+
+def _joined(parts: Sequence[tuple[int, Curve]]) -> Curve:
+    """Curves one after another, each moved by the steps before it."""
+    return [(before + x, y) for before, points in parts for x, y in points]
+
+
+def _line(
+    label: str, runs: Sequence[RunDirectory], metric: str, agent: str | None, band: Band
+) -> Line:
+    curves = [_curves_of(run, agent)[metric] for run in runs]
+    gridded = on_one_grid(curves)
+    if gridded is None:
+        raise SkillweaveError(f"the runs of {label!r} have no steps in common: train them as long")
+    steps, values = gridded
+    low = high = None
+    if len(runs) > 1 and band != "none":
+        ends = (25, 75) if band == "iqr" else (0, 100)
+        low, high = np.percentile(values, ends, axis=0)
+    return Line(label, len(runs), steps, np.median(values, axis=0), low, high)
+
+
+def _binary(runs: Sequence[RunDirectory]) -> bool:
+    """Whether every return of the runs' evaluations is 0 or 1, and there are evaluations."""
+    saved = [load_evaluation(run) for run in runs]
+    returns = [r for e in saved if e is not None for r in e.evaluation.returns]
+    return bool(returns) and is_binary(returns)
+
+
+def _caption(lines: Sequence[Line], band: Band) -> str:
+    counts = sorted({line.seeds for line in lines})
+    if counts == [1]:
+        return "Lines: one seed each."
+    seeds = " to ".join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))
+    shown = "" if band == "none" else f"; bands: {BANDS[band]}"
+    return f"Lines: median of {seeds} seeds{shown}."
+
+
+def _draw(
+    lines: Sequence[Line],
+    out: Path,
+    metric: str,
+    agent: str | None,
+    binary: bool,
+    width: float,
+    height: float | None,
+) -> tuple[Path, ...]:
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
+    except ImportError as error:
+        raise MissingExtra("plotting", "plot") from error
+    named = len(lines) > 1
+    if height is None:
+        height = 0.62 * width + (0.17 * len(lines) if named else 0.0)
+    # The same figure is the same file.
+    with matplotlib.rc_context({"font.size": FONT, "svg.hashsalt": "skillweave"}):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        axes = figure.add_subplot()
+        for i, line in enumerate(lines):
+            look: dict[str, Any] = {"color": COLORS[i % len(COLORS)], "zorder": 3}
+            dashes = DASHES[i % len(DASHES)]
+            label = _shortened(line.label, width)
+            axes.plot(line.steps, line.middle, linewidth=1.4, linestyle=dashes, label=label, **look)
+            if line.low is not None and line.high is not None:
+                axes.fill_between(
+                    line.steps, line.low, line.high, alpha=0.2, linewidth=0, color=look["color"]
+                )
+        axes.set_xlabel("environment steps" if agent is None else f"environment steps of {agent}")
+        words = AXES.get(metric, metric.replace("_", " "))
+        if binary:
+            words = words.replace("mean return", "episodes solved")
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+            axes.set_ylim(-0.03, 1.03)
+        axes.set_ylabel(words if agent is None else f"{agent}: {words}")
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.xaxis.set_major_formatter(FuncFormatter(_steps))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="#e3e3e6", linewidth=0.5)
+        axes.set_axisbelow(True)
+        if named:
+            figure.legend(loc="outside upper left", frameon=False, handlelength=2.6, borderpad=0)
+        return _save(figure, out)
+
+
+def _save(figure: Any, out: Path) -> tuple[Path, ...]:
+    stem = out.with_suffix("") if out.suffix in (".png", ".svg") else out
+    paths = tuple(stem.parent / f"{stem.name}{suffix}" for suffix in (".png", ".svg"))
+    try:
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(paths[0], dpi=DPI)
+        figure.savefig(paths[1], metadata={"Date": None})
+    except OSError as error:
+        raise SkillweaveError(f"could not write {stem}: {error.strerror}") from error
+    return paths
+
+
+def _shortened(label: str, width: float) -> str:
+    """A name that fits into the figure."""
+    most = math.floor(width * 14)
+    return label if len(label) <= most else f"{label[: most - 1]}…"
+
+
+def _steps(value: float, _: Any = None) -> str:
+    """Steps on an axis: 200k, 1.5M."""
+    if abs(value) >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"

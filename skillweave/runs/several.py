@@ -1,0 +1,40 @@
+"""Runs by the paths that people name: a run's directory, or a directory of runs, as sweeps are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from skillweave.runs.directory import RunDirectory
+from skillweave.types import SkillweaveError
+
+
+def open_runs(paths: Sequence[Path]) -> list[RunDirectory]:
+    """Open the runs at ``paths``; a directory of runs stands for all of them, in their order.
+
+    Raises:
+        SkillweaveError: a path holds no run, or a run is damaged.
+    """
+    found = []
+    for path in paths:
+        inside = [] if (path / "run.json").exists() else _runs_in(path)
+        # Where neither is there, opening says what a run is.
+        found += [RunDirectory.open(each) for each in inside or [path]]
+    if not found:
+        raise SkillweaveError("no runs were given; name a run's directory, or a sweep's")
+    return found
+
+
+def _runs_in(path: Path) -> list[Path]:
+    """The runs directly below a directory: s2 before s10."""
+    if not path.is_dir():
+        return []
+    runs = [each.parent for each in path.glob("*/run.json")]
+    return sorted(runs, key=lambda run: _by_numbers(run.name))
+
+
+def _by_numbers(name: str) -> list[tuple[int, int, str]]:
+    """A key that sorts numbers in names by their size."""
+    parts = re.split(r"(\d+)", name)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
