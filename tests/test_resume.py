@@ -193,7 +193,12 @@ def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stoppe
 
     def hierarchy() -> Hierarchy:
         found = recipes.load("lunar-lander")
-        budgets = ["skills.stabilize.steps=1", "skills.center.steps=1", "apart.selector_steps=1"]
+        budgets = [
+            "learn=apart",
+            "skills.stabilize.steps=1",
+            "skills.center.steps=1",
+            "apart.selector_steps=1",
+        ]
         apply_overrides(found, [*budgets, "skills.landing.steps=24000", "train.checkpoint_every=1"])
         return found
 
@@ -388,7 +393,7 @@ def test_a_hierarchy_that_learns_from_replay_ends_as_if_it_had_not_been_stopped(
     tmp_path: Path,
 ) -> None:
     text = RECIPE.replace(', engine="ENGINE"', "").replace("Left.algorithm = moving\n", "")
-    text = text.replace("import Network, PPO,", "import DQN, SAC, Network, PPO,")
+    text = text.replace("Apart, Network, PPO,", "Apart, DQN, SAC, Network, PPO,")
     replay = "num_envs=4, learning_starts=40, buffer_size=300, batch_size=8, update_ratio=0.25"
     replay += ", network=Network((8,))"
     text = text.replace("    algorithm=small,", f"    algorithm=DQN.rainbow({replay}),")
@@ -436,9 +441,9 @@ LEARNERS = {
 
 
 FEWER_STEPS = {
-    "apart.skill_steps=300": "apart.skill_steps=200",
-    "apart.selector_steps=750": "apart.selector_steps=400",
-    "train.checkpoint_every=75": "train.checkpoint_every=50",
+    "skill_steps=300": "skill_steps=200",
+    "selector_steps=750": "selector_steps=400",
+    "checkpoint_every=75": "checkpoint_every=50",
 }
 
 

@@ -98,7 +98,8 @@ class Demo:
         self.say(
             "   Skills, by the share of steps in which they act: "
             f"{shares(self.result['mission']['skill_usage'])}.\n"
-            "   (This mission has no part for hover. Others have: skillweave train lander-missions.)"
+            "   (This mission has no part for hover; others do: skillweave train "
+            "lander-missions.)"
         )
         _, flat, seconds = self._learn(hierarchy, MISSION, "mission-flat", flat=True)
         self.say(

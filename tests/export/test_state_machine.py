@@ -236,9 +236,8 @@ def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
     assert decisions == {True, False}
 
 
-@pytest.mark.parametrize("deciding", [True, False])
-def test_why_calls_are_interrupted_is_the_same(tmp_path: Path, deciding: bool) -> None:
-    policy = interrupted(0.02 if deciding else 0.5, deciding=deciding)
+def test_why_calls_are_interrupted_is_the_same(tmp_path: Path) -> None:
+    policy = interrupted(0.02, deciding=True)
     export = write_export(tmp_path, policy, "walk")
     runner = Runner(tmp_path, export.functions)
     env, player, whys = LongWalk(), Player(policy), set()

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave import SkillweaveError, Step
+from skillweave import Apart, SkillweaveError, Step
 from skillweave.recipes import _arm as world
 from skillweave.recipes import pick_and_place as arm
 
@@ -223,7 +223,9 @@ def test_a_selector_is_learnt_over_skills_with_and_without_the_tree_beside_it(de
     pytest.importorskip("mujoco")
     pytest.importorskip("gymnasium_robotics")
     small = replace(arm.SELECTOR, num_envs=2, n_steps=64, update_epochs=1)
-    found = declare(world.Disturbances(), selector=small, selector_steps=256)
+    found = declare(
+        world.Disturbances(), selector=small, apart=Apart(skill_steps=256, selector_steps=256)
+    )
     found.env = replace(found.spec, workers=1)
     found.skill("recover").policy = arm.above
     run = found.train(tmp_path / "run", quiet=True)
