@@ -202,7 +202,11 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # Names are imported when first used: torch takes two seconds, which `--help` must not pay.
     if name not in _HOME:
-        raise AttributeError(f"module 'skillweave' has no attribute {name!r}")
+        from difflib import get_close_matches
+
+        near = get_close_matches(name, __all__, n=1)
+        hint = f": is {near[0]!r} meant?" if near else ""
+        raise AttributeError(f"module 'skillweave' has no attribute {name!r}{hint}")
     return getattr(importlib.import_module(f"skillweave.{_HOME[name]}"), name)
 
 

@@ -115,6 +115,10 @@ def _wrong_arguments(
     name = owner.__name__ if makes and owner is not None else function.__name__
     who, what = (name, "setting") if makes and is_dataclass(owner) else (f"{name}()", "argument")
     by_name = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    if makes and not parameters:
+        example = next((f"{k} = {short(v, 40)}" for k, v in named.items()), "")
+        advice = f"write {example} in the body of the class, or give" if example else "give"
+        return f"{who} takes no arguments: {advice} it an __init__ of its own"
     takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
     if not takes_all and (unknown := [k for k in named if k not in by_name]):
         places = [_Place(k, "", "") for k in by_name]

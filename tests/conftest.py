@@ -94,3 +94,9 @@ def forget_registered() -> Iterator[None]:
     yield
     config._REGISTERED.clear()
     config._REGISTERED.update(known)
+
+
+@pytest.fixture
+def unprobed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Call functions for the environments alone: for tests that record calls."""
+    monkeypatch.setattr("skillweave.skills.probing._other_sizes", lambda *_: ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
 import sys
@@ -27,6 +28,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     given = ["--no-deterministic" if word == "--stochastic" else word for word in words]
     given = _with_addresses(given)
+    if (wrong := _unknown_command(words, [commands.name_of(c) for c in commands.COMMANDS])) != "":
+        print(f"error: {wrong}", file=sys.stderr)
+        return 2
     parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         parser,
@@ -50,6 +54,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(command, str(error) or "interrupted", 130)
     except BrokenPipeError:
         return 1
+
+
+def _unknown_command(words: Sequence[str], known: Sequence[str]) -> str:
+    """Return a sentence about a first word that is no command; empty if it is one, or none."""
+    if not words or words[0] in known or words[0].startswith("-"):
+        return ""
+    near = difflib.get_close_matches(words[0], known, n=1)
+    hint = f"is {near[0]!r} meant?" if near else f"the commands are {', '.join(known)}"
+    return f"no command {words[0]!r}: {hint} (skillweave --help)"
 
 
 def _with_addresses(words: Sequence[str]) -> list[str]:

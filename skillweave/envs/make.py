@@ -160,8 +160,14 @@ class EnvSpec:
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error
             raise SkillweaveError(f"the environment {env_id} needs more: {error}") from error
         except (gym.error.Error, ImportError) as error:
-            why, near = shortened(str(error)).rstrip("."), close_matches(env_id, gym.registry)
-            raise SkillweaveError(f"no environment {short(env_id)}: {why}.{near}") from error
+            why, advice = shortened(str(error)).rstrip("."), close_matches(env_id, gym.registry)
+            if not advice and ":" not in env_id:
+                advice = (
+                    " If a package of its own registers it, install that and import it, or write "
+                    f"its module first: 'module:{env_id}'."
+                )
+            why += "" if why.endswith("?") else "."
+            raise SkillweaveError(f"no environment {short(env_id)}: {why}{advice}") from error
 
     def observation_names(self) -> ObsNames | None:
         """Return the names of an observation's numbers; None: they have none.

@@ -13,6 +13,7 @@ from skillweave.collecting.guide import LastCall
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.probing import probe
 from skillweave.skills.ready import required_arguments
 from skillweave.types import Array, Memory, SkillweaveError, Step, read_only
 
@@ -58,12 +59,15 @@ class FunctionSelector(ReadySelector):
         if self.asks_last:
             last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
             value = called(lambda given: function(given, last), read_only(obs), self._who)
+            given: Any = (obs, last)
         else:
             value = called(function, read_only(obs), self._who)
+            given = obs
         chosen = as_array(value, self._who)
         if chosen.dtype.kind in "UO" and chosen.shape == (len(obs),):
             chosen = np.array([self._number(name, self._who) for name in chosen.tolist()], int)
         chosen = checked_actions(chosen, len(obs), Discrete(len(self.skills)), self._who)
+        probe(function, given, len(obs), self._who)
         self._check_starts(chosen, obs, mask)
         return chosen, memory
 

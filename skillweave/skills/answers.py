@@ -9,6 +9,7 @@ import numpy as np
 
 from skillweave.messages import short
 from skillweave.skills.outputs import as_array, at_step, called
+from skillweave.skills.probing import probe
 from skillweave.types import LARGEST_REWARD, Array, SkillweaveError, Step, read_only, wrong_reward
 
 
@@ -30,7 +31,9 @@ def answer(
     if isinstance(about, np.ndarray):
         about = read_only(about)
     value = called(function, about, f"{who}: {method}()", elapsed)
-    return checked(value, n, dtype, who, method, elapsed, ids)
+    array = checked(value, n, dtype, who, method, elapsed, ids)
+    probe(function, about, n, f"{who}: {method}()")
+    return array
 
 
 def checked(
@@ -52,11 +55,17 @@ def checked(
         SkillweaveError: it has another shape or kind, or is a NaN or an infinity; the message
             names the skill, the method and the step.
     """
+    if value is None:
+        raise SkillweaveError(
+            f"{who}: {method}() returned None{at_step(elapsed)}, but shape ({n},) was expected: "
+            "does it lack a return?"
+        )
     array = as_array(value, f"{who}: {method}()")
     if array.shape != (n,):
+        one = "yes or no" if dtype is bool else "number"
         raise SkillweaveError(
             f"{who}: {method}() returned shape {array.shape}{at_step(elapsed)}, but ({n},) was "
-            f"expected: one number for each of the {n} environments"
+            f"expected: one {one} for each of the {n} environments, the first axis of every array"
         )
     if dtype is bool:
         return (

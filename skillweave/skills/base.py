@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import warnings
@@ -17,6 +16,8 @@ from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.skills.answers import answer
 from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.probing import probe
+from skillweave.skills.spelling import misspelt
 from skillweave.types import Array, SkillweaveError, Step
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
@@ -70,6 +71,10 @@ class Skill:
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
 
     _path: str = ""
+
+    @checked_names
+    def __init__(self) -> None:
+        super().__init__()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -145,7 +150,8 @@ class Skill:
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
                 "0 to 255: color = (230, 80, 60)"
             )
-        for name, meant in self._misspelt():
+        known = [*Skill.__annotations__.keys() - {"methods", "_path"}, *self.methods]
+        for name, meant in misspelt(self, Skill, known):
             warnings.warn(
                 f"{where} has {name!r}, which Skillweave does not know: is {meant!r} meant?",
                 stacklevel=2,
@@ -155,16 +161,6 @@ class Skill:
                 raise SkillweaveError(
                     f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
-
-    def _misspelt(self) -> Iterator[tuple[str, str]]:
-        """Names of the subclass that are nearly those of attributes, with these."""
-        meant = [*Skill.__annotations__.keys() - {"methods", "_path"}, *self.methods]
-        for kind in type(self).__mro__[: type(self).__mro__.index(Skill)]:
-            for name in vars(kind).keys() - set(dir(Skill)):
-                if name.startswith("_"):
-                    continue
-                if found := difflib.get_close_matches(name, meant, n=1, cutoff=0.9):
-                    yield name, found[0]
 
 
 def _is_color(value: object) -> bool:
@@ -273,7 +269,9 @@ class Reflex:
         n, who = len(obs), f"{self._who}: action"
         if not callable(self.action):
             return np.repeat(self.fixed(space)[None], n, axis=0)
-        return checked_actions(called(self.action, obs, f"{who}()"), n, space, f"{who}()")
+        actions = checked_actions(called(self.action, obs, f"{who}()"), n, space, f"{who}()")
+        probe(self.action, obs, n, f"{who}()", space.shape or ())
+        return actions
 
 
 def apply_reflexes(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
+from skillweave.arguments import meant
 from skillweave.messages import short, told
 from skillweave.tracebacks import is_users
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array, SkillweaveError, Step
 
 
 def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
@@ -24,14 +26,40 @@ def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
     except SkillweaveError:
         raise
     except Exception as error:
-        # the message of numpy says only that something is read-only
-        hint = "; what it is given cannot be changed: change a copy"
-        hint = hint if "read-only" in told(error) else ""
         about = getattr(argument, "shape", None)
         given = "" if about is None else f" for observations of shape {about}"
         raise SkillweaveError(
-            f"{who} raised {told(error)}{at_step(elapsed)}{given}{hint}"
+            f"{who} raised {told(error)}{at_step(elapsed)}{given}{_advice(error, argument)}"
         ) from error
+
+
+def _advice(error: Exception, argument: Any) -> str:
+    """What to write instead, for the mistakes that are made most; else nothing."""
+    text, step = str(error), isinstance(argument, Step)
+    name = getattr(error, "name", None) if isinstance(error, AttributeError) else None
+    if "read-only" in text:
+        return "; what it is given cannot be changed: change a copy"
+    if "truth value of an array" in text:
+        return "; combine arrays by & and |, with each side in parentheses, and use np.where for if"
+    if "positional argument" in text and "given" in text and _not_entered(error):
+        what = "(self, step)" if step else "(self, obs)"
+        return f"; a method of a skill takes {what}, another function the last of these alone"
+    if step and ("not subscriptable" in text or name in dir(np.ndarray)):
+        return "; it is given a Step: write step.next_obs[:, 0]"
+    if step and name is not None and getattr(error, "obj", None) is argument:
+        known = [f.name for f in fields(Step)]
+        return meant(name, known, "a Step has").replace(": is", "; is")
+    if isinstance(argument, np.ndarray) and name in Step.__slots__:
+        return "; it is given observations, not a Step: write obs[:, 0]"
+    if isinstance(error, IndexError) and step:
+        return f"; step.next_obs has the shape {argument.next_obs.shape}"
+    return ""
+
+
+def _not_entered(error: Exception) -> bool:
+    """Whether a function was called wrongly, and none of its lines ran."""
+    frames = error.__traceback__
+    return frames is not None and frames.tb_next is None
 
 
 def blame(error: Exception, who: str) -> NoReturn:

@@ -11,6 +11,7 @@ from skillweave.arguments import checked_names
 from skillweave.messages import short
 from skillweave.skills.foreign_policy import Foreign, qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.probing import probe
 from skillweave.types import Array, Memory, SkillweaveError, read_only
 
 
@@ -42,7 +43,10 @@ class ScriptedPolicy(Foreign):
         action = called(self.function, read_only(obs), self._who)
         if self.action_space is None:
             return as_array(action, self._who), memory
-        return checked_actions(action, len(obs), self.action_space, self._who), memory
+        n, shape = len(obs), self.action_space.shape or ()
+        actions = checked_actions(action, n, self.action_space, self._who)
+        probe(self.function, obs, n, self._who, shape)
+        return actions, memory
 
     def source(self) -> dict[str, Any]:
         """The function's name."""

@@ -450,6 +450,7 @@ class Nested(gym.Env):
         return obs, 0.0, False, False, {"id": self.number, "deep": deep}
 
 
+@pytest.mark.usefixtures("unprobed")
 def test_a_skill_sees_its_own_rows_of_info_however_deep():
     seen = []
 

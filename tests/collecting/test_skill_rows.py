@@ -255,6 +255,7 @@ def test_a_skills_termination_terminates_and_resets_at_once(collector):
     assert (env.obs[:, EPISODE] == 5).all()
 
 
+@pytest.mark.usefixtures("unprobed")
 def test_a_skill_sees_the_whole_step_and_its_reward_replaces_the_tasks(collector):
     seen = []
 
@@ -289,6 +290,7 @@ def test_a_skill_sees_the_whole_step_and_its_reward_replaces_the_tasks(collector
             assert not len(collected.episodes)
 
 
+@pytest.mark.usefixtures("unprobed")
 def test_elapsed_counts_from_one_in_every_episode(collector):
     elapsed = []
 

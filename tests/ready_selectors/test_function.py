@@ -43,6 +43,7 @@ def test_numbers_and_names_choose_the_same(function):
         assert story(hierarchy(function), seed) == wanted
 
 
+@pytest.mark.usefixtures("unprobed")
 def test_a_function_of_two_arguments_is_told_how_the_last_call_ended():
     told: list[tuple[int, int, bool]] = []
 

@@ -1,0 +1,195 @@
+"""A test of each user's function with other numbers of environments, the first time it is called.
+
+A function that forgets the axis of the environments may return the right shape by chance:
+``step.next_obs[0]`` has four numbers for four environments of CartPole. So the rows of its first
+call are put together to 3 environments, and to more than there are, and it is called with these.
+Only what really occurred is in them. Random streams of Python, NumPy and torch, and of the object
+that a method belongs to, are afterwards as they were.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import random
+import sys
+import types
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from skillweave.messages import told
+from skillweave.types import Array, SkillweaveError, Step, read_only
+
+MOST = 256
+"""Up to so many environments, a function is also called with more than there are."""
+AXIS = (
+    "the first axis of every array is that of the environments: step.next_obs[:, 0], obs[:, 0], "
+    "axis=1"
+)
+"""What messages say to do."""
+CHANGING = (
+    dict, list, set, np.ndarray, random.Random, np.random.Generator, np.random.RandomState,
+)  # fmt: skip
+"""Kinds of attributes that a method may change in place."""
+
+
+class _Seen:
+    """Objects, and names of their functions, that were tested in this process."""
+
+    def __init__(self) -> None:
+        self._names: dict[int, tuple[weakref.ref[Any], set[str]]] = {}
+
+    def first_time(self, owner: Any, name: str) -> bool:
+        """Whether this is the first call with these arguments."""
+        key = id(owner)
+        if (entry := self._names.get(key)) is not None:
+            if name in entry[1]:
+                return False
+            entry[1].add(name)
+            return True
+        try:
+            reference = weakref.ref(owner, lambda _: self._names.pop(key, None))
+        except TypeError:  # of some objects written in C
+            return False
+        self._names[key] = reference, {name}
+        return True
+
+
+_seen = _Seen()
+
+
+def probe(
+    function: Callable[..., Any],
+    given: Step | Array | tuple[Any, ...],
+    n: int,
+    who: str,
+    shape: tuple[int, ...] = (),
+) -> None:
+    """Call a function, if it is its first time, for other numbers of environments than n.
+
+    Args:
+        function: the user's, which has just returned the right shape for n environments.
+        given: its argument, or arguments: a step, or arrays whose first axis has n rows.
+        n: environments.
+        who: what messages call the function.
+        shape: of its answer for one environment.
+
+    Raises:
+        SkillweaveError: its answer does not have a row for each environment; the message names it.
+    """
+    owner = getattr(function, "__self__", function)
+    if not n or not _seen.first_time(owner, getattr(function, "__name__", "")):
+        return
+    arguments = given if isinstance(given, tuple) else (given,)
+    sizes = _other_sizes(n, set(itertools.chain.from_iterable(_sizes(a, n) for a in arguments)))
+    certain = all(_has_rows(a, n) for a in arguments)
+    with _randomness_kept():
+        function = _on_copy(function)
+        for m in sizes:
+            rows = np.arange(m) % n
+            try:
+                answer = function(*(_taken(a, rows, n) for a in arguments))
+            except Exception as error:
+                if not certain:
+                    return
+                raise SkillweaveError(
+                    f"{who} answers for {n} environments, but for {m} it raised {told(error)}: "
+                    f"{AXIS}"
+                ) from error
+            found, wanted = np.shape(answer), (m, *shape)
+            if found != wanted and certain:
+                raise SkillweaveError(
+                    f"{who} returned shape {found} for {m} environments, but {wanted} was "
+                    f"expected; for {n} its shape was right by chance: {AXIS}"
+                )
+
+
+def _other_sizes(n: int, taken: set[int]) -> tuple[int, ...]:
+    """Numbers of environments that differ from n and from the sizes of all other axes."""
+    free = (m for m in itertools.count(3) if m != n and m not in taken)
+    first = next(free)
+    if n > MOST:
+        return (first,)
+    return first, next(m for m in free if m > n)
+
+
+def _values(given: Any) -> Iterator[Any]:
+    """All values in an argument: of a step its arrays and what is in its info."""
+    if is_dataclass(given):
+        for field in fields(given):
+            yield from _values(getattr(given, field.name))
+    elif isinstance(given, Mapping):
+        for value in given.values():
+            yield from _values(value)
+    else:
+        yield given
+
+
+def _sizes(given: Any, n: int) -> Iterator[int]:
+    """The sizes of all axes of an argument but the first."""
+    for array in _values(given):
+        if isinstance(array, np.ndarray):
+            yield from array.shape[1:]
+            yield from _sizes_of_fields(array.dtype)
+
+
+def _sizes_of_fields(dtype: np.dtype[Any]) -> Iterator[int]:
+    for part, *_ in (dtype.fields or {}).values():
+        yield from part.shape
+        yield from _sizes_of_fields(part.base)
+
+
+def _has_rows(given: Any, n: int) -> bool:
+    """Whether an argument holds nothing whose rows cannot be taken, as a list in an info."""
+    plain = bool | int | float | str | None | np.generic
+    return all(
+        isinstance(value, plain) or (isinstance(value, np.ndarray) and value.shape[:1] == (n,))
+        for value in _values(given)
+    )
+
+
+def _taken(given: Any, rows: Array, n: int) -> Any:
+    """The rows of an argument; what has no rows stays as it is."""
+    if is_dataclass(given):
+        parts = {f.name: _taken(getattr(given, f.name), rows, n) for f in fields(given)}
+        kind: Any = type(given)
+        return kind(**parts)
+    if isinstance(given, Mapping):
+        return {key: _taken(value, rows, n) for key, value in given.items()}
+    if isinstance(given, np.ndarray) and given.shape[:1] == (n,):
+        return read_only(given[rows])
+    return given
+
+
+def _on_copy(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of a copy of its object, so that a counter or a generator stays as it was."""
+    if not isinstance(function, types.MethodType):
+        return function
+    try:
+        twin = copy.copy(function.__self__)
+        for name, value in vars(twin).items():
+            if isinstance(value, CHANGING):
+                vars(twin)[name] = copy.deepcopy(value)
+    except Exception:  # it cannot be copied
+        return function
+    return types.MethodType(function.__func__, twin)
+
+
+@contextmanager
+def _randomness_kept() -> Iterator[None]:
+    """Put the global random streams back afterwards."""
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    torch = sys.modules.get("torch")
+    state = None if torch is None else torch.get_rng_state()
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002
+        if torch is not None:
+            torch.set_rng_state(state)

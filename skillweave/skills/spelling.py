@@ -1,0 +1,88 @@
+"""Attributes of a user's skill that look like misspelt ones: what its declaration warns about."""
+
+from __future__ import annotations
+
+import difflib
+import types
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+SIMILAR = 0.9
+"""The least similarity of a name to the attribute that it may be meant for; ``difflib``'s ratio."""
+
+METHODS = {
+    "available": "initiation",
+    "can_start": "initiation",
+    "compute_reward": "reward",
+    "condition": "initiation",
+    "done": "termination",
+    "get_reward": "reward",
+    "init_set": "initiation",
+    "initial": "initiation",
+    "initiate": "initiation",
+    "is_done": "termination",
+    "is_success": "success",
+    "is_terminal": "termination",
+    "is_terminated": "termination",
+    "may_start": "initiation",
+    "precondition": "initiation",
+    "reward_fn": "reward",
+    "reward_function": "reward",
+    "should_stop": "termination",
+    "solved": "success",
+    "stop": "termination",
+    "succeeded": "success",
+    "terminate": "termination",
+    "terminated": "termination",
+    "act": "policy",
+    "predict": "policy",
+}
+"""Names that others give to a skill's methods, with the names that they have here."""
+
+VALUES = {
+    "max_episode_steps": "max_steps",
+    "time_limit": "max_steps",
+    "timeout": "max_steps",
+    "total_timesteps": "steps",
+    "training_steps": "steps",
+    "colour": "color",
+}
+"""The same of attributes that are no methods."""
+
+
+def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Names in a skill that are probably meant for attributes, with these attributes.
+
+    What the skill's own methods use is no mistake, and neither is what begins with "_".
+
+    Args:
+        skill: an instance of a subclass of ``base``.
+        base: the class ``Skill``.
+        known: the attributes that a skill may define.
+    """
+    known = list(known)
+    kinds = type(skill).__mro__[: type(skill).__mro__.index(base)]
+    own = {k: v for kind in reversed(kinds) for k, v in vars(kind).items()} | vars(skill)
+    used = set().union(*(_used(v) for v in own.values()))
+    for name, value in own.items():
+        if name.startswith("_") or name in dir(base):
+            continue
+        near = difflib.get_close_matches(name, known, n=1, cutoff=SIMILAR)
+        elsewhere = (METHODS if callable(value) else VALUES).get(name)
+        if near:
+            yield name, near[0]
+        elif elsewhere is not None and name not in used:
+            yield name, elsewhere
+
+
+def _used(value: Any) -> set[str]:
+    """The names that a function, a property or a wrapped method reads."""
+    function: Callable[..., Any] | None = getattr(value, "fget", None)
+    function = function or getattr(value, "__func__", None) or value
+    code = getattr(function, "__code__", None)
+    return set() if code is None else _names(code)
+
+
+def _names(code: types.CodeType) -> set[str]:
+    inner = (_names(part) for part in code.co_consts if isinstance(part, types.CodeType))
+    return set(code.co_names).union(*inner)

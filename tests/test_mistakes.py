@@ -1,0 +1,484 @@
+"""Typical mistakes of newcomers, and unusual but legal ways: what comes of each.
+
+A mistake ends in a ``SkillweaveError`` that names the thing, or in a warning; what is legal works.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import warnings
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+import skillweave as sw
+from skillweave.selectors.function import FunctionSelector
+from skillweave.types import SkillweaveError
+
+SMALL = sw.PPO(num_envs=4, n_steps=32, batch_size=32)
+FAST: dict[str, Any] = {"steps": 256, "learn": "apart", "algorithm": SMALL, "selector": SMALL}
+
+
+class Good(sw.Skill):
+    def reward(self, step):
+        return step.next_obs[:, 0]
+
+
+class Boom(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        raise ValueError("boom")
+
+
+class Wrong(Boom):
+    def step(self, action):
+        return np.zeros(3, np.float32), 0.0, False, False, {}
+
+
+class Old(Boom):
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, {}
+
+
+def declare(env: Any = "CartPole-v1", skills: Any = None, **settings: Any) -> sw.Hierarchy:
+    return sw.Hierarchy(env, skills or [Good()], **(FAST | settings))
+
+
+def train(*args: Any, **settings: Any) -> sw.Run:
+    return declare(*args, **settings).train("runs/run", quiet=True)
+
+
+def with_skill(**members: Any) -> sw.Run:
+    """Train a skill with these methods and attributes."""
+    return train(skills=[skill(**members)])
+
+
+def skill(**members: Any) -> sw.Skill:
+    return type("S", (sw.Skill,), members)()
+
+
+def trained() -> sw.Hierarchy:
+    """Leave a run in runs/ok."""
+    found = declare()
+    found.train("runs/ok", quiet=True)
+    return found
+
+
+def zeros(_: Any, obs: Any) -> Any:
+    return np.zeros(len(obs), int)
+
+
+def overwrite(_: Any, step: sw.Step) -> Any:
+    step.next_obs[:, 0] = 0
+    return step.reward
+
+
+def file_in_the_way() -> None:
+    Path("afile").write_text("x")
+    declare().train("afile", quiet=True)
+
+
+def by_chance(**members: Any) -> sw.Run:
+    """CartPole has four numbers, and there are four environments."""
+    return with_skill(**members)
+
+
+AXIS = "the first axis of every array is that of the environments"
+MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
+    # Environments
+    "misspelt env id": (lambda: train("CartPol-v1"), "Close matches: CartPole-v1"),
+    "old env id": (lambda: train("LunarLander-v2"), "use `LunarLander-v3` instead"),
+    "env of a package not imported": (lambda: train("ALE/Pong-v5"), "install that and import it"),
+    "env instance": (lambda: train(gym.make("CartPole-v1")), "it must be a Gymnasium id"),
+    "env of no package": (lambda: train("procgen-v0"), "no environment 'procgen-v0'"),
+    "env raises in step": (lambda: train(Boom), "of its episode: step() raised ValueError"),
+    "env returns a wrong shape": (lambda: train(Wrong), "not in its observation_space"),
+    "four values of old gym": (lambda: train(Old), "returned 4 values; Gymnasium asks for five"),
+    "misspelt keyword of an environment": (
+        lambda: train(sw.EnvSpec("CartPole-v1", kwargs={"sutton_bartow_reward": True})),
+        "sutton_bartow_reward",
+    ),
+    # What a skill's methods return
+    "reward (N, 1)": (
+        lambda: with_skill(reward=lambda _, step: step.next_obs[:, :1]),
+        "reward() returned shape (4, 1) at step 1, but (4,) was expected",
+    ),
+    "reward forgets the N axis": (
+        lambda: with_skill(reward=lambda _, step: float(step.next_obs[0][0])),
+        "one number for each of the 4 environments",
+    ),
+    "reward of one element": (
+        lambda: with_skill(reward=lambda _, step: step.next_obs[0, 0]),
+        "one number for each of the 4 environments, the first axis of every array",
+    ),
+    "reward forgets the N axis by chance": (
+        lambda: by_chance(reward=lambda _, step: step.next_obs[0]),
+        f"reward() returned shape (4,) for 3 environments, but (3,) was expected; for 4 its shape "
+        f"was right by chance: {AXIS}",
+    ),
+    "reward over the wrong axis": (
+        lambda: by_chance(reward=lambda _, step: np.linalg.norm(step.next_obs, axis=0)),
+        AXIS,
+    ),
+    "reward mixes axes": (
+        lambda: by_chance(reward=lambda _, step: step.next_obs[:, 0] * step.next_obs[0]),
+        "reward() answers for 4 environments, but for 3 it raised ValueError",
+    ),
+    "termination forgets the N axis by chance": (
+        lambda: by_chance(termination=lambda _, step: step.next_obs[0] > 1),
+        "termination() returned shape (4,) for 3 environments",
+    ),
+    "success forgets the N axis by chance": (
+        lambda: by_chance(success=lambda _, step: step.next_obs[0] > 1),
+        "success() returned shape (4,) for 3 environments",
+    ),
+    "initiation forgets the N axis by chance": (
+        lambda: by_chance(initiation=lambda _, obs: obs[0] > -9),
+        "initiation() returned shape (4,) for 3 environments",
+    ),
+    "a reflex forgets the N axis by chance": (
+        lambda: train(reflexes=[sw.Reflex(lambda obs: obs[0] > 9, action=1, name="safe")]),
+        "reflex 'safe': condition() returned shape (4,) for 3 environments",
+    ),
+    "a reflex's action forgets the N axis by chance": (
+        lambda: train(
+            reflexes=[
+                sw.Reflex(lambda obs: obs[:, 0] > -9, lambda obs: (obs[0] > 0).astype(int), "safe")
+            ]
+        ),
+        "reflex 'safe': action() returned shape (4,) for 3 environments",
+    ),
+    "a policy forgets the N axis by chance": (
+        lambda: sw.from_function(
+            lambda obs: (obs[0] > 0).astype(int), action_space=Boom.action_space
+        ).act({}, np.eye(4)),
+        "function <lambda>() returned shape (4,) for 3 environments",
+    ),
+    "a selector forgets the N axis by chance": (
+        lambda: FunctionSelector(lambda obs: (obs[0] > 9).astype(int))
+        .among(("left", "right"))
+        .act({}, np.eye(4)),
+        "function <lambda>() returned shape (4,) for 3 environments",
+    ),
+    "reward NaN": (
+        lambda: with_skill(reward=lambda _, step: np.full(len(step.obs), np.nan)),
+        "reward() returned nan at step 1 for environment 0: rewards must be finite",
+    ),
+    "reward None": (
+        lambda: with_skill(reward=lambda _, step: None),
+        "reward() returned None at step 1, but shape (4,) was expected: does it lack a return?",
+    ),
+    "termination is one bool": (
+        lambda: with_skill(termination=lambda _, step: False),
+        "termination() returned shape () at step 1, but (4,) was expected: one yes or no for each",
+    ),
+    "termination returns floats": (
+        lambda: with_skill(termination=lambda _, step: step.next_obs[:, 0]),
+        "but yes or no (bool) is asked: compare with something",
+    ),
+    "termination uses and": (
+        lambda: with_skill(
+            termination=lambda _, step: step.next_obs[:, 0] > 1 and step.next_obs[:, 1] > 0
+        ),
+        "combine arrays by & and |, with each side in parentheses",
+    ),
+    "termination takes obs": (
+        lambda: with_skill(termination=lambda _, obs: obs[:, 0] > 1),
+        "it is given a Step: write step.next_obs[:, 0]",
+    ),
+    "termination takes the mean of obs": (
+        lambda: with_skill(termination=lambda _, obs: obs.mean(axis=1) > 1),
+        "it is given a Step: write step.next_obs[:, 0]",
+    ),
+    "initiation takes a step": (
+        lambda: with_skill(initiation=lambda _, step: step.obs[:, 0] > 1),
+        "it is given observations, not a Step: write obs[:, 0]",
+    ),
+    "initiation False everywhere": (
+        lambda: with_skill(initiation=lambda _, obs: np.zeros(len(obs), bool)),
+        "Let at least one start everywhere",
+    ),
+    "no self": (
+        lambda: with_skill(reward=lambda step: step.next_obs[:, 0]),
+        "a method of a skill takes (self, step)",
+    ),
+    "index out of range": (
+        lambda: with_skill(reward=lambda _, step: step.next_obs[:, 9]),
+        "step.next_obs has the shape (4, 4)",
+    ),
+    "misspelt field of a step": (
+        lambda: with_skill(reward=lambda _, step: step.next_observations[:, 0]),
+        "is 'next_obs' meant?",
+    ),
+    "reward overwrites step.next_obs": (
+        lambda: with_skill(reward=overwrite),
+        "what it is given cannot be changed: change a copy",
+    ),
+    # Declarations
+    "skill class": (lambda: train(skills=[Good]), "write Center(), not Center"),
+    "skill with arguments": (
+        lambda: Good(max_steps=50),
+        "Good() takes no arguments: write max_steps = 50 in the body of the class",
+    ),
+    "one skill, no list": (lambda: train(skills=Good()), "skills=[Center(), ...]"),
+    "two skills of one name": (lambda: train(skills=[Good(), Good()]), "give one another name"),
+    "no skills": (lambda: sw.Hierarchy("CartPole-v1", []), "needs at least one skill"),
+    "misspelt keyword of Hierarchy": (
+        lambda: declare(skill_step=5),
+        "is 'skill_steps' meant, a setting of apart? Write apart=Apart(skill_steps=...)",
+    ),
+    "keyword of a group": (
+        lambda: declare(skill_steps=5),
+        "Hierarchy has no setting 'skill_steps'; it is a setting of apart: write "
+        "apart=Apart(skill_steps=...)",
+    ),
+    "keyword of the guide": (lambda: declare(restrict=True), "write guide=Guide(restrict=...)"),
+    "keyword of the algorithm": (
+        lambda: declare(gamma=0.9), "it is a setting of algorithm: write algorithm=PPO(gamma=...)"
+    ),
+    "keyword of train": (
+        lambda: declare(seed=3),
+        "'seed'; it is an argument of train(): write train(seed=...)",
+    ),
+    "keyword of Hierarchy in train": (
+        lambda: declare().train("runs/r", call_steps=5), "write Hierarchy(call_steps=...)"
+    ),
+    "misspelt keyword of train": (lambda: declare().train("runs/r", sed=5), "is 'seed' meant"),
+    "misspelt keyword of PPO": (
+        lambda: sw.PPO(learning_rat=1e-3),
+        "PPO has no setting 'learning_rat': is 'learning_rate' meant?",
+    ),
+    "keyword of another library": (lambda: sw.PPO(n_envs=8), "is 'num_envs' meant?"),
+    "misspelt keyword of Together": (lambda: sw.Together(intterupt=True), "is 'interrupt' meant?"),
+    "misspelt keyword of Agent": (
+        lambda: sw.Agent("CartPole-v1", SMALL, 5, target_retrun=3), "is 'target_return' meant?"
+    ),
+    "misspelt keyword of train_agent": (
+        lambda: sw.train_agent("CartPole-v1", SMALL, 5, "runs/r", seeed=3), "is 'seed' meant?"
+    ),
+    "train_agent without a budget": (
+        lambda: sw.train_agent("CartPole-v1", SMALL),
+        "train_agent() needs steps",
+    ),
+    "misspelt attribute": (
+        lambda: setattr(declare(), "call_step", 5),
+        "Hierarchy has no setting 'call_step': is 'call_steps' meant?",
+    ),
+    "attribute of a group": (
+        lambda: setattr(declare(), "skill_steps", 5),
+        "it is a setting of apart: write apart=Apart(skill_steps=...)",
+    ),
+    "changed group": (
+        lambda: setattr(declare().apart, "skill_steps", 5),
+        "Apart cannot be changed: make another one, with dataclasses.replace(..., skill_steps=5)",
+    ),
+    "misspelt attribute of an agent": (
+        lambda: setattr(sw.Agent("CartPole-v1", SMALL, 5), "stepps", 5), "is 'steps' meant?"
+    ),
+    "negative learning rate": (lambda: sw.PPO(learning_rate=-1), "PPO.learning_rate is -1"),
+    "gamma of 99": (lambda: sw.PPO(gamma=99), "PPO.gamma is 99; it must be between 0 and 1"),
+    "batch_size over a rollout": (
+        lambda: sw.PPO(num_envs=4, n_steps=8, batch_size=512), "PPO.batch_size is 512"
+    ),
+    "DQN on continuous actions": (
+        lambda: train("Pendulum-v1", skills=[skill()], algorithm=sw.DQN(num_envs=4)),
+        "DQN cannot act in Box",
+    ),
+    "algorithm as text": (lambda: train(algorithm="PPO"), "algorithm is 'PPO'"),
+    "algorithm class": (lambda: train(algorithm=sw.PPO), "write PPO(), not PPO"),
+    "misspelt way of learning": (lambda: train(learn="jointly"), "'apart, then together'"),
+    "call_steps=0": (lambda: train(call_steps=0), "call_steps is 0; it must be at least 1"),
+    # Runs
+    "run_dir is a file": (file_in_the_way, "afile"),
+    "run_dir not writable": (lambda: declare().train("/proc/x/run", quiet=True), "/proc/x/run"),
+    "load of no run": (lambda: declare().load("runs/nope"), "runs/nope holds no run"),
+    "load of another recipe": (
+        lambda: (trained(), declare(skills=[skill(name="other")]).load("runs/ok")),
+        "runs/ok was trained with the skills good, but this hierarchy has other",
+    ),
+    "resume of another recipe": (
+        lambda: (trained(), declare(skills=[skill(name="other")]).resume("runs/ok")),
+        "runs/ok was trained with the skills good, but this hierarchy has other",
+    ),
+    "load with another env": (
+        lambda: (trained(), declare("Acrobot-v1").load("runs/ok")), "was trained on CartPole-v1"
+    ),
+    "misspelt keyword of evaluate": (
+        lambda: trained().load("runs/ok").evaluate(episode=5), "is 'episodes' meant?"
+    ),
+    "seed by position": (
+        lambda: trained().load("runs/ok").evaluate(5, 3),
+        "evaluate() takes at most 1 of its arguments by position, but 2 were given: name the "
+        "others, seed=... for example",
+    ),
+    "render to .avi": (lambda: trained().load("runs/ok").render("x.avi"), ".gif or .mp4"),
+    "evaluate(0)": (lambda: trained().load("runs/ok").evaluate(0), "episodes is 0"),
+    # Ready parts
+    "selector of an unknown name": (
+        lambda: train(
+            skills=[skill(policy=zeros)], selector=lambda obs: np.full(len(obs), "landd")
+        ).evaluate(2),
+        "names 'landd', which is no skill of the hierarchy; there are: s",
+    ),
+    "selector of floats": (
+        lambda: train(
+            skills=[skill(policy=zeros)], selector=lambda obs: np.zeros(len(obs))
+        ).evaluate(2),
+        "whole numbers",
+    ),
+    "policy of one action for all": (
+        lambda: train(skills=[skill(policy=lambda _, obs: 1)]).evaluate(2),
+        "one action of Discrete(2) for each",
+    ),
+    "policy of an action outside": (
+        lambda: train(skills=[skill(policy=lambda _, obs: np.full(len(obs), 7))]).evaluate(2),
+        "returned 7, which is no action of Discrete(2)",
+    ),
+    "reflex of a forbidden action": (
+        lambda: train(reflexes=[sw.Reflex(lambda obs: obs[:, 0] > 0, action=5)]),
+        "action returned 5, which is no action of Discrete(2)",
+    ),
+    "misspelt tracker": (
+        lambda: declare().train("runs/tr", track=["tensorbord"]),
+        "no tracker 'tensorbord'; there are: tensorboard, wandb, mlflow",
+    ),
+    "tracker as text": (
+        lambda: declare().train("runs/tr", track="tensorboard", quiet=True), "track=['wandb']"
+    ),
+    "seed as text": (lambda: declare().train("runs/sd", seed="1"), "it must be a whole number"),
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write runs into a folder of the test."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("label", MISTAKES)
+def test_a_mistake_is_an_error_that_names_the_thing(label: str) -> None:
+    mistake, words = MISTAKES[label]
+    with pytest.raises(SkillweaveError) as caught:
+        mistake()
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
+def test_a_device_that_is_not_there() -> None:
+    with pytest.raises(SkillweaveError, match="finds no CUDA device here; use 'cpu'"):
+        train(algorithm=dataclasses.replace(SMALL, device="cuda"))
+
+
+WARNED = {
+    "terminaton": ({"terminaton": lambda _, step: step.next_obs[:, 0] > 1}, "termination"),
+    "done": ({"done": lambda _, step: step.next_obs[:, 0] > 1}, "termination"),
+    "max_step": ({"max_step": 5}, "max_steps"),
+    "time_limit": ({"time_limit": 5}, "max_steps"),
+}
+
+
+@pytest.mark.parametrize("name", WARNED)
+def test_a_misspelt_attribute_of_a_skill_is_a_warning(name: str) -> None:
+    members, meant = WARNED[name]
+    with pytest.warns(UserWarning, match=f"has '{name}', .* is '{meant}' meant"):
+        declare(skills=[skill(**members)])
+
+
+def test_a_misspelt_attribute_of_a_skills_instance_is_a_warning() -> None:
+    mine = Good()
+    mine.max_step = 5
+    with pytest.warns(UserWarning, match="has 'max_step', .* is 'max_steps' meant"):
+        declare(skills=[mine])
+
+
+def test_names_that_a_skills_methods_use_are_its_own() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        declare(
+            skills=[
+                skill(
+                    done=lambda self, step: step.next_obs[:, 0] > self.timeout,
+                    termination=lambda self, step: self.done(step),
+                    timeout=1.0,
+                    goal=(1.0, 2.0),
+                )
+            ]
+        )
+
+
+class Draws(sw.Skill):
+    """Legal, though its reward is random: it has a generator, and counts its calls."""
+
+    def __init__(self) -> None:
+        self.rng, self.calls = np.random.default_rng(0), 0
+
+    def reward(self, step):
+        self.calls += 1
+        return self.rng.random(len(step.obs)) + np.random.rand()  # noqa: NPY002
+
+
+LEGAL = {
+    "reward as a tensor": {"reward": lambda _, step: torch.as_tensor(step.next_obs[:, 0])},
+    "reward as a list": {"reward": lambda _, step: list(step.next_obs[:, 0])},
+    "termination of 0 and 1": {
+        "termination": lambda _, step: (step.next_obs[:, 0] > 1).astype(int)
+    },
+    "reward of what env says": {"reward": lambda _, step: step.reward * step.elapsed},
+    "reward of info": {"reward": lambda _, step: step.info.get("x", np.zeros(len(step.obs)))},
+    "a random reward": {"reward": lambda _, step: np.random.rand(len(step.obs))},  # noqa: NPY002
+}
+
+
+@pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")
+@pytest.mark.parametrize("label", LEGAL)
+def test_unusual_but_legal_ways_work(label: str) -> None:
+    assert with_skill(**LEGAL[label]).path.is_dir()
+
+
+def test_training_without_a_directory_is_either_refused_or_makes_one() -> None:
+    # Which of both depends on the signature of train().
+    optional = inspect.signature(sw.Hierarchy.train).parameters["run_dir"].default is None
+    with nullcontext() if optional else pytest.raises(SkillweaveError, match="needs run_dir"):
+        assert declare().train(quiet=True).path.is_dir()
+
+
+def test_the_directory_of_a_finished_run_is_not_used_again() -> None:
+    hierarchy = trained()
+    with pytest.raises(SkillweaveError, match="runs/ok already holds a run"):
+        hierarchy.train("runs/ok", quiet=True)
+
+
+def test_a_resumed_run_goes_on_with_its_own_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    trained()
+    declare(call_steps=7).resume("runs/ok")
+    assert "call_steps is 40 (declared now: 7)" in capsys.readouterr().err
+
+
+def test_looking_for_a_forgotten_axis_does_not_change_training(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def weights(run_dir: str) -> dict[str, Any]:
+        np.random.seed(0)  # noqa: NPY002
+        declare(skills=[Draws()]).train(run_dir, quiet=True)
+        return load_file(Path(run_dir) / "policies" / "draws.safetensors")
+
+    probed = weights("runs/probed")
+    monkeypatch.setattr("skillweave.skills.answers.probe", lambda *_: None)
+    plain = weights("runs/plain")
+    assert plain.keys() == probed.keys()
+    assert all(torch.equal(plain[name], probed[name]) for name in plain)
