@@ -75,6 +75,7 @@ def test_there_are_as_many_examples_as_are_known():
     assert {p.name for p in EXAMPLES} == set(SAYS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.name)
 def test_an_example_runs_to_its_end(path, tmp_path):
     for module in NEEDS.get(path.name, ()):

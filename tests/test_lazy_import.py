@@ -30,6 +30,7 @@ def probe(*arguments: str) -> tuple[int, list[str]]:
     return int(line[1]), line[3].split(",") if len(line) > 3 else []
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["evaluate", "-h"]])
 def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     code, heavy = probe(*arguments)
@@ -37,6 +38,7 @@ def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     assert heavy == []
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -56,6 +58,7 @@ def test_an_argument_error_imports_nothing_heavy(arguments: list[str]) -> None:
     assert heavy == []
 
 
+@pytest.mark.slow
 def test_the_probe_sees_what_a_real_command_imports() -> None:
     code, heavy = probe("list")
     assert code == 0

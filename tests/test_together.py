@@ -100,11 +100,13 @@ def whole(tmp_path_factory):
     return Whole(KINDS, tmp_path_factory)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind):
     whole.assert_resumes(kind, (2, 4, 2), tmp_path / "run")
 
 
+@pytest.mark.fast_cases(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
     whole.assert_loads(kind, tmp_path / "weights")
@@ -122,6 +124,7 @@ def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
     assert 450 <= entry["steps"] <= 450 + 32, "a stage ends within one rollout of its budget"
 
 
+@pytest.mark.slow
 def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch):
     declare(workers=2).train(tmp_path / "processes", seed=3, quiet=True)
     from skillweave.collecting import group, where
@@ -136,6 +139,7 @@ def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch)
     assert_same(tmp_path / "processes", tmp_path / "here")
 
 
+@pytest.mark.slow
 def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they_did_not(
     tmp_path, monkeypatch
 ):
@@ -164,6 +168,7 @@ def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they
     assert_same(tmp_path / "shared", tmp_path / "apart")
 
 
+@pytest.mark.slow
 def test_skills_that_grew_in_a_population_go_on_as_they_are(tmp_path):
     always = Mutations(none=0, hyperparameters=0, parameters=0, activation=0, architecture=1)
     grows = Evolution(population=4, generations=4, episodes=2, mutations=always)
@@ -190,6 +195,7 @@ def test_the_better_of_before_and_after_is_kept(whole):
     assert "anchor_kl" in " ".join(lines(path)[-1])
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.usefixtures("usual_episodes")
 @pytest.mark.parametrize(
     ("learn", "asked", "played"),
@@ -224,6 +230,7 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
     assert run.evaluate(100, seed=select_best.SEEDS + 3).mean == kept[best]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("usual_episodes")
 def test_it_is_found_out_in_the_pool_where_it_was_trained_in_one(tmp_path):
     pytest.importorskip("envpool")
@@ -235,6 +242,7 @@ def test_it_is_found_out_in_the_pool_where_it_was_trained_in_one(tmp_path):
     assert run.evaluate(100, **how).mean != kept[kept["kept"]]
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("engine", ["auto", "sync"])
 @pytest.mark.parametrize("better", [True, False])
 def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
@@ -263,6 +271,7 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     assert "4 episodes of each kind are played" in heard.said[-2]
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     ("means", "kept"),
     [
@@ -310,6 +319,7 @@ def test_a_sampling_selector_samples_also_where_greedy_actions_are_asked(tmp_pat
     assert len(set(memory["skill"].tolist())) > 1, "the selector is nearly uniform so early"
 
 
+@pytest.mark.slow
 def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch):
     whole = declare().train(tmp_path / "whole", seed=3, quiet=True)
 

@@ -120,6 +120,7 @@ def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path: Path) -> None:
     assert "skillweave/" not in interrupted
 
 
+@pytest.mark.slow
 def test_ipython_shows_all_frames_where_the_switch_is_set(tmp_path: Path) -> None:
     shown = in_ipython(tmp_path, SKILLWEAVE_TRACEBACK="1")
     assert "skillweave/skills/outputs.py" in shown

@@ -101,6 +101,7 @@ VARIANTS = {
 }
 
 
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("variant", [*VARIANTS, "masked"])
 def test_a_stack_of_three_learns_what_three_single_members_learn(variant):
     masked, settings = variant == "masked", VARIANTS.get(variant, {})
@@ -157,6 +158,7 @@ def plain_network(algorithm: PPOAlgorithm, state: State, prefix: str) -> nn.Sequ
     return nn.Sequential(*layers[:-1])
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
     ("space", "masked"), [(Discrete(4), False), (Discrete(4), True), (Box(-1, 1, (2,)), False)]
@@ -265,6 +267,7 @@ def test_without_an_entropy_bonus_a_fresh_policy_does_not_move_until_something_i
     assert not torch.equal(state.params, before)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("action_std", ["parameter", "state"])
 def test_where_nothing_is_paid_the_entropy_bonus_does_not_widen_the_deviation_for_ever(action_std):
     algorithm, state = make(
@@ -398,6 +401,7 @@ def test_weights_are_one_unless_what_acted_is_old(asks, rnn, overlap):
     assert [x > 1e-3 for x in off] == [False, overlap, overlap, overlap]
 
 
+@pytest.mark.fast_cases(20)
 @SPACES
 @MEMORIES
 @pytest.mark.parametrize(("columns", "steps"), [(1, 1), (1, 5), (4, 1), (4, 4)])

@@ -55,6 +55,7 @@ def own(**settings: Any) -> Any:
 # Learning
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(("asks", "updates"), [("Discrete", 120), ("Box", 400)])
 def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, updates, tmp_path):
     env = Echo(8, "vector", asks)

@@ -261,6 +261,7 @@ class Nothing(Toy):
         return still, 0.0 * self.ones, self.never, self.never
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("n_step", [1, 3])
 def test_the_soft_value_is_the_same_whatever_the_number_of_steps(n_step):
     config = SAC(

@@ -119,6 +119,7 @@ def test_an_algorithm_of_the_users_own_that_does_not_follow_schedules_refuses_th
         make_algorithm(PPO(learning_rate=Linear(1e-3, 0)), *spaces)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("how", [Linear(2e-3, 5e-4), halving, lambda remaining: 2e-3 * remaining])
 @pytest.mark.parametrize("config", [ON, OFF], ids=["ppo", "dqn"])
 def test_a_stopped_run_has_the_same_rates_as_one_that_was_not(tmp_path, config, how):

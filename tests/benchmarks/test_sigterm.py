@@ -51,6 +51,7 @@ def until(condition, seconds: float = 60.0) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="there is no /proc here")
 @pytest.mark.parametrize("how", ["worker", "command", "command, then worker"])
 def test_a_benchmark_that_is_sent_sigterm_leaves_no_process(tmp_path, how):
@@ -71,6 +72,7 @@ def test_a_benchmark_that_is_sent_sigterm_leaves_no_process(tmp_path, how):
     assert stub.returncode in (-signal.SIGTERM, 128 + signal.SIGTERM)
 
 
+@pytest.mark.slow
 def test_a_command_that_fails_is_told(tmp_path):
     from benchmarks.common import run_command
 

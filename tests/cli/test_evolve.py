@@ -121,6 +121,7 @@ def test_the_winners_family_tree_reaches_back_to_the_start(run: Path):
             assert changed == {k.removeprefix("network.") for k in after.changes}
 
 
+@pytest.mark.slow
 def test_plots_of_populations_are_pictures_and_drawings(run: Path, tmp_path, capsys):
     assert main(["plot", str(run), "-o", str(tmp_path), "--json"]) == 0
     paths = [Path(p) for p in json.loads(capsys.readouterr().out)["paths"]]

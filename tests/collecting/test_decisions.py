@@ -96,6 +96,7 @@ def compare(collected, scalars, exact=False):
     return steps
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("call_steps", [1, 2, 5, 40])
 @pytest.mark.parametrize("rows", [1, 7, 64])
 def test_every_decision_is_that_of_a_scalar_loop(call_steps, rows):

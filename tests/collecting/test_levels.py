@@ -197,6 +197,7 @@ class One:
         self.open = None
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("node", [Paid, Plain])
 @pytest.mark.parametrize(("outer", "inner"), [(4, 3), (3, 5), (1, 2), (9, 1), (6, 6)])
 def test_decisions_of_both_levels_are_what_calls_mean(node, outer, inner):

@@ -75,6 +75,7 @@ def equal(one, two):
     assert not len(two.begun_anew)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", [deciding, stepping])
 @pytest.mark.parametrize("rows", [1, 20])
 def test_the_same_experience_here_and_in_processes(in_processes, kind, rows):
@@ -86,6 +87,7 @@ def test_the_same_experience_here_and_in_processes(in_processes, kind, rows):
     assert plain.steps_made == apart.steps_made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [deciding, stepping])
 def test_killed_workers_are_made_again_and_find_the_same(in_processes, kind):
     plain, apart = here(kind()), in_processes(kind())
@@ -155,6 +157,7 @@ def test_one_that_dies_in_the_middle_of_a_step_is_made_again(in_processes, tmp_p
     assert not fuse.exists(), "it did not die"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["spawn", "forkserver"])
 def test_processes_that_are_not_forked_get_the_users_code_and_stay(
     in_processes, method, monkeypatch, tmp_path
@@ -191,6 +194,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.slow
 def test_workers_end_where_their_parent_is_killed_though_one_of_them_hangs():
     command = [sys.executable, "-c", PARENT]
     paths = {"PYTHONPATH": os.pathsep.join(sys.path)}

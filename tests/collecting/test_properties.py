@@ -108,6 +108,7 @@ def asked(params, rows, **how):
         yield Request(rows, (params,), np.array([0.9]), Seeds(1) / i, **how)
 
 
+@pytest.mark.fast_cases(13)
 @pytest.mark.parametrize("skill", [None, Half()], ids=["task", "skill"])
 @pytest.mark.parametrize("asks", ASKS)
 @pytest.mark.parametrize("shows", SHOWS)
@@ -124,6 +125,7 @@ def test_rows_of_skills_chain_in_every_space(shows, asks, skill):
         assert np.concatenate([e.ended for e in found]).sum() > 4
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("shows", SHOWS)
 def test_decisions_chain_in_every_space(shows):
     for asks in ASKS:
@@ -226,6 +228,7 @@ JOINED = {
 }
 
 
+@pytest.mark.fast_cases(4)
 @pytest.mark.parametrize("rows", [1, 6, 35])
 @pytest.mark.parametrize("kind", JOINED)
 def test_joined_collectors_find_what_they_find_alone(kind, rows):

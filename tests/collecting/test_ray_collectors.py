@@ -111,6 +111,7 @@ def kill(worker):
     os.kill(worker.place["process"], signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_actors_find_what_this_thread_finds_though_they_are_killed(on_ray):
     plain, apart = here(deciding()), on_ray(deciding())
     for collectors in (plain, apart):
@@ -153,6 +154,7 @@ def only_here(tmp_path):
     del sys.modules["only_here"], gym.registry["OnlyHere-v0"]
 
 
+@pytest.mark.slow
 def test_collectors_of_a_lost_node_are_made_again_on_others(on_ray, cluster, only_here):
     extra = cluster.add_node(num_cpus=3)
     make = stepping(only_here)

@@ -84,6 +84,7 @@ def test_a_script_sends_its_own_classes_from_a_process_that_it_spawned(tmp_path)
     assert (done.returncode, done.stdout.split()) == (0, ["7", "7"]), done.stderr
 
 
+@pytest.mark.slow
 def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_path):
     file = tmp_path / "packed"
     file.write_bytes(packed(recipes.load(recipe), "it"))
@@ -96,6 +97,7 @@ def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_pa
     assert printed_elsewhere(code) == ["Own", "1.5"]
 
 
+@pytest.mark.slow
 def test_a_recipe_that_lies_where_packages_are_installed_is_sent_as_well(tmp_path, monkeypatch):
     places = (*shipping._INSTALLED, recipes.source("lunar-lander").parent.resolve())
     monkeypatch.setattr(shipping, "_INSTALLED", places)

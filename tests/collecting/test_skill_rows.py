@@ -78,6 +78,7 @@ class Acting(Choices):
         super().__init__(num_envs, 3)
 
 
+@pytest.mark.fast_cases(5)
 @pytest.mark.parametrize("reflexes", [(), (shy(), Reflex(lambda obs: obs[:, T] == 3, 0))])
 @pytest.mark.parametrize("skill", [None, Skill(), Timed(), Fleeting(), Elsewhere()])
 @pytest.mark.parametrize("rows", [1, 7, 60])

@@ -102,6 +102,7 @@ def calls_of(experience, n):
     return [(int(experience.action[t, n]), int(experience.steps[t, n])) for t in rows]
 
 
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("call_steps", [1, 2, 5, Lengths(1, ..., 4)])
 @pytest.mark.parametrize("margin", [None, 0.5])
 def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):

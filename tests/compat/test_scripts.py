@@ -46,6 +46,7 @@ def test_budgets_are_cut_by_constants_that_are_in_the_text():
     assert [len(s.splitlines()) > 80 for s in scripts().values()] == [True] * 3
 
 
+@pytest.mark.slow
 def test_the_full_training_code_writes_four_agents_that_hold_no_pickle(trained):
     folder, _ = trained
     for name in (*SKILLS, "selector"):
@@ -62,6 +63,7 @@ def test_it_warns_once_of_the_old_id_and_says_once_that_wandb_is_offline(trained
     assert len(list((folder / "wandb").glob("offline-run-*"))) == 4
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ["skills", "hierarchy"])
 def test_the_rendering_scripts_write_films(trained, name):
     folder, _ = trained

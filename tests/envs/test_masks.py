@@ -215,6 +215,7 @@ LEARNERS = [
 ]
 
 
+@pytest.mark.fast_cases(15)
 @pytest.mark.parametrize("at_random", [True, False])
 @pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda a: type(a).__name__)
 @pytest.mark.parametrize("skill", [None, Skill(), Late()])
@@ -239,6 +240,7 @@ def test_rows_have_the_masks_of_what_was_acted_on_and_of_true_successors(
         assert experience.ended[valid].sum() > 10
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", LEARNERS, ids=lambda a: type(a).__name__)
 def test_learnt_skills_selectors_and_flat_agents_never_take_what_is_forbidden(algorithm, tmp_path):
     # Gate raises an error at the first forbidden action: in training, looks, evaluation, videos.

@@ -119,6 +119,7 @@ def lineage(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (path / "lineage.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_population_evolves_and_ends_with_the_best_member(name, tmp_path):
     run = train(name, tmp_path / "run")
@@ -161,6 +162,7 @@ def test_the_best_so_far_must_hold_its_own_on_the_same_episodes(tmp_path, monkey
     assert (winner["generation"], winner["fitness"]) == (2, 6.0)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_killed_population_ends_with_the_very_same_weights(name, tmp_path, monkeypatch):
     whole = train(name, tmp_path / "whole", seed=3)
@@ -193,6 +195,7 @@ SCALED = DQN(**REPLAY, normalize_rewards=True)
 SCALED_RAINBOW = DQN.rainbow(**REPLAY, normalize_obs=True)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("config", [CONFIGS["ppo"], RECURRENT, SCALED, SCALED_RAINBOW])
 def test_a_killed_population_of_selectors_ends_with_the_very_same_weights(
     config, tmp_path, monkeypatch
@@ -266,6 +269,7 @@ def test_fitness_is_measured_on_the_same_starts_for_all(tmp_path, monkeypatch):
     assert len(set.union(*starts.values())) == 4  # another generation, other starts
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeypatch):
     poisoned: list[int] = []
@@ -292,6 +296,7 @@ def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeyp
     assert all(bool(v.isfinite().all()) for v in run.policy.weights.values())
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tmp_path):
     config = replace(CONFIGS[name], max_grad_norm=1e30)
@@ -320,6 +325,7 @@ def killed_at_save(name: str, path: Path, generation: int, monkeypatch: Any) -> 
     monkeypatch.setattr(evolving.EvolvingPopulation, "_save", save)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_members_that_are_to_train_hold_no_nan_in_a_checkpoint(name, tmp_path, monkeypatch):
     killed_at_save(name, tmp_path / "run", 1, monkeypatch)

@@ -85,6 +85,7 @@ def test_a_run_names_and_keeps_its_policies(made):
     assert manifest["needs_recipe"]
 
 
+@pytest.mark.slow
 def test_trained_and_loaded_act_the_same_also_from_a_weights_file(made, tmp_path):
     folder, run = made
     loaded = declare(*all_kinds(folder)).load(run.path)
@@ -173,6 +174,7 @@ def test_a_hierarchy_of_foreign_skills_is_a_skill_again(tmp_path):
     assert acts(loaded.policy) == acts(run.policy)
 
 
+@pytest.mark.slow
 def test_a_hierarchy_as_a_skill_must_be_the_one_that_the_run_was_trained_with(tmp_path):
     def inner(name, seed, policy=upright):
         own = declare(skill("a", linear()), skill("b", policy))
@@ -251,6 +253,7 @@ class Point(gym.Env):
         return self.obs, float(np.sum(action)), False, self.t == 5, {}
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("space", [Box(-0.5, 0.5, (2,), np.float32), MultiDiscrete([2, 3])])
 def test_other_actions_than_choices(tmp_path, space):
     width = 2 if isinstance(space, Box) else 5

@@ -84,6 +84,7 @@ def test_an_environment_that_was_made_otherwise_is_refused(tmp_path):
 EVOLVE = Evolution(population=2, generations=2, episodes=2)
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize(
     ("first", "then", "says"),
     [
@@ -174,6 +175,7 @@ def test_a_recipe_is_not_asked_for_what_the_command_line_changed(tmp_path, monke
     assert "own settings" not in "".join(capsys.readouterr())
 
 
+@pytest.mark.slow
 def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, capsys):
     agent = Agent("CartPole-v1", ON, 300, target_return=1e6)
     with monkeypatch.context() as patched:

@@ -55,6 +55,7 @@ def test_others_use_what_is_checked() -> None:
         ppo_samples.gae(**of_gae(value=torch.ones(P, T, 1)))
 
 
+@pytest.mark.slow
 def test_without_the_tests_nothing_is_checked_and_jaxtyping_is_not_imported() -> None:
     code = (
         "import sys, torch, typing\n"

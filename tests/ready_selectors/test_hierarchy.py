@@ -67,6 +67,7 @@ def test_it_solves_the_corridor_without_training(kind, tmp_path):
     assert RunDirectory.open(run.path).finished
 
 
+@pytest.mark.fast_cases(7)
 @pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("kind", SELECTORS)
 def test_many_environments_at_once_are_each_as_alone(kind, nested, tmp_path):
@@ -89,6 +90,7 @@ def test_many_environments_at_once_are_each_as_alone(kind, nested, tmp_path):
         assert alone.skill_steps["wait"] > 0
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("kind", SELECTORS)
 def test_as_a_skill_under_a_selector_that_is_trained(kind, tmp_path):
     inner = declare(SELECTORS[kind]).train(tmp_path / "run", quiet=True).as_skill("inner")

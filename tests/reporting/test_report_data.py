@@ -123,6 +123,7 @@ class Unseen(Walkway):
         super().__init__()
 
 
+@pytest.mark.slow
 def test_an_environment_without_pictures_has_no_film_and_all_the_rest(tmp_path: Path) -> None:
     pytest.importorskip("vl_convert")
     run = declare(Unseen).train(tmp_path / "run", quiet=True)
@@ -200,6 +201,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
+@pytest.mark.slow
 def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder: Path) -> None:
     runs = [RunDirectory.open(folder / name) for name in "abc"]
     first, second = grouped(runs)

@@ -592,6 +592,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("worker", ["alone", "fork"])
 def test_a_process_that_is_killed_holds_the_run_no_longer(run: RunDirectory, worker: str) -> None:
     command = [sys.executable, "-c", HOLD, str(run.path), worker]

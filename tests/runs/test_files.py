@@ -170,6 +170,7 @@ def _unshare() -> str | None:
     return "unshare" if done.returncode == 0 else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", ["tmpfs", "rlimit"])
 def test_a_disk_that_is_really_full_leaves_the_old_file(tmp_path: Path, limit: str) -> None:
     folder = tmp_path / "disk"

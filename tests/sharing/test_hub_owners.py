@@ -31,6 +31,7 @@ def change(path: Path, **fields: Any) -> None:
 # What goes up
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("place", ["/home/ada/secret/", "C:\\ada\\secret\\", ""])
 def test_where_files_lie_and_who_tracks_a_run_does_not_go_up(
     place: str, run: sw.Run, hub: Hub
@@ -90,6 +91,7 @@ def contents(path: Path) -> dict[str, bytes]:
     return {str(f): f.read_bytes() for f in path.rglob("*") if f.is_file()}
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("what", WRITES)
 def test_nothing_is_written_into_the_copy_that_the_hubs_library_keeps(
     what: str, tracked: None, hub: Hub

@@ -88,6 +88,7 @@ def test_a_module_acts_as_the_copy_that_was_fitted_and_in_evaluation_mode():
     np.testing.assert_array_equal(acts(policy), lean(ROWS))
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ["ppo", "a2c", "dqn"])
 def test_every_discrete_algorithm_of_sb3_acts_as_it_would_itself(tmp_path, name):
     sb3 = pytest.importorskip("stable_baselines3")

@@ -74,6 +74,7 @@ def greedy(algorithm: PPOAlgorithm, state: State, obs: np.ndarray, mask=None) ->
 # What is learnt
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("overlap", [True, False])
 def test_ppo_learns_that_the_action_must_equal_the_observation(overlap):
     algorithm, state = train(Identity(16), 40, replace(CONFIG, overlap=overlap))
@@ -82,6 +83,7 @@ def test_ppo_learns_that_the_action_must_equal_the_observation(overlap):
     assert head.softmax(-1)[0].diagonal().min() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overlap", [True, False])
 def test_ppo_learns_that_a_continuous_action_must_equal_the_observation(overlap):
     algorithm, state = train(BoxIdentity(16), 80, replace(CONFIG, overlap=overlap))
@@ -107,6 +109,7 @@ def test_a_time_limit_is_bootstrapped():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normalize_returns", [True, False])
 def test_a_termination_is_not_bootstrapped(normalize_returns):
     config = replace(CONFIG, normalize_returns=normalize_returns)
@@ -116,6 +119,7 @@ def test_a_termination_is_not_bootstrapped(normalize_returns):
     assert values.tolist() == pytest.approx(finite, rel=0.05)
 
 
+@pytest.mark.slow
 def test_rewards_of_any_size_are_learnt_in_their_own_units():
     class Rich(Countdown):
         def play(self, action):
@@ -129,6 +133,7 @@ def test_rewards_of_any_size_are_learnt_in_their_own_units():
     )
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     ("allowed", "n_steps", "value"),
     [((True, False), 16, 1 / (1 - 0.9)), ((False, True), 160, 3 / (1 - 0.9**10))],
@@ -138,6 +143,7 @@ def test_the_value_of_calls_discounts_by_their_length(allowed, n_steps, value):
     assert algorithm.value(state, torch.zeros(1, 1, 1)).item() == pytest.approx(value, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overlap", [True, False])
 def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_step(overlap):
     # Without γ^τ the long call would look three times as good.
@@ -270,6 +276,7 @@ def test_a_rollout_in_which_no_call_ends_is_told_but_not_learnt_from():
 # Stacks and seeds
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("overlap", [True, False])
 def test_a_stack_of_three_trains_like_three_single_members(overlap):
     config = replace(CONFIG, num_envs=4, batch_size=16, overlap=overlap)
@@ -285,6 +292,7 @@ def test_a_stack_of_three_trains_like_three_single_members(overlap):
     assert (stack.params[0] - stack.params[1]).abs().max() > 0.1
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("overlap", [True, False])
 def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not(overlap):
     def weights(seed: int) -> torch.Tensor:
@@ -297,6 +305,7 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not(o
 # Engines
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*precision lowered")  # see tests/envs/test_engine.py
 @pytest.mark.parametrize("engine", ["envpool", "sync"])
 def test_cartpole_is_learnt_with_every_engine(engine):
@@ -320,6 +329,7 @@ SMALL = {
 }
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", SMALL)
 def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_die(name):
     config, scene = SMALL[name], skill_scene(EnvSpec("CartPole-v1", engine="sync"))
@@ -387,6 +397,7 @@ CUTS = {
 }
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", CUTS)
 def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights_and_metrics(name):
     config, env = CUTS[name]
@@ -485,6 +496,7 @@ def test_a_member_that_diverges_may_be_skipped(config):
         other.run(2048)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("overlap", [True, False])
 def test_the_callback_may_stop_the_run_and_threads_are_given_back(overlap):
     torch.set_num_threads(1)

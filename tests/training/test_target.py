@@ -83,6 +83,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return count
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", [SMALL, REPLAY])
 def test_training_ends_at_the_first_evaluation_that_is_good_enough(
     tmp_path: Path, algorithm: Any, made: list[int]
@@ -117,6 +118,7 @@ def test_a_target_that_is_not_reached_changes_nothing(tmp_path: Path) -> None:
     assert all(torch.equal(v, weights[1][k]) for k, v in weights[0].items())
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", [SMALL, REPLAY])
 @pytest.mark.parametrize("where", ["an evaluation before", "the target", "its policy"])
 def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
@@ -200,6 +202,7 @@ def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path: Path) -
     assert all(0.1 < x < 0.9 for x in told)
 
 
+@pytest.mark.slow
 def test_a_success_that_nobody_tells_is_an_error(tmp_path: Path) -> None:
     agent = Agent("CartPole-v1", SMALL, 200, target_success=0.5)
     with pytest.raises(SkillweaveError, match=r"agent.*target_success.*info\['success'\]"):
