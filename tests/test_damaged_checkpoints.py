@@ -135,6 +135,7 @@ def _change(run: Path, name: str, damage):
     write_tensors(path, tensors, header, make_directories=False)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", CUTS)
 def test_what_is_not_damaged_is_gone_on_from(stopped, tmp_path, kind):
     run = tmp_path / "run"

@@ -8,6 +8,7 @@ from skillweave import Skill
 from skillweave.types import SkillweaveError
 
 
+@pytest.mark.slow
 def test_every_hostile_case_is_a_sentence_or_does_no_harm():
     bad: list[str] = []
     counts = run_hostile(40, 0, bad)
@@ -32,6 +33,7 @@ def test_the_trial_sees_what_is_wrong():
     assert case(lambda _: None) == "accepted"
 
 
+@pytest.mark.slow
 def test_what_the_hostile_cases_start_from_is_in_order(tmp_path):
     train(tmp_path, Ramp, Plain())
     with pytest.raises(SkillweaveError, match=r"skill 'bad': reward.. returned nan"):

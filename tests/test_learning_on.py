@@ -66,6 +66,7 @@ class StopAfter:
             raise KeyboardInterrupt
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("stage", ["left", "selector", "together"])
 def test_a_run_killed_between_stages_ends_as_if_it_had_not_been(whole, stage, tmp_path):
     run = new_run(then(), tmp_path / "run")
@@ -77,6 +78,7 @@ def test_a_run_killed_between_stages_ends_as_if_it_had_not_been(whole, stage, tm
     assert not (run.path / "states").exists()
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_it_was_judged_is_judged_when_it_is_resumed(
     whole, tmp_path, monkeypatch
 ):

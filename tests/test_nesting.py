@@ -201,11 +201,13 @@ STOPS["a ready selector"] = (3, 9)  # after 4 its episodes are still the first o
 LATER = [("apart", (15, 11)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize(("kind", "ticks"), [*STOPS.items(), *LATER])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, ticks):
     whole.assert_resumes(kind, ticks, tmp_path / "run")
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
     whole.assert_loads(kind, tmp_path / "weights")
@@ -214,6 +216,7 @@ def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, ki
     assert list(run.evaluate(3).skills) == paths
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", ["together", "then", "off-policy", "three"])
 def test_all_learn_at_every_level_in_one_stream(whole, kind):
     _, path = whole(kind)

@@ -219,6 +219,7 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Any]]:
     return [cell.outputs for cell in notebook.cells if cell.cell_type == "code"]
 
 
+@pytest.mark.slow
 def test_the_example_shows_tables_and_films_and_nothing_raw(outputs: list[list[Any]]) -> None:
     shown = [output for cell in outputs for output in cell]
     assert {output.output_type for output in shown} == {"execute_result", "display_data"}
@@ -236,6 +237,7 @@ def test_the_example_shows_tables_and_films_and_nothing_raw(outputs: list[list[A
     assert "data:image/gif;base64,R0lGOD" in results["<Film"]
 
 
+@pytest.mark.slow
 def test_training_in_the_example_leaves_its_last_progress(outputs: list[list[Any]]) -> None:
     html = outputs[2][0].data["text/html"]
     assert "<progress" in html

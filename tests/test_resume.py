@@ -110,6 +110,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
 # Two uninterrupted runs
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(
     tmp_path: Path, reference: Reference, engine: str
@@ -145,6 +146,7 @@ def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
 # Interrupted within the process
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("tick", [1, 7, 10, 12, 15, 21, 24])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
@@ -157,6 +159,7 @@ def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
     assert_same(run.path, whole)
 
 
+@pytest.mark.slow
 def test_a_run_stopped_again_and_again_ends_as_if_it_had_not_been(
     tmp_path: Path, reference: Reference
 ) -> None:
@@ -185,6 +188,7 @@ def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path: P
     assert_same(run.path, tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_a_run_with_networks_of_the_usual_size_ends_as_if_it_had_not_been_stopped(
     tmp_path: Path,
 ) -> None:
@@ -220,6 +224,7 @@ def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(
     assert_same(path, whole)
 
 
+@pytest.mark.slow
 def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
     tmp_path: Path, reference: Reference, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,6 +274,7 @@ SETTINGS = [  # a run that lost any of them would end otherwise
 ]
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
     tmp_path: Path, settings: list[str]
@@ -350,6 +356,7 @@ def train_echo(run: RunDirectory, stage: Stage, *listeners: Any) -> None:
         run.close()
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", REPLAYERS)
 def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
     tmp_path: Path, name: str
@@ -368,6 +375,7 @@ def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
     assert_metrics_fit(run.path, tmp_path / "whole")
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ["rainbow", "sac"])
 def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
     tmp_path: Path, name: str
@@ -491,6 +499,7 @@ class Killer(StopAt):
             Killer.killed += 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_run_of_any_learner_stopped_again_and_again_ends_as_if_it_had_not_been(
@@ -547,6 +556,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return done | {"recipe": recipe, "run": folder / "run"}
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_code_130_and_says_how_to_go_on(interrupted: dict[str, Any]) -> None:
     assert interrupted["code"] == 130
     assert "Traceback" not in interrupted["err"]
@@ -555,11 +565,13 @@ def test_ctrl_c_ends_with_code_130_and_says_how_to_go_on(interrupted: dict[str, 
     assert interrupted["out"] == ""
 
 
+@pytest.mark.slow
 def test_the_command_that_ctrl_c_names_is_complete(interrupted: dict[str, Any]) -> None:
     # A recipe in a user's file must be pointed to (contract 7), so the command must say so.
     assert f"--recipe {interrupted['recipe']}" in interrupted["err"]
 
 
+@pytest.mark.slow
 def test_a_run_stopped_by_ctrl_c_ends_as_if_it_had_not_been(
     tmp_path: Path, interrupted: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,6 +14,8 @@ from pages import ROOT
 
 import skillweave as sw
 
+pytestmark = pytest.mark.slow
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 EXTERNAL = (
     r"<(?:script|img|iframe|source|video)[^>]*\ssrc=\"(?:https?:)?//[^\"]*",

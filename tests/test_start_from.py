@@ -100,6 +100,7 @@ def source(tmp_path_factory):
     return path
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", AGENTS)
 def test_a_plain_agent_begins_with_the_weights_it_ended_with(kind, tmp_path):
     config = AGENTS[kind]
@@ -113,6 +114,7 @@ def test_a_plain_agent_begins_with_the_weights_it_ended_with(kind, tmp_path):
     assert differ(weights_of(fresh.path)["agent"], weights_of(first.path)["agent"])
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
 def test_all_who_have_learnt_there_begin_with_it(learn, source, tmp_path):
     path = tmp_path / "run"
@@ -229,6 +231,7 @@ def test_where_nothing_can_be_copied_no_run_is_begun(source, tmp_path, monkeypat
     declare().train(tmp_path / "run", quiet=True, start_from=source)
 
 
+@pytest.mark.slow
 def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
     agent = Agent("CartPole-v1", ON, 64)
     found = []
@@ -263,6 +266,7 @@ def begun(path, source, **how):
     )
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("learn", ["apart", "together"])
 def test_a_run_that_is_killed_needs_the_other_one_no_more(learn, source, tmp_path):
     """Also where it is killed before its first checkpoint."""
@@ -395,6 +399,7 @@ def other_runs(tmp_path_factory):
     return folder / "second", folder / "plain"
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("learn", ["apart", "together"])
 def test_several_runs_are_a_start_by_the_name_of_who_begins(learn, source, other_runs, tmp_path):
     second, plain = other_runs
@@ -486,6 +491,7 @@ def nested(rate=None, **how):
     )
 
 
+@pytest.mark.slow
 def test_all_levels_of_a_nested_hierarchy_begin_with_what_they_learnt(tmp_path):
     nested().train(tmp_path / "a", seed=1, quiet=True)
     nested(STILL).train(tmp_path / "b", seed=2, quiet=True, start_from=tmp_path / "a")

@@ -64,6 +64,7 @@ def sample(space: gym.Space[Any], seed: int) -> Sample:
 
 # A C++ compiler takes most of the time: one algorithm goes all the way, the others as far as torch
 # traces the whole step, its backward pass and its changes in place.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "space", "backend"),
     [
@@ -116,6 +117,7 @@ def rollout(space: gym.Space[Any], seed: int) -> Rollout:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "settings", "space", "backend"),
     [
@@ -165,6 +167,7 @@ def learn(algorithm: Any, state: Any, **changed: Any) -> None:
     algorithm.update(state, data, [Seeds(m).torch() for m in range(P)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compile", [True, False])
 def test_a_member_stops_where_it_oversteps_the_kl(
     compile: bool, monkeypatch: pytest.MonkeyPatch
@@ -179,6 +182,7 @@ def test_a_member_stops_where_it_oversteps_the_kl(
     assert (state.count < 5).all()
 
 
+@pytest.mark.slow
 def test_a_learner_that_stays_near_another_compiled_learns_what_it_learns_plainly(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -193,6 +197,7 @@ def test_a_learner_that_stays_near_another_compiled_learns_what_it_learns_plainl
     torch.testing.assert_close(*params, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_algorithm_that_has_compiled_can_be_sent_to_another_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

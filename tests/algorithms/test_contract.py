@@ -159,7 +159,15 @@ TABLE: dict[str, Case] = {
         ("sac", SOFT, "tuple", "Discrete", 400),
     ]
 }
-every_case = pytest.mark.parametrize("case", TABLE.values(), ids=TABLE)
+FIRST = {name.split(",")[0]: name for name in reversed(TABLE)}.values()
+"""The first case of each algorithm; the others are slow."""
+every_case = pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=name, marks=[] if name in FIRST else pytest.mark.slow)
+        for name, case in TABLE.items()
+    ],
+)
 
 
 @pytest.mark.parametrize("kind", [PPO, DQN, TD3, SAC])
@@ -331,6 +339,7 @@ def test_a_time_limit_is_bootstrapped(name):
     assert values(algorithm, state, np.zeros((1, 1), np.float32)) == pytest.approx([5.0], rel=0.06)
 
 
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("name", [name for name in VALUED if name != "ppo with lstm"])
 def test_an_end_is_not_bootstrapped(name):
     algorithm, state = trained(acted_in(Countdown(8), name), name)
@@ -370,6 +379,7 @@ def test_the_value_of_calls_discounts_by_their_length(name):
 SHORT, LONG = 1 / (1 - GAMMA), 3 + GAMMA**10 / (1 - GAMMA)  # 5.0 and 3.54
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", [name for name in CHOOSERS if name != "ppo with lstm"])
 def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_step(name):
     algorithm, state = trained(
@@ -393,6 +403,7 @@ def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_ste
             assert q.flatten().tolist()[1] == pytest.approx(LONG, rel=0.06)
 
 
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("name", CHOOSERS)
 def test_a_forbidden_action_is_never_taken(name):
     env, config = Masked(8), VALUED[name]
@@ -571,6 +582,7 @@ def remembered(config: PPO, budget: int) -> float:
 RECALLING = {"num_envs": 16, "n_steps": 16, "batch_size": 64, "gamma": 0.9, "overlap": True}
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", MEMORIES)
 def test_what_was_seen_three_steps_before_is_remembered(kind):
     assert remembered(replace(MEMORIES[kind], **RECALLING), 10_240) == 1.0

@@ -44,6 +44,7 @@ def one_thread_afterwards() -> Iterator[None]:
     torch.set_num_threads(1)
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", INITIAL)
 def test_initial_weights_do_not_depend_on_the_number_of_threads(name):
     config = INITIAL[name]
@@ -67,6 +68,7 @@ LEARNERS = {
 }
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", LEARNERS)
 def test_training_does_not_depend_on_the_number_of_threads(name):
     config, asks = LEARNERS[name]
@@ -114,6 +116,7 @@ def trained(path: Path) -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.slow
 def test_a_hierarchy_does_not_depend_on_the_number_of_threads(tmp_path):
     found = []
     for count in COUNTS:

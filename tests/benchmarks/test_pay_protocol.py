@@ -140,6 +140,7 @@ def done(tmp_path_factory):
     return results
 
 
+@pytest.mark.slow
 def test_every_agent_has_a_result_on_every_task(done):
     found = [r for r in done.all("line") if r.seed == 0]
     by_agent = Counter(r.agent for r in found)
@@ -267,6 +268,7 @@ def test_a_result_that_does_not_say_its_code_is_of_other_code(done, tmp_path):
     assert "1 of these 1 results" in of_other_code([read(tmp_path / "0.json")])
 
 
+@pytest.mark.slow
 def test_who_was_killed_goes_on_and_comes_to_the_same(done, tmp_path, monkeypatch):
     results = Results(tmp_path)
     score = agents.Bench._score
@@ -507,6 +509,7 @@ def test_curves_count_the_steps_of_earlier_stages(done):
     assert curve[0][0] > 2 * 128  # skills came first
 
 
+@pytest.mark.slow
 def test_jobs_of_the_command_run_in_processes_of_their_own(tmp_path):
     """What a process is sent must be importable there: nothing of a package's ``__main__`` is."""
     pytest.importorskip("Box2D")

@@ -6,6 +6,7 @@ from benchmarks import reading
 from skillweave import SkillweaveError
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", reading.ROUNDS)
 def test_every_function_on_the_walk_runs_and_they_are_soon_read(name):
     env, config = reading.ROUNDS[name]

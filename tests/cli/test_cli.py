@@ -150,6 +150,7 @@ def test_help_lists_every_command(call: Call) -> None:
     assert all(f"• {name} " in listed for name in COMMANDS)
 
 
+@pytest.mark.fast_cases(5)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_of_its_own(call: Call, command: str) -> None:
     answer = call(command, "--help")
@@ -182,6 +183,7 @@ def test_train_prints_one_json_object_and_tells_progress_on_stderr(
     assert "left (1 of 3): training for 256 steps" in answer.err
 
 
+@pytest.mark.slow
 def test_train_and_evaluate_in_a_process_of_their_own_print_one_json_object(
     trained: Trained, tmp_path: Path
 ) -> None:
@@ -703,6 +705,7 @@ def trap(run: Path, source: Path, recipe: str, **fields: Any) -> Path:
     return marker
 
 
+@pytest.mark.fast_cases(5)
 @pytest.mark.parametrize("recipe", ["RUN/trap.py", "trap.py", "trap", "./trap.py"])
 @pytest.mark.parametrize("command", ["evaluate", "render", "resume", "weights", "info"])
 def test_code_inside_a_run_is_never_executed(
@@ -722,6 +725,7 @@ def test_code_inside_a_run_is_never_executed(
     assert not marker.exists()
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("kind", ["hierarchy", "flat"])
 @pytest.mark.parametrize("command", ["evaluate", "render", "resume"])
 def test_an_environment_named_by_a_run_never_imports_code(

@@ -16,6 +16,7 @@ from skillweave.cli.demo import FLAT_RESULTS, MISSION, NEW_SELECTOR_STEPS, compl
 from skillweave.recipes import lander_missions as missions
 
 
+@pytest.mark.slow
 def test_a_tiny_demo_trains_scores_films_and_says_what_came_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

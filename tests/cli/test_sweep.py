@@ -85,6 +85,7 @@ def test_each_combination_is_trained_with_each_seed_and_none_twice(capsys, asked
     assert trained == []
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_to_the_same_end(capsys, asked, trained, monkeypatch):
     one = asked("--seeds", "3:4")
     _, whole = answer(capsys, [w.replace("runs", "whole") for w in one])
@@ -148,6 +149,7 @@ def refused(capsys, words, *said):
         assert text in error
 
 
+@pytest.mark.slow
 def test_an_edited_recipe_does_not_go_on_with_a_sweep(capsys, asked, trained, tmp_path):
     recipe = tmp_path / "still.py"
     first = answer(capsys, asked("--seeds", "0:1"))
@@ -184,6 +186,7 @@ def test_a_recipe_that_failed_before_anything_was_learnt_may_be_mended(
     assert isinstance(found["runs"][0]["return"], float)
 
 
+@pytest.mark.slow
 def test_nor_does_one_whose_module_was_edited(capsys, asked, helper, trained, tmp_path):
     first = answer(capsys, asked("--seeds", "0:1"))
     helper.write_text("WEIGHT = 2\n")
@@ -213,6 +216,7 @@ class Dying(Still):
 DYING_RECIPE = RECIPE.replace("\nsmall", f"{DYING}\nsmall", 1).replace("[Still()]", "[Dying()]")
 
 
+@pytest.mark.slow
 def test_a_run_whose_process_dies_is_named_and_the_others_are_trained(capsys, asked, tmp_path):
     (tmp_path / "still.py").write_text(DYING_RECIPE)
     code, found = answer(capsys, asked("--seeds", "0:2", "--jobs", "1"))
@@ -224,6 +228,7 @@ def test_a_run_whose_process_dies_is_named_and_the_others_are_trained(capsys, as
     assert (code, [run["seed"] for run in found["runs"]]) == (0, [0, 1])
 
 
+@pytest.mark.slow
 def test_a_run_in_a_process(capsys, asked):
     code, found = answer(capsys, asked("--seeds", "2"))
     assert code == 0

@@ -13,7 +13,10 @@ ray = pytest.importorskip("ray")
 
 from skillweave.collecting import stationed  # noqa: E402
 
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning"),
+]
 SKILLWEAVE, PYTHON = metadata.version("skillweave"), platform.python_version()
 
 

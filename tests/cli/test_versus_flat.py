@@ -17,6 +17,7 @@ def told(mean: float, low: float, high: float) -> dict[str, Any]:
     return {"mean": mean, "ci95": [low, high]}
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     ("flat", "words"),
     [

@@ -44,7 +44,10 @@ from skillweave.collecting.stationed import COMPUTING, Stationed  # noqa: E402
 NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
 
 
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning"),
+]
 
 
 SOON = {"health_check_period_ms": 1000, "health_check_failure_threshold": 3}

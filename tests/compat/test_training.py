@@ -94,6 +94,7 @@ def test_ppo_trains_and_is_tested_every_few_episodes(capsys):
     assert capsys.readouterr().out.count("fitness") == 4
 
 
+@pytest.mark.slow
 def test_training_makes_better():
     torch.manual_seed(1)
     env = makeVectEnvs("CartPole-v1", num_envs=4)
@@ -105,6 +106,7 @@ def test_training_makes_better():
     assert np.mean(pop[0].scores[-5:]) > 2.0 * pop[0].scores[0]
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algo", ["DQN", "Rainbow DQN", "DDPG", "TD3"])
 def test_off_policy_algorithms_train(algo):
     torch.manual_seed(0)
@@ -126,6 +128,7 @@ def test_off_policy_algorithms_train(algo):
     assert not torch.equal(before, found[0].native.member.state.params)
 
 
+@pytest.mark.slow
 def test_populations_evolve(tmp_path):
     torch.manual_seed(0)
     env = makeVectEnvs("CartPole-v1")

@@ -80,6 +80,7 @@ def test_episodes_of_a_users_pool_are_played_again():
     assert obs.shape == (N, 1)
 
 
+@pytest.mark.slow
 def test_agents_learn_in_a_users_pool_and_are_scored_in_the_environment_itself(tmp_path):
     agent = sw.PPO(num_envs=4, n_steps=8, batch_size=32)
     run = sw.train_agent(

@@ -44,6 +44,7 @@ def declare():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("checkpoint", [1, 2])
 def test_who_takes_its_place_goes_on_with_calls_that_it_can_learn_from(
     checkpoint, tmp_path, monkeypatch

@@ -125,6 +125,7 @@ def whole(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_parts_in_processes_find_the_same_though_one_is_killed(whole, tmp_path):
     fatal = tmp_path / "fatal"
     fatal.touch()
@@ -138,6 +139,7 @@ def test_parts_in_processes_find_the_same_though_one_is_killed(whole, tmp_path):
     assert entry["steps"] == ticks[-1]["steps"] + 6 * 2 * 7
 
 
+@pytest.mark.slow
 def test_a_split_population_goes_on_from_its_last_generation(whole, tmp_path, monkeypatch):
     interrupt_at_checkpoint(monkeypatch, 2)
     with pytest.raises(KeyboardInterrupt):
@@ -194,6 +196,7 @@ class Cursed(Walk):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_part_that_dies_again_and_again_is_told(tmp_path):
     cursed = Agent(EnvSpec(Cursed, engine="sync", workers=2), SMALL, 240)
     says = r"Cursed.*worker 0 died by signal 9.*, and again when it was made anew"
@@ -222,6 +225,7 @@ def test_what_cannot_be_split_is_refused(config, says, cluster, tmp_path, monkey
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning")
 def test_a_run_goes_on_on_ray_and_ends_the_same_though_an_actor_is_killed(
     whole, tmp_path, monkeypatch, capsys

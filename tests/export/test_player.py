@@ -24,6 +24,7 @@ from skillweave.cli import main
 torch.set_num_threads(1)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     "make",
     [nested, lambda: trained(skill_set(Counter, Right, Zigzag, reflexes=(shy(),)))],
@@ -85,6 +86,7 @@ def test_an_observation_of_another_shape_is_refused() -> None:
         Player(policy).act({"inner": (1, np.zeros(2))})
 
 
+@pytest.mark.slow
 def test_the_command_exports_and_its_runner_runs_without_the_library(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

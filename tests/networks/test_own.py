@@ -241,6 +241,7 @@ SOLVED = ("ppo", "dqn")
 """Those with a budget in which they learn the task."""
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("shows", ["vector", "image, channels last"])
 @pytest.mark.parametrize("name", LEARNERS)
 def test_it_learns_saves_and_loads_with_every_algorithm(name, shows):
@@ -317,6 +318,7 @@ def small(**how: Any) -> Hierarchy:
     return found
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("learn", ["apart", "together"])
 def test_a_stopped_run_ends_as_if_it_had_not_been_stopped(tmp_path, learn):
     small(learn=learn).train(tmp_path / "whole", seed=3, quiet=True)
@@ -341,6 +343,7 @@ def test_a_run_says_that_it_needs_code_and_loads_with_its_declaration(tmp_path, 
         RunDirectory.open(run.path).load_policy("agent")
 
 
+@pytest.mark.slow
 def test_a_population_learns_with_it_where_its_architecture_stays(tmp_path):
     config = replace(ON, network=Network((8,), encoder=Features))
     mutations = Mutations(0.2, 0.5, 0.2, 0.0, 0.1)

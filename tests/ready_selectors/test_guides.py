@@ -136,11 +136,13 @@ STOPS |= dict.fromkeys(("tree, then", "near and restricted, then"), (3, 4, 19))
 STOPS |= dict.fromkeys(("automaton", "restricted"), (3, 9))
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(("kind", "ticks"), STOPS.items())
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, ticks):
     whole.assert_resumes(kind, ticks, tmp_path / "run")
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
     whole.assert_loads(kind, tmp_path / "weights")
@@ -157,6 +159,7 @@ def test_skills_learn_where_a_ready_selector_calls_them(whole):
     assert not any(name.startswith("selector.") for name in told)
 
 
+@pytest.mark.slow
 def test_skills_that_learn_under_a_ready_selector_solve_the_corridor(tmp_path):
     # To stay is nearly as good as to go, as there is time. After 12,000 steps greedy skills stay at
     # the door with a third of the seeds; after 24,000 with none of 0 to 11.
@@ -197,6 +200,7 @@ CHAIN = Automaton(
 )
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("selector", [ON, OFF])
 @pytest.mark.parametrize("learn", ["apart", "together"])
 def test_a_restricted_selector_calls_nothing_else_also_when_it_is_trained(
@@ -253,6 +257,7 @@ def test_a_function_that_is_told_of_calls_hears_of_those_that_were_made(tmp_path
     assert len(np.unique(np.concatenate(heard))) > 2
 
 
+@pytest.mark.slow
 def test_a_population_of_restricted_selectors_evolves(tmp_path):
     skills = [
         Leave(),

@@ -217,6 +217,7 @@ def test_the_extra_is_named(monkeypatch):
         world.Rooms(("Empty-5x5",))
 
 
+@pytest.mark.slow
 def test_skills_that_are_there_learn_nothing_more():
     ready = {name: lambda obs: np.zeros(len(obs), np.int64) for name in SKILLS}
     found = rooms.with_skills("multi-room", ready, apart=Apart(selector_steps=4096))

@@ -218,6 +218,7 @@ def test_calls_end_where_there_is_nothing_left_to_do():
     assert [ends(carry, o) for o in (held, around)] == [(False, False), (True, False)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("declare", [arm.declare, arm.anchored])
 def test_a_selector_is_learnt_over_skills_with_and_without_the_tree_beside_it(declare, tmp_path):
     pytest.importorskip("mujoco")

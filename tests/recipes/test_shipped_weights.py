@@ -30,6 +30,7 @@ def test_every_recipe_with_weights_is_here_and_made_by_make_weights():
     assert sorted(made[1].split()) == found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_weights_do_their_task(name):
     needs, episodes, greedy, bar = SHIPPED[name]

@@ -21,7 +21,10 @@ from skillweave.runs.directory import RunDirectory
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser here: apt-get install chromium")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="no browser here: apt-get install chromium"),
+]
 pytest.importorskip("vl_convert")
 pytest.importorskip("imageio_ffmpeg")
 playwright = pytest.importorskip("playwright.sync_api")

@@ -60,6 +60,7 @@ def test_errors_of_opengl_have_a_hint(monkeypatch, told):
     assert screen.hint(RuntimeError("no light here")) == ""
 
 
+@pytest.mark.slow
 def test_the_half_cheetah_is_drawn_by_a_camera_that_stands_still():
     pytest.importorskip("mujoco")
     if ctypes.util.find_library("EGL") is None:

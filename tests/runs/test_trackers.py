@@ -111,6 +111,7 @@ def test_after_a_resume_tensorboard_shows_each_step_of_each_stage_once(run: RunD
     assert shown["selector"] == [(100, 1.0), (200, 2.0), (300, 2.0)]
 
 
+@pytest.mark.slow
 def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
     run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +212,7 @@ tracker.close()
 """
 
 
+@pytest.mark.slow
 def test_wandb_without_a_login_works_offline_and_asks_for_nothing(tmp_path: Path) -> None:
     if importlib.util.find_spec("wandb") is None:
         pytest.skip("wandb is not installed")
@@ -239,6 +241,7 @@ def test_wandb_without_a_login_works_offline_and_asks_for_nothing(tmp_path: Path
     assert film.read_bytes().startswith(b"GIF89a")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
     run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -278,6 +281,7 @@ def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
     assert len(client.search_runs([experiment])) == 2
 
 
+@pytest.mark.slow
 def test_where_mlflow_does_not_answer_it_is_said_before_training(
     run: RunDirectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,11 @@ import sys
 from collections import Counter
 from types import SimpleNamespace
 
+import pytest
+
 from scripts.torture.code import tally
+
+pytestmark = pytest.mark.slow
 
 
 def test_outcomes_are_counted_over_all_categories(monkeypatch, capsys):

@@ -65,6 +65,7 @@ def hierarchy(**settings) -> sw.Hierarchy:
     return sw.Hierarchy(spec, [Late(), Always()], call_steps=3, **plainly({**given, **settings}))
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize(
     "settings",
     [
@@ -116,6 +117,7 @@ def test_what_a_killed_and_resumed_run_made_again_is_not_reported_twice(made, tm
     assert ours == theirs
 
 
+@pytest.mark.slow
 def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
     class Zero(sw.Skill):
         def policy(self, obs):
@@ -133,6 +135,7 @@ def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
     assert run.info()["stages"][0]["steps"] < declared.apart.selector_steps + 64 * 64
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
 @pytest.mark.parametrize("evolve", [None, sw.Evolution(population=2, generations=10, episodes=1)])
 def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_to_their_ends(
@@ -154,6 +157,7 @@ def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_t
     assert {line["length"] for line in ended} == {20.0}
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
 def test_a_population_reports_its_search_for_a_start(algorithm, made, tmp_path):
     declared = hierarchy(algorithm=algorithm, selector_steps=300)

@@ -244,6 +244,7 @@ KINDS = {
 }
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", KINDS)
 def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights(name):
     config, kind = KINDS[name]
