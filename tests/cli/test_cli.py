@@ -293,6 +293,7 @@ def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
 ) -> None:
     before = recipes.load("lunar-lander").total_steps
     budgets = ("apart.skill_steps=100", "skills.landing.steps=100", "apart.selector_steps=100")
+    budgets += ("together.steps=100",)
     small = (*(part for b in budgets for part in ("--set", b)), "--scale", 0.5)
     tiny = [f"algorithm.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
     tiny += [f"skills.landing.{k}" for k in ("batch_size=4", "n_steps=2", "num_envs=2")]
