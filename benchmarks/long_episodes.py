@@ -65,7 +65,7 @@ class Stopping(Progress):
 
 
 def hierarchy(length: int, steps: int) -> Hierarchy:
-    return Hierarchy(lambda: Late(length), [Task()], algorithm=PPO())
+    return Hierarchy(lambda: Late(length), [Task()], algorithm=PPO(), steps=steps)
 
 
 def main() -> None:

@@ -482,23 +482,23 @@ def test_errors_of_skills_below_name_their_path(tmp_path):
 def stage(name, kept):
     """An entry of ``run.json``: done and judged, done, or still waiting."""
     entry = {"name": name, "kind": "together", "status": "waiting" if kept == "waiting" else "done"}
-    judged = kept in ("before", "after", "sampled")
-    told = {"compared": judged or kept == "unjudged", "greedy_judged": True}
-    return entry | ({} if kept == "alone" else told) | ({"kept": {"kept": kept}} if judged else {})
+    judged = kept in ("before", "greedy", "skills_sample")
+    told = {"compared": judged or kept == "unjudged", "greedy_judged": kept != "alone"}
+    return entry | told | ({"kept": {"kept": kept}} if judged else {})
 
 
 @pytest.mark.parametrize(
     ("stages", "greedy"),
     [
         ({}, (True, True)),  # all apart
-        ({"together": "after"}, (True, True)),
-        ({"together": "sampled"}, (False, False)),
+        ({"together": "greedy"}, (True, True)),
+        ({"together": "skills_sample"}, (False, False)),
         ({"together": "waiting"}, (True, True)),
         ({"together": "unjudged"}, (True, True)),
-        ({"inner/together": "sampled"}, (True, False)),
-        ({"inner/together": "sampled", "together": "before"}, (True, False)),
-        ({"inner/together": "sampled", "together": "after"}, (True, True)),
-        ({"inner/together": "sampled", "together": "unjudged"}, (True, False)),
+        ({"inner/together": "skills_sample"}, (True, False)),
+        ({"inner/together": "skills_sample", "together": "before"}, (True, False)),
+        ({"inner/together": "skills_sample", "together": "greedy"}, (True, True)),
+        ({"inner/together": "skills_sample", "together": "unjudged"}, (True, False)),
         ({"inner/together": "alone"}, (True, False)),  # it played no episodes: as it learnt
     ],
 )

@@ -148,7 +148,7 @@ def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_t
         [task],
         algorithm=algorithm,
         train_defaults=sw.TrainDefaults(checkpoint_every=20),
-        learn="apart",
+        steps=640,
     )
     run = declared.train(tmp_path / "run", flat=True, quiet=True, evolve=evolve)
     lines = list(RunDirectory.open(run.path).metrics())
