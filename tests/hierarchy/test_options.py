@@ -300,6 +300,7 @@ def test_reflexes_override_and_the_last_one_wins(options, walks, call_steps):
     assert {0, 1, 2} <= set(lefts)
 
 
+@pytest.mark.usefixtures("unprobed")
 def test_a_skill_that_watches_sees_the_action_that_reflexes_left(options):
     seen = []
 
@@ -336,6 +337,7 @@ def recorder(seen: dict, max_steps=None, stops=False):
     return type("Recorder", (Skill,), attributes)
 
 
+@pytest.mark.usefixtures("unprobed")
 def test_termination_sees_the_step_of_its_own_environment_and_call(options, walks):
     seen = {}
     env = options(skill_set(Left, recorder(seen, max_steps=3), call_steps=4), walks)
@@ -378,6 +380,7 @@ class Nested(gym.Env):
         return obs, 0.0, False, False, {"id": self.number, "deep": deep}
 
 
+@pytest.mark.usefixtures("unprobed")
 def test_a_skill_sees_its_own_rows_of_info_however_deep(options):
     seen = []
 
@@ -658,6 +661,7 @@ def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):
 
 
 @pytest.mark.filterwarnings("ignore:.*precision lowered")
+@pytest.mark.usefixtures("unprobed")
 def test_envpool_steps_only_those_whose_calls_go_on(options):
     pytest.importorskip("envpool")
     told = []
