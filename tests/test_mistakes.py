@@ -384,6 +384,55 @@ def test_a_device_that_is_not_there() -> None:
         train(algorithm=dataclasses.replace(SMALL, device="cuda"))
 
 
+def changed(**attributes: Any) -> None:
+    """Train a hierarchy whose attributes were set after it was declared."""
+    hierarchy = declare()
+    for name, value in attributes.items():
+        setattr(hierarchy, name, value)
+    hierarchy.train("runs/changed", quiet=True)
+
+
+CHANGED = {
+    "learn": ("jointly", "it must be one of"),
+    "call_steps": (0, "it must be at least 1"),
+    "algorithm": ("PPO", "no algorithm's settings"),
+    "selector": (3, "selector is 3"),
+    "steps": (-4, "steps is -4"),
+    "apart": ({"skill_steps": 5}, "write apart=Apart(skill_steps=100_000)"),
+    "skills": ([Good], "write Center(), not Center"),
+    "reflexes": (None, "reflexes=[Reflex(...)]"),
+    "env": (None, "it must be a Gymnasium id"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_what_is_set_after_the_declaration_is_checked_as_well(name: str) -> None:
+    value, words = CHANGED[name]
+    with pytest.raises(SkillweaveError) as caught:
+        changed(**{name: value})
+    assert words in str(caught.value)
+    assert not Path("runs/changed").exists()
+
+
+def test_what_is_set_on_an_agent_or_a_skill_afterwards_is_checked_as_well() -> None:
+    agent = sw.Agent("CartPole-v1", SMALL, 256)
+    agent.steps = "many"  # type: ignore[assignment]
+    with pytest.raises(SkillweaveError, match="steps is 'many'"):
+        agent.train("runs/agent", quiet=True)
+    hierarchy = declare()
+    hierarchy.skills[0].max_steps = -3
+    with pytest.raises(SkillweaveError, match="max_steps is -3"):
+        hierarchy.train("runs/changed", quiet=True)
+
+
+def test_what_is_set_on_a_hierarchy_inside_afterwards_is_checked_as_well() -> None:
+    inner = declare()
+    outer = declare(skills=[inner, Good()])
+    inner.call_steps = 0
+    with pytest.raises(SkillweaveError, match="call_steps is 0"):
+        outer.train("runs/outer", quiet=True)
+
+
 WARNED = {
     "terminaton": ({"terminaton": lambda _, step: step.next_obs[:, 0] > 1}, "termination"),
     "done": ({"done": lambda _, step: step.next_obs[:, 0] > 1}, "termination"),

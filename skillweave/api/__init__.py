@@ -64,6 +64,7 @@ class Agent(PlainAgent):
         ``seed``, ``eval_every``, ``eval_episodes``, ``checkpoint_every``, ``quiet``, ``track``,
         ``evolve``, ``cluster`` and ``start_from`` are as in ``Hierarchy.train``.
         """
+        self.validate()
         how = self.train_defaults.given(
             eval_every=eval_every, eval_episodes=eval_episodes, checkpoint_every=checkpoint_every
         )
@@ -83,6 +84,7 @@ class Agent(PlainAgent):
 
         ``quiet``, ``evolve`` and ``cluster`` are as in ``Hierarchy.resume``.
         """
+        self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
         return go_on(self, run, quiet, evolve, cluster, told_differences(self, run))
@@ -90,6 +92,7 @@ class Agent(PlainAgent):
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
         """The finished run of this agent in ``run_dir``."""
+        self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
         return Run(self, run.path, training.load(self, run))
@@ -106,6 +109,7 @@ class Agent(PlainAgent):
     @checked_names
     def load_weights(self, path: str | Path) -> Run:
         """This agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
+        self.validate()
         path = as_path(path, "path")
         return Run(self, path, read_agent(self.spec, *open_weights(path), path))
 
@@ -199,6 +203,7 @@ class Hierarchy(Declaration):
             SkillweaveError: the declaration does not fit the environment, training diverged, or
                 nobody can start from ``start_from``.
         """
+        self.validate()
         seed = whole_number(seed, "seed", 0)
         how = self.train_defaults.given(
             eval_every=eval_every, eval_episodes=eval_episodes, checkpoint_every=checkpoint_every
@@ -225,6 +230,7 @@ class Hierarchy(Declaration):
         selection of your own. ``cluster``: where its collectors run from now on; their number
         stays.
         """
+        self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         own = adopted(self, run)
         return go_on(own, run, quiet, evolve, cluster, told_differences(self, run))
@@ -232,6 +238,7 @@ class Hierarchy(Declaration):
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
         """The finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
+        self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         own = adopted(self, run)
         return Run(declared_of(own, run), run.path, training.load(own, run))
@@ -246,6 +253,7 @@ class Hierarchy(Declaration):
     @checked_names
     def load_weights(self, path: str | Path) -> Run:
         """This hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
+        self.validate()
         path = as_path(path, "path")
         own = copied(self)  # it takes over how skills are called
         policy = read_weights(own, path)

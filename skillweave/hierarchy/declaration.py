@@ -86,6 +86,14 @@ class Declaration(Nestable):
     """It is of a run that was loaded without its code, and knows less than was declared."""
 
     def __post_init__(self) -> None:
+        self.validate()
+
+    def validate(self) -> None:
+        """Check every setting; training and loading do it again, as attributes may be set.
+
+        Raises:
+            SkillweaveError: something is wrong; the message names it.
+        """
         check_env(self.env)
         self.skills = checked_skills(self.skills, RESERVED)
         self.reflexes = checked_reflexes(self.reflexes)
@@ -96,6 +104,9 @@ class Declaration(Nestable):
         check_fields(self)
         check_calls(self.call_steps, self.skills)
         check_nested(self)
+        for skill in self.skills:
+            if (inner := inner_of(skill)) is not None:
+                inner.validate()
 
     @property
     def spec(self) -> EnvSpec:

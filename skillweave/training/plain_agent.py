@@ -48,6 +48,14 @@ class PlainAgent:
     """It is of a run that was loaded without its code, and knows less than was declared."""
 
     def __post_init__(self) -> None:
+        self.validate()
+
+    def validate(self) -> None:
+        """Check every setting; training and loading do it again, as attributes may be set.
+
+        Raises:
+            SkillweaveError: something is wrong; the message names it.
+        """
         check_env(self.env)
         check_algorithm(self.algorithm, "algorithm")
         check_fields(self)
