@@ -255,7 +255,7 @@ def _draw(
                 axes.fill_between(
                     line.steps, line.low, line.high, alpha=0.2, linewidth=0, color=look["color"]
                 )
-        axes.set_xlabel("environment steps" if agent is None else f"environment steps of {agent}")
+        axes.set_xlabel("environment steps")
         words = AXES.get(metric, metric.replace("_", " "))
         if binary:
             words = words.replace("mean return", "episodes solved")

@@ -215,7 +215,7 @@ def _run_row(
         "mean": say(None if told is None else told["mean"]),
         "iqm": say(None if told is None else told["iqm"]),
         "solved": percent(_solved(saved)),
-        "length": number(None if told is None else told["length_mean"]),
+        "length": NOTHING if told is None else f"{told['length_mean']:,.1f}",
         "episodes": NOTHING if told is None else str(told["episodes"]),
     }
 
