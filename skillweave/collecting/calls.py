@@ -258,7 +258,7 @@ class SkillSet:
         worth, n = how.worth(obs[rows]), len(self.skills)
         own = worth[np.arange(len(rows)), running[rows]]
         may = self.startable(obs[rows])[:, :: max(1, len(self.lengths))]
-        anew = np.where(may.any(axis=1), worth[:, n], -np.inf)  # else nobody could be called then
+        anew = np.where(may.any(axis=1), worth[:, n], -np.inf)  # else no skill could be called then
         why[rows[anew - own > how.margin]] = Why.INTERRUPTED
 
     def succeeded(self, memory: Memory, rows: Array, step: Step, why: Array) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, SkillCritic
+from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, SkillCritic
 from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import Declaration
@@ -65,10 +65,19 @@ def own_stages(
         return apart
     together = _together(declaration, as_skill, budgets[TOGETHER])
     if as_skill is None or _plays_alone(declaration):  # else its episodes cannot be evaluated
-        choices = (own.selection for _, own in every_hierarchy(declaration))
-        left = any(None in (c.greedy_skills, c.greedy_selector) for c in choices)
-        together = replace(together, compared=bool(apart), greedy_judged=left)
+        left_open = any(open_choices(declaration))
+        together = replace(together, compared=bool(apart), greedy_judged=left_open)
     return [*apart, together]
+
+
+def open_choices(declaration: Declaration) -> tuple[bool, bool]:
+    """Return whether it is open anywhere if skills are greedy, and if a trained selector is."""
+    hierarchies = [own for _, own in every_hierarchy(declaration)]
+    trained = any(own.ready_selector is None for own in hierarchies)
+    return (
+        any(own.selection.greedy_skills is None for own in hierarchies),
+        trained and any(own.selection.greedy_selector is None for own in hierarchies),
+    )
 
 
 def _together(declaration: Declaration, as_skill: Skill | None, budget: int) -> Stage:
@@ -83,7 +92,12 @@ def _together(declaration: Declaration, as_skill: Skill | None, budget: int) -> 
     ready = declaration.ready_selector is not None
     config = declaration.algorithm if ready else _with_epsilon(declaration.selector, how)
     beside, weights = _learners(declaration, how), _task_weights(declaration)
-    if how.interrupt or any(weights.get(k, how.task_weight) for k in beside if not decides(k)):
+    follows_task = any(
+        weights.get(name, how.task_weight)
+        for name, own in beside.items()
+        if isinstance(own, OnPolicy) and not decides(name)
+    )
+    if how.interrupt or follows_task:
         beside |= _critic(config, how.interrupt)
     return Stage(
         TOGETHER,

@@ -15,6 +15,7 @@ import numpy as np
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import below, copied, every_hierarchy
+from skillweave.hierarchy.schedule import open_choices
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import SAMPLING, kept_words, to_be_judged
 from skillweave.training.evaluation import Evaluation, evaluate
@@ -95,7 +96,7 @@ def _scores(
         return score(with_sampling(declaration, *SAMPLING[name]), learnt)
 
     found = {"greedy": sampling("greedy")}
-    skills_open, selector_open = _open_choices(declaration)
+    skills_open, selector_open = open_choices(declaration)
     if entry["greedy_judged"] and skills_open:
         found["skills_sample"] = sampling("skills_sample")
     if entry["greedy_judged"] and selector_open:
@@ -117,16 +118,6 @@ def _best(scores: Mapping[str, Evaluation]) -> str:
         if one.mean() - other.mean() > CLEARLY * error:
             return name
     return best
-
-
-def _open_choices(declaration: Declaration) -> tuple[bool, bool]:
-    """Return whether greedy skills, and a greedy selector, are left open anywhere."""
-    choices = [own.selection for _, own in every_hierarchy(declaration)]
-    trained = any(own.ready_selector is None for _, own in every_hierarchy(declaration))
-    return (
-        any(c.greedy_skills is None for c in choices),
-        trained and any(c.greedy_selector is None for c in choices),
-    )
 
 
 def settled(

@@ -12,7 +12,7 @@ from torch import Tensor
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Experience
-from skillweave.training.learner import Learner, Stack
+from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.training.stage import CRITIC, SELECTOR, decides
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -36,7 +36,12 @@ class WovenLearner:
     ) -> None:
         self.parts, self._progress = dict(parts), 0.0
         weights = weights or {}
-        self._weights = {k: weights.get(k, task_weight) for k in parts if not decides(k)}
+        # Learners from replay keep no advantage, so they follow their own reward alone.
+        self._weights = {
+            name: weights.get(name, task_weight)
+            for name, part in parts.items()
+            if isinstance(part, RolloutLearner) and not decides(name)
+        }
         self._selector, self._critic = node + SELECTOR, node + CRITIC
         self.counts = {name: [0, 0] for name in parts}
         """By path, in how many rows each has acted, and how often it has learnt from them."""

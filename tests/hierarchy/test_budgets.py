@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from skillweave import PPO, Apart, Hierarchy, Lengths, Skill, SkillweaveError, Together
+from skillweave import (
+    DQN,
+    PPO,
+    Apart,
+    Hierarchy,
+    Lengths,
+    Selection,
+    Skill,
+    SkillweaveError,
+    Together,
+)
 from skillweave.hierarchy.schedule import stages_of
 
 
@@ -106,6 +116,21 @@ def test_a_skill_keeps_to_its_own_reward_where_it_says_so():
     assert stage.entry()["task_weights"] == {"own": 0.0}
     alone = stages_of(declare(Own()))[0]
     assert "skill_critic" not in alone.beside, "no skill needs what the critic says"
+
+
+def test_skills_that_learn_from_replay_need_no_critic_of_the_task():
+    (stage,) = stages_of(declare(algorithm=DQN()))
+    assert list(stage.beside) == ["one", "two"]
+
+
+def test_nothing_is_compared_where_nothing_is_left_open():
+    def rule(obs):
+        return obs[:, 0] > 0
+
+    fixed = Selection(greedy_skills=True)
+    assert not stages_of(declare(selector=rule, selection=fixed))[0].greedy_judged
+    assert stages_of(declare(selection=fixed))[0].greedy_judged, "the selector's choice is open"
+    assert stages_of(declare(selector=rule))[0].greedy_judged, "that of the skills is"
 
 
 def test_a_weight_of_a_hierarchy_holds_for_the_skills_in_it():
