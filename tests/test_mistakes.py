@@ -365,8 +365,9 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write runs into a folder of the test."""
+    """Write runs into a folder of the test, where no other test has registered an environment."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(gym.registry, "LunarLander-v2", raising=False)
 
 
 @pytest.mark.parametrize("label", MISTAKES)

@@ -20,8 +20,10 @@ from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted
 from skillweave.hierarchy.guidance import check_selection
 from skillweave.hierarchy.nesting import (
     Nestable,
+    check_ends,
     check_nested,
     every_skill,
+    inner_hierarchies,
     inner_of,
 )
 from skillweave.hierarchy.settings import Apart, Guide, Selection
@@ -103,10 +105,10 @@ class Declaration(Nestable):
         target_of(self.selection.target_return, None, "selector")
         check_fields(self)
         check_calls(self.call_steps, self.skills)
-        check_nested(self)
-        for skill in self.skills:
-            if (inner := inner_of(skill)) is not None:
-                inner.validate()
+        check_ends(self)
+        for _, inner in inner_hierarchies(self.skills):
+            inner.validate()
+        check_nested(self)  # last: messages then call every skill by its path
 
     @property
     def spec(self) -> EnvSpec:

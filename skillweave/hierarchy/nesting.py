@@ -108,7 +108,7 @@ def check_nested(declared: Declaration) -> None:
 
     Afterwards messages call every skill by its path.
     """
-    _check_ends((declared,), "")
+    check_ends(declared)
     for skill, inner in inner_hierarchies(declared.skills):
         # How many processes step it is said by the outermost one, for all.
         if replace(inner.spec, workers=None) != replace(declared.spec, workers=None):
@@ -139,8 +139,12 @@ def _shown(one: Declaration, other: Declaration) -> str:
     return one.spec.name if one.spec.name != other.spec.name else short(one.spec)
 
 
-def _check_ends(above: tuple[Any, ...], path: str) -> None:
+def check_ends(declared: Declaration) -> None:
     """Raise a SkillweaveError where a hierarchy contains itself."""
+    _check_ends((declared,), "")
+
+
+def _check_ends(above: tuple[Any, ...], path: str) -> None:
     for skill, inner in inner_hierarchies(above[-1].skills):
         here = f"{path}{skill.name}"
         if any(inner is other for other in above):
