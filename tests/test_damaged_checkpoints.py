@@ -112,6 +112,7 @@ CASES = [
 ]
 
 
+@pytest.mark.fast_cases(10)
 @pytest.mark.parametrize(("kind", "name", "damage"), CASES)
 def test_numbers_that_are_never_written_are_refused(stopped, tmp_path, kind, name, damage):
     run = tmp_path / "run"

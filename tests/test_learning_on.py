@@ -66,7 +66,7 @@ class StopAfter:
             raise KeyboardInterrupt
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["left", "selector", "together"])
 def test_a_run_killed_between_stages_ends_as_if_it_had_not_been(whole, stage, tmp_path):
     run = new_run(then(), tmp_path / "run")

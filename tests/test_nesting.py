@@ -201,7 +201,7 @@ STOPS["a ready selector"] = (3, 9)  # after 4 its episodes are still the first o
 LATER = [("apart", (15, 11)), ("then", (32,)), ("inside, then", (7,)), ("three", (8,))]
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "ticks"), [*STOPS.items(), *LATER])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kind, ticks):
     whole.assert_resumes(kind, ticks, tmp_path / "run")

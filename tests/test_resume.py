@@ -375,7 +375,7 @@ def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
     assert_metrics_fit(run.path, tmp_path / "whole")
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rainbow", "sac"])
 def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
     tmp_path: Path, name: str
@@ -397,6 +397,7 @@ def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
     assert [r["steps"] for r in lines(run.path)] == [128, 252, 376, 500, 628, 652]
 
 
+@pytest.mark.slow
 def test_a_hierarchy_that_learns_from_replay_ends_as_if_it_had_not_been_stopped(
     tmp_path: Path,
 ) -> None:
@@ -598,6 +599,7 @@ cp -r "$1/run" "$4/finished"
 """
 
 
+@pytest.mark.slow
 def test_a_run_stopped_by_a_full_disk_goes_on_when_there_is_room_again(
     tmp_path: Path, reference: Reference
 ) -> None:

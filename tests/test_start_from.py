@@ -126,6 +126,7 @@ def test_all_who_have_learnt_there_begin_with_it(learn, source, tmp_path):
         assert_near(after[name], wanted)
 
 
+@pytest.mark.slow
 def test_what_was_learnt_together_is_a_start_too_with_its_critic(tmp_path):
     how = {"interrupt": True, "together_steps": 600}
     declare("together", **how).train(tmp_path / "a", seed=1, quiet=True)
@@ -156,6 +157,7 @@ def test_who_has_not_learnt_there_begins_afresh_and_people_are_told(source, tmp_
     assert starts == {"left": None, "third": None}
 
 
+@pytest.mark.slow
 def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_path):
     moments = {k: v for k, v in learnt_in(source)["left"].policy.weights.items() if "obs_" in k}
     assert set(moments) == {"obs_mean", "obs_var"}
@@ -201,6 +203,7 @@ def test_a_dqn_does_not_explore_anew(tmp_path, monkeypatch):
     assert epsilon == pytest.approx([OFF.exploration_final_eps] * len(epsilon))
 
 
+@pytest.mark.slow
 def test_who_starts_from_a_run_is_not_held_near_what_it_was(source, tmp_path, monkeypatch):
     anchors, make = {}, WovenLearner.__init__
 
@@ -266,7 +269,7 @@ def begun(path, source, **how):
     )
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", ["apart", "together"])
 def test_a_run_that_is_killed_needs_the_other_one_no_more(learn, source, tmp_path):
     """Also where it is killed before its first checkpoint."""
@@ -307,6 +310,7 @@ def test_a_copy_that_is_lost_or_anothers_is_refused(source, tmp_path):
     declare().resume(run.path, quiet=True)
 
 
+@pytest.mark.slow
 def test_runs_that_start_elsewhere_are_others(source, tmp_path):
     ids = [
         run.info()["id"]
@@ -501,6 +505,7 @@ def test_all_levels_of_a_nested_hierarchy_begin_with_what_they_learnt(tmp_path):
         assert_near(after[name], wanted)
 
 
+@pytest.mark.slow
 def test_a_selector_below_must_choose_from_the_same_skills(tmp_path):
     nested().train(tmp_path / "a", seed=1, quiet=True)
     other = nested()

@@ -106,7 +106,7 @@ def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kin
     whole.assert_resumes(kind, (2, 4, 2), tmp_path / "run")
 
 
-@pytest.mark.fast_cases(4)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
     whole.assert_loads(kind, tmp_path / "weights")
@@ -462,6 +462,7 @@ class Right(Skill):
     """The reward of the task, so that it is learnt by a flat agent as well."""
 
 
+@pytest.mark.slow
 def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
     """What a flat agent would learn from: the value of a state is that of its episode."""
     alone = declare(

@@ -103,6 +103,7 @@ def in_ipython(folder: Path, **environment: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path: Path) -> None:
     shown = in_ipython(tmp_path)
     assert "In[2], line 3" in shown

@@ -229,6 +229,7 @@ class Branching:
 register_encoder("branching", Branching)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried() -> None:
     network, says = Network((8,), encoder="branching"), r"PPO\.compile: the gradient step could not"
     algorithm, state = small_ppo(network=network, compile=True)
@@ -263,6 +264,7 @@ def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     assert Compiled(lambda: 3, DQN(compile="auto"))() == 3
 
 
+@pytest.mark.slow
 def test_no_compiler_says_so_but_where_it_is_tried(tmp_path: Path) -> None:
     code = """
 import torch

@@ -184,6 +184,7 @@ def test_the_table_has_every_observation_for_every_algorithm(kind):
 # Learning, saving
 
 
+@pytest.mark.fast_cases(2)
 @every_case
 def test_it_learns_to_answer_what_it_sees(case):
     algorithm, state, env = case.learn()
@@ -240,6 +241,7 @@ def stacked(case: Case, config: AlgorithmConfig, budget: int) -> Any:
     return stack, singles
 
 
+@pytest.mark.fast_cases(4)
 @every_case
 def test_a_stack_of_three_learns_what_three_single_members_learn(case):
     stack, singles = stacked(case, case.brief(), budget=72)
@@ -332,6 +334,7 @@ def values(algorithm: Any, state: Any, obs: Any) -> list[float]:
     return algorithm.value(state, torch.as_tensor(np.asarray(obs))[None])[0].tolist()
 
 
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("name", [name for name in VALUED if name != "ddpg"])
 def test_a_time_limit_is_bootstrapped(name):
     algorithm, state = trained(acted_in(Allowance(8), name), name)
@@ -339,7 +342,7 @@ def test_a_time_limit_is_bootstrapped(name):
     assert values(algorithm, state, np.zeros((1, 1), np.float32)) == pytest.approx([5.0], rel=0.06)
 
 
-@pytest.mark.fast_cases(3)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", [name for name in VALUED if name != "ppo with lstm"])
 def test_an_end_is_not_bootstrapped(name):
     algorithm, state = trained(acted_in(Countdown(8), name), name)
@@ -367,6 +370,7 @@ class LongCalls(Toy):
         return still, 3 * self.ones, self.never, self.never
 
 
+@pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("name", [name for name in VALUED if name != "ppo with lstm"])
 def test_the_value_of_calls_discounts_by_their_length(name):
     algorithm, state = trained(acted_in(LongCalls(8), name), name)
@@ -379,7 +383,7 @@ def test_the_value_of_calls_discounts_by_their_length(name):
 SHORT, LONG = 1 / (1 - GAMMA), 3 + GAMMA**10 / (1 - GAMMA)  # 5.0 and 3.54
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", [name for name in CHOOSERS if name != "ppo with lstm"])
 def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_step(name):
     algorithm, state = trained(
@@ -439,6 +443,7 @@ class Endless(Masked):
         return next_obs, reward, self.never, self.never
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ["dqn", "dqn of three steps", "sac of choices"])
 def test_a_forbidden_action_is_never_chosen_in_targets(name):
     # A line for each observation: what is never done keeps the value that it is given here.
@@ -582,7 +587,7 @@ def remembered(config: PPO, budget: int) -> float:
 RECALLING = {"num_envs": 16, "n_steps": 16, "batch_size": 64, "gamma": 0.9, "overlap": True}
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MEMORIES)
 def test_what_was_seen_three_steps_before_is_remembered(kind):
     assert remembered(replace(MEMORIES[kind], **RECALLING), 10_240) == 1.0

@@ -175,6 +175,7 @@ class Fruitless(Toy):
         return after, np.full(self.num_envs, -0.02), never, self.t >= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_policy_that_can_win_nothing_stays_as_random_as_it_was(seed):
     """All advantages are the critic's errors. Made as large as any, they move the policy."""

@@ -183,6 +183,7 @@ def test_f1_and_f2_learn_the_first_task_and_those_that_are_named(tmp_path, chain
     assert {r.task for r in results.all("line")} == {"right", "left"}
 
 
+@pytest.mark.slow
 def test_steps_are_counted_as_they_were_made(done):
     for r in done.all("line"):
         rollout = TINY.num_envs * TINY.n_steps
@@ -214,6 +215,7 @@ def test_a_result_of_other_budgets_is_not_taken_for_this_one(done):
         Bench(suite().scaled(2.0), done, seed=0).run("flat")
 
 
+@pytest.mark.slow
 def test_results_of_other_code_are_named(done, tmp_path, capsys, monkeypatch):
     results = reported(done.all("line"), [0])
     assert {r.code for r in results} == {CODE}
@@ -335,6 +337,7 @@ def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_
                 np.testing.assert_array_equal(value, skills[name].weights[k])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("greedy", [True, False])
 @pytest.mark.parametrize("found_out", [True, False])
 def test_skills_act_on_every_task_as_they_did_where_they_were_learnt(
@@ -473,6 +476,7 @@ def test_the_hours_of_results_count_f3_on_the_first_task_once(done):
     assert hours(found) == pytest.approx(sum(r.seconds for r in own) / 3600.0)
 
 
+@pytest.mark.slow
 def test_figures_and_the_table_are_made_from_the_files(done, tmp_path):
     pytest.importorskip("matplotlib")
     results = reported(done.all("line"), [0])

@@ -255,11 +255,13 @@ def test_skills_are_scored_without_their_selector(tmp_path: Path) -> None:
     assert set(found.values()) == {0.0}
 
 
+@pytest.mark.slow
 def test_a_hierarchys_skills_are_scored_when_asked() -> None:
     found = one("together", "bridge", 4_000, "auto", f4=True, seed=0)
     assert list(found["f4"]) == ["by lot", "get_axe", "chop", "build", "cross"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["bridge", "lander"])
 def test_skills_alone_are_scored_as_the_run_plays_them(
     task: str, monkeypatch: pytest.MonkeyPatch

@@ -130,6 +130,7 @@ def test_an_experience_of_nobody_changes_nothing():
 # Everything else against the plainest replay there is
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**32 - 1),
     members=st.integers(1, 3),

@@ -287,6 +287,7 @@ def unshared_recipe() -> Iterator[None]:
         sys.modules[name] = before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unshared_recipe")
 def test_training_a_shipped_recipe_twice_in_one_process_scales_it_once(
     call: Call, tmp_path: Path

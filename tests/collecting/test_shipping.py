@@ -128,6 +128,7 @@ def test_packages_of_other_places_are_only_named(folder, tmp_path, monkeypatch):
         sys.modules.pop("a_package_elsewhere", None)
 
 
+@pytest.mark.slow
 def test_environments_arrive_as_they_are_registered_here_whatever_they_are_called(tmp_path):
     known, kind = gym.registry["CartPole-v1"], "gymnasium.envs.classic_control:CartPoleEnv"
     file = tmp_path / "packed"

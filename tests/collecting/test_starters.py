@@ -108,6 +108,7 @@ def test_each_of_its_ends_begins_anew_and_it_is_led_again():
     assert all(experience.obs[t + 1, n, T] == 0 for t, n in after)
 
 
+@pytest.mark.slow
 def test_where_no_starter_may_start_chance_acts():
     collector, asked = collector_of(OnlyFar), requests(600)
     first = collector.collect(next(asked)).experience
@@ -122,6 +123,7 @@ def test_without_starters_it_says_that_chance_found_nothing():
         collector.collect(next(requests(6_000)))
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(("kinds", "skill"), [((Five,), Anywhere), ((Five,), Far)])
 def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill):
     collector = collector_of(*kinds, skill=skill, start_calls=6)
@@ -138,6 +140,7 @@ def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill
     assert counts.sum() == 1.0
 
 
+@pytest.mark.slow
 def test_an_episode_in_which_it_may_not_start_begins_anew():
     found = collector_of(search_steps=9).collect(next(requests(200))).experience
     assert not found.valid.any()
@@ -234,6 +237,7 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
     assert acted(far_only, [0, 0, 0, 0], [2]) == [4]
 
 
+@pytest.mark.slow
 def test_an_episode_may_have_several_calls_with_those_of_others_between_them():
     collector = collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
     found = collector.collect(next(requests(3_000))).experience
@@ -281,6 +285,7 @@ class OnTime(Skill):
         return obs[:, T] % 15 == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start_calls", "ends"), [(0, {4}), (2, {4, 19, 34})])
 def test_after_a_call_it_is_called_again_only_where_the_calls_between_lead_to(start_calls, ends):
     how = {"start_calls": start_calls, "episode_calls": 3, "search_steps": 9}

@@ -230,6 +230,7 @@ PROGRAMS = {
 }
 
 
+@pytest.mark.slow
 def test_a_pickle_nested_too_deep_is_refused(tmp_path):
     for name, program in PROGRAMS.items():
         write_program(tmp_path / name, program)

@@ -55,6 +55,7 @@ def test_the_full_training_code_writes_four_agents_that_hold_no_pickle(trained):
         assert not data.startswith((b"PK", b"\x80"))
 
 
+@pytest.mark.slow
 def test_it_warns_once_of_the_old_id_and_says_once_that_wandb_is_offline(trained):
     folder, said = trained
     assert said.count("LunarLander-v2 means -v3") == 1
@@ -63,7 +64,7 @@ def test_it_warns_once_of_the_old_id_and_says_once_that_wandb_is_offline(trained
     assert len(list((folder / "wandb").glob("offline-run-*"))) == 4
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["skills", "hierarchy"])
 def test_the_rendering_scripts_write_films(trained, name):
     folder, _ = trained

@@ -202,6 +202,7 @@ def test_a_layer_taken_away_is_as_if_it_were_linear(name):
         torch.testing.assert_close(new[key], value, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.fast_cases(6)
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("activation", ["relu", "tanh", "silu"])
 def test_whatever_is_drawn_stays_within_the_limits_and_can_act(name, activation):

@@ -82,7 +82,7 @@ def learn(algorithm: Any, state: Any, action_space: Any, rows: list[int], update
         algorithm.update(state, sample, [(Seeds(u) / r).torch() for r in rows])
 
 
-@pytest.mark.fast_cases(6)
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("activation", ["relu", "tanh", "silu"])
 @pytest.mark.parametrize("name", CASES)
 def test_a_stack_of_several_widths_learns_what_each_member_learns_alone(name, activation):

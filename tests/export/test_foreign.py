@@ -110,6 +110,7 @@ class Sees(torch.nn.Module):
         return self.head(torch.cat([brightness, obs["inner"][1]], 1)) * 5.0
 
 
+@pytest.mark.slow
 def test_a_module_acts_as_here(tmp_path: Path) -> None:
     torch.manual_seed(0)
     space = SPACES["MultiDiscrete"][0]

@@ -122,6 +122,7 @@ def same(a: Any, b: Any) -> bool:
     return np.allclose(a, b, rtol=1e-4, atol=1e-5) if a.dtype.kind == "f" else bool((a == b).all())
 
 
+@pytest.mark.fast_cases(4)
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_a_plain_agent_acts_as_here(case: Any, tmp_path: Path) -> None:
     config, obs_space, action_space = case
@@ -148,6 +149,7 @@ def test_a_plain_agent_acts_as_here(case: Any, tmp_path: Path) -> None:
     assert len({str(np.round(x, 3)) for x in told}) > 1  # a constant would agree with anything
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ["ppo, normalised", "rainbow", "td3"])
 def test_a_sampling_agent_takes_its_noise_as_an_input(name: str) -> None:
     import onnxruntime

@@ -225,7 +225,7 @@ def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple
     return told
 
 
-@pytest.mark.fast_cases(3)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES)
 def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
     policy = make()

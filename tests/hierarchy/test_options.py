@@ -124,6 +124,7 @@ def agree(env: OptionsEnv, scalars: list[Scalar], calls: int, seed: int) -> dict
     return {k: np.array(v) for k, v in seen.items()}
 
 
+@pytest.mark.fast_cases(4)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("call_steps", [1, 2, 5, 40])
 def test_every_call_is_that_of_a_scalar_loop(options, call_steps, seed):
@@ -196,6 +197,7 @@ class Turn(Skill):
     policy = ScriptedPolicy(lambda obs: np.where(obs[:, 4] > 0, 3, 1), None, None)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("env_id", "kinds", "limit"),

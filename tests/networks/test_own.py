@@ -241,7 +241,7 @@ SOLVED = ("ppo", "dqn")
 """Those with a budget in which they learn the task."""
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("shows", ["vector", "image, channels last"])
 @pytest.mark.parametrize("name", LEARNERS)
 def test_it_learns_saves_and_loads_with_every_algorithm(name, shows):
@@ -277,6 +277,7 @@ def test_settings_are_recorded_as_data_and_are_equal_when_read():
     assert algorithm.layout.shapes["actor.encoder.layers.1.weight"] == (5, 4)
 
 
+@pytest.mark.slow
 def test_it_is_known_where_its_settings_are_unpacked(tmp_path):
     """A process that has none of the user's files acts by it, and reads files that name it."""
     config = replace(ON, network=Network((8,), encoder=Features))

@@ -218,6 +218,7 @@ def test_a_restricted_selector_calls_nothing_else_also_when_it_is_trained(
         assert run.evaluate(40, deterministic=False).mean > 0.5
 
 
+@pytest.mark.slow
 def test_a_selector_near_its_guide_does_what_the_guide_does(tmp_path):
     def shares(**how):
         # What the task pays says nothing here: no call is worth more than another.

@@ -68,6 +68,7 @@ def test_files_beside_a_recipe_are_imported_also_later(write: Write) -> None:
     assert center.reward(step).tolist() == [1.5]
 
 
+@pytest.mark.slow
 def test_what_is_imported_later_is_found_in_another_process_too(
     write: Write, tmp_path: Path
 ) -> None:

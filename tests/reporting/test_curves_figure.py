@@ -136,6 +136,7 @@ def test_the_figure_has_the_width_of_a_column_and_letters_of_eight_points(
     assert 'width="237.6pt"' in found.paths[1].read_text()  # of 72 points
 
 
+@pytest.mark.slow
 def test_plot_and_compare_take_a_sweep(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

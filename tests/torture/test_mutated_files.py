@@ -175,6 +175,7 @@ def test_a_number_gives_the_same_change_again_and_nearly_all_change_something(fo
     assert kinds >= {"bytes", "place", "json", "text", "line", "raw_header", "header", "tensors"}
 
 
+@pytest.mark.slow
 def test_only_named_settings_ask_for_other_behaviour_and_bad_numbers_never(folder, tmp_path):
     for number in range(600):
         told, _ = changed(folder, tmp_path / "x", number)

@@ -42,6 +42,7 @@ def test_a_device_that_is_not_there_is_told_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", LEARNERS)
 @pytest.mark.parametrize("evolve", EVOLVE)
 def test_auto_is_the_cpu_where_there_is_nothing_else(

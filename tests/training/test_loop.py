@@ -101,6 +101,7 @@ def test_a_forbidden_action_is_never_taken_and_the_best_of_the_others_is_learnt(
     assert greedy(algorithm, state, obs, mask).tolist() == [2, 2, 1]
 
 
+@pytest.mark.slow
 def test_a_time_limit_is_bootstrapped():
     # The observation is 0, so of a critic that begins at 0 only the last bias learns: that is slow.
     algorithm, state = train(Allowance(16), 200)
@@ -133,7 +134,7 @@ def test_rewards_of_any_size_are_learnt_in_their_own_units():
     )
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("allowed", "n_steps", "value"),
     [((True, False), 16, 1 / (1 - 0.9)), ((False, True), 160, 3 / (1 - 0.9**10))],

@@ -109,6 +109,7 @@ class Balance(Skill):
     """Stay up."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "algorithm",
     [PPO(num_envs=4, n_steps=16, batch_size=32, network=SMALL),
