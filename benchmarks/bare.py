@@ -23,7 +23,6 @@ def train_bare(
     seeds: Seeds,
     steps: int,
     on_tick: Callable[[Tick, Stack], None],
-    cut_every: int = 10**9,
 ) -> Stack:
     """Train an agent; ``on_tick`` is told of every report."""
     scene = skill_scene(spec)
@@ -34,7 +33,7 @@ def train_bare(
     collectors = Collectors([scene.collector(config.num_envs, acting)])
     try:
         train(
-            learner, collectors, Episodes(), seeds, steps, cut_every=cut_every,
+            learner, collectors, Episodes(), seeds, steps,
             on_tick=lambda tick: on_tick(tick, stack),
         )  # fmt: skip
     finally:

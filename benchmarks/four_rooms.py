@@ -223,7 +223,7 @@ def learnt(skills: list[Skill], config: Any, goal: int, steps: int, seed: int) -
     collectors.counted = Counted(len(skills))
     learner = learner_of(stack, config.num_envs, seeds / "learner", row_steps=CALL)
     try:
-        train(learner, collectors, Episodes(), seeds, steps, cut_every=10**9)
+        train(learner, collectors, Episodes(), seeds, steps)
     finally:
         collectors.close()
     return stack.algorithm, stack.state, collectors.counted

@@ -145,9 +145,6 @@ class Toy:
         self.obs = next_obs
         return RawStep(next_obs, reward.astype(np.float32), terminated, truncated, {})
 
-    def renew(self, seed: int) -> None:
-        pass
-
     def state(self) -> dict[str, Array]:
         """Everything it has: a toy is copied, not played again."""
         return {"pickle": np.frombuffer(pickle.dumps(self.__dict__), np.uint8).copy()}
@@ -480,9 +477,9 @@ class Training:
         """Train it, as ``train`` does."""
         return train(self.learner, self.collectors, self.episodes, self.seeds, budget, **how)
 
-    def resume(self, extra: dict[str, Any]) -> Array:
-        """Stand where a clean cut was."""
-        return resume(self.learner, self.collectors, self.episodes, extra)
+    def resume(self, extra: dict[str, Any], at: Progress) -> Array:
+        """Stand where a checkpoint was written, at these steps."""
+        return resume(self.learner, self.collectors, self.episodes, extra, at)
 
 
 def training(

@@ -21,7 +21,7 @@ from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec, obs_codec
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array, SkillweaveError, prefixed
 
 S = TypeVar("S")
 Device = torch.device | str
@@ -68,6 +68,38 @@ class ActingParams:
     shift: Tensor | None  # (P, 1, O), where observations are normalised
     scale: Tensor | None  # (P, 1, O)
     extra: dict[str, Tensor] = field(default_factory=dict)  # of exploration, such as ε, (P, 1)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return copies of all tensors by name, for a checkpoint."""
+        scaling = {"shift": self.shift, "scale": self.scale}
+        found = {k: v for k, v in scaling.items() if v is not None}
+        found |= prefixed("views", self.views) | prefixed("extra", self.extra)
+        return {k: v.detach().to("cpu", copy=True).contiguous() for k, v in found.items()}
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        """Take over a ``state`` of acting parameters of the same algorithm.
+
+        Weights are copied in place: the last bit of a product of matrices can depend on where they
+        lie in memory.
+
+        Raises:
+            ValueError: the state does not fit.
+        """
+        own = self.state()
+        if own.keys() != state.keys():
+            different = ", ".join(sorted(own.keys() ^ state.keys()))
+            raise ValueError(f"the parameters of the next rows do not fit: {different}")
+        for name, x in own.items():
+            saved = state[name]
+            if saved.shape != x.shape or saved.dtype != x.dtype or not bool(saved.isfinite().all()):
+                raise ValueError(f"{name} of the parameters of the next rows does not fit")
+        for name, view in self.views.items():
+            view.copy_(state[f"views.{name}"])
+        self.shift, self.scale = (
+            None if x is None else state[name].clone()
+            for name, x in (("shift", self.shift), ("scale", self.scale))
+        )
+        self.extra = {name: state[f"extra.{name}"].clone() for name in self.extra}
 
 
 class Algorithm:

@@ -108,6 +108,8 @@ def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) ->
         result = job(*arguments)
     except SkillweaveError as error:
         problem = SkillweaveError(str(error))
+    except KeyboardInterrupt:
+        os._exit(128 + signal.SIGTERM)  # its run has saved; the parent knows why it ended it
     except Exception:  # any, as it comes from what a user wrote; not all errors can be sent
         problem = RuntimeError(traceback.format_exc())
     try:

@@ -11,7 +11,6 @@ import numpy as np
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.columns import as_wide
 from skillweave.collecting.restored import check_numbers, opened
-from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, checksums
 from skillweave.experience import Experience
 from skillweave.seeding import Seeds
@@ -35,7 +34,7 @@ class Collected:
 class Collector:
     """N environments, and who acts in them. A function of requests, seeds and ``state``.
 
-    A clean cut does not end episodes: ``state`` holds what is needed to play them again.
+    A checkpoint ends no episode: ``state`` holds what is needed to play the open ones again.
 
     Args:
         engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
@@ -110,17 +109,8 @@ class Collector:
         """(N,) bool, environments in which an episode cannot begin, as it seems."""
         return np.zeros(self.num_envs, bool)
 
-    def cut(self, seeds: Seeds) -> Array:
-        """Make ready for ``state``: take new seeds, so that the past need not be kept.
-
-        Returns:
-            (k,) environments that begin anew, as their episodes are too long to be kept.
-        """
-        self.engine.renew((seeds / "env").integer())
-        return self._begin_anew(np.flatnonzero(self.kept["age"] > LONGEST_EPISODE))
-
     def state(self) -> dict[str, Array]:
-        """All that ``restore`` needs, right after ``cut``."""
+        """Return what ``restore`` needs. It changes nothing."""
         kept = {k: v.copy() for k, v in self.kept.items()} | {"obs": checksums(self.obs)}
         opened = {k: v.copy() for k, v in self.open.items()}
         found = prefixed("kept", kept) | prefixed("open", opened)

@@ -44,12 +44,8 @@ class Collectors:
         found = [part.collect(request.of_collector(i)) for i, part in enumerate(self.parts)]
         return self._joined(found)
 
-    def cut(self, seeds: Seeds) -> Array:
-        """Make ready for ``state``; (k,) environments that begin anew."""
-        return self._columns([part.cut(seeds / i) for i, part in enumerate(self.parts)])
-
     def state(self) -> dict[str, Array]:
-        """All that ``restore`` needs, right after ``cut``."""
+        """Return what ``restore`` needs. It changes nothing."""
         return joined_states([part.state() for part in self.parts])
 
     def restore(self, state: dict[str, Array]) -> Array:

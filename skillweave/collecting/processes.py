@@ -200,6 +200,7 @@ def _work(number: int, maker: _Maker, each: int, pipe: Connection, other_end: Co
 
     first = os.getppid()  # the parent waits for our first answer; after that it may be no more
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, who then closes us
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has the parent's handler
     torch.set_num_threads(1)
     other_end.close()
     station: Station | None = None

@@ -234,13 +234,8 @@ class WorkerCollectors(Workers, Collectors):
             self.states()
         return found
 
-    def cut(self, seeds: Seeds) -> Array:
-        """Make ready for ``state``; (k,) environments that begin anew."""
-        begun_anew = self._columns(self.ask("cut", self._divided(seeds)))
-        return np.union1d(begun_anew, self.differing())
-
     def state(self) -> dict[str, Array]:
-        """All that ``restore`` needs, right after ``cut``."""
+        """Return what ``restore`` needs. Only a worker that is lost meanwhile can change."""
         return joined_states(self.states())
 
     def restore(self, state: dict[str, Array]) -> Array:

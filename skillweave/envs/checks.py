@@ -23,7 +23,7 @@ from skillweave.types import (
 )
 
 LONGEST_EPISODE = 100_000
-"""Steps after which an episode is cut that nothing ends, wherever a policy is only watched."""
+"""Steps after which an engine truncates an episode that nothing else has ended."""
 LONGEST_FILM = 10_000
 """The same of a video."""
 
@@ -186,6 +186,11 @@ class Watch:
         if (row := wrong_reward(raw.reward)) is not None:
             raise self._wrong(row, ids, f"its reward is {raw.reward[row]}; {_REWARDS}")
         return raw
+
+    def too_long(self, ids: Array | None = None) -> Array:
+        """Return (n,) bool: the episodes of environments ``ids`` have had enough steps."""
+        found: Array = self._elapsed[slice(None) if ids is None else ids] >= LONGEST_EPISODE
+        return found
 
     def _check(self, obs: Array, ids: Array | None) -> None:
         for place in self._places:

@@ -3,7 +3,8 @@
 Gymnasium resets on the next step, in the same step or never; EnvPool resets on the next step
 and ignores the action sent then. An ``Engine`` knows none of this: ``step`` steps the
 environments named and returns their true successors, ``reset_some`` starts those named anew.
-An environment that has ended must be reset before the next step.
+An environment that has ended must be reset before the next step. An episode that nothing else
+ends is truncated after ``LONGEST_EPISODE`` steps.
 
 ``state`` is what ``restore`` needs to bring the environments where they are: their seeds and what
 was done since. Only an environment whose dynamics follow from these two can be restored.
@@ -58,10 +59,6 @@ class Engine(Protocol):
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
         """Act in some environments; the others stand still."""
-        ...
-
-    def renew(self, seed: int) -> None:
-        """Take new seeds for episodes that begin from now on, where histories grow long."""
         ...
 
     def state(self) -> dict[str, Array]:
@@ -133,9 +130,6 @@ class GymnasiumEngine:
         self.steps_made += len(rows)
         return self._act(action, ids)
 
-    def renew(self, seed: int) -> None:
-        """Nothing to do: every episode has a seed of its own."""
-
     def state(self) -> dict[str, Array]:
         """Seeds, and what was done since."""
         own = {"root": np.array([self._root]), "episode": self._episode, "seed": self._seed}
@@ -191,10 +185,10 @@ class GymnasiumEngine:
         if ids is not None:
             info = info_rows(info, ids, self.num_envs)
         self._masks.see(info, ids, terminated | truncated)
-        truncated = truncated & ~terminated
         next_obs = pack(self.observation_space, obs)
         raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
         self._watch.stepped(raw, ids)
+        raw.truncated = (truncated | self._watch.too_long(ids)) & ~terminated
         return raw
 
 

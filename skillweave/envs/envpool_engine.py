@@ -23,8 +23,9 @@ class EnvPoolEngine:
     """Environments of a pool: EnvPool's, or what a user makes of them.
 
     A pool takes its seeds when it is made, so an environment can be played again only from there.
-    To keep that short, ``renew`` makes a second pool now and then, in which environments go on
-    whose episodes have ended in the first one.
+    To keep that short, a second pool is made after ``RENEW_AFTER`` steps, and each environment
+    moves there when its episode ends. The seed of each pool follows from the first one and from
+    how many pools there were, so nothing depends on when a checkpoint is written.
 
     Args:
         make: a pool.
@@ -41,6 +42,8 @@ class EnvPoolEngine:
         self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
         self._all = np.arange(num_envs)
+        self._root = 0
+        self._made = 0  # pools since the root seed
         self._pools: list[Any] = []
         self._seeds: list[int] = []  # of the pools
         self._place = np.zeros(num_envs, np.int64)  # in which pool each environment is
@@ -85,6 +88,7 @@ class EnvPoolEngine:
 
     def reset(self, seed: int) -> Array:
         """Start all anew from one seed; observations (N, *obs_shape)."""
+        self._root, self._made = seed, 1
         self._pools, self._seeds = [self.make_pool(seed)], [seed]
         self._place[:] = 0
         self._history.forget(self._all)
@@ -94,6 +98,8 @@ class EnvPoolEngine:
         """Start some anew; observations (n, *obs_shape)."""
         if seeds is not None:
             raise SkillweaveError("EnvPool cannot reset single environments to a seed")
+        if len(self._pools) == 1 and self._history.total >= RENEW_AFTER:
+            self._add_pool()
         newest = len(self._pools) - 1
         moves = self._place[ids] != newest
         self._history.begin(ids[~moves])
@@ -111,15 +117,18 @@ class EnvPoolEngine:
         self.steps_made += len(rows)
         return self._act(action, rows)
 
-    def renew(self, seed: int) -> None:
-        """Make a second pool from this seed, where the histories have grown long."""
-        if len(self._pools) == 1 and self._history.total >= RENEW_AFTER:
-            self._pools.append(self.make_pool(seed))
-            self._seeds.append(seed)
+    def _add_pool(self) -> None:
+        """Make the next pool, with a seed of its own."""
+        node = np.random.SeedSequence(self._root, spawn_key=(self._made,))
+        seed = int(node.generate_state(1, np.uint32)[0] >> 1)
+        self._made += 1
+        self._pools.append(self.make_pool(seed))
+        self._seeds.append(seed)
 
     def state(self) -> dict[str, Array]:
         """Seeds, and what was done since."""
         own = {"seeds": np.array(self._seeds), "place": self._place.copy()}
+        own["root"] = np.array([self._root, self._made])
         return own | self._history.state()
 
     def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
@@ -129,6 +138,10 @@ class EnvPoolEngine:
         wrong = self._place.shape != (self.num_envs,) or not 0 < len(self._seeds) < 3
         if wrong or not ((self._place >= 0) & (self._place < len(self._seeds))).all():
             raise ValueError("environments are said to be in pools that there are not")
+        root = state["root"]
+        if root.shape != (2,) or root.dtype.kind != "i" or not (root >= 0).all():
+            raise ValueError("the first seed and the number of pools are no whole numbers")
+        self._root, self._made = (int(x) for x in root)
         self._history.load(state)
         self._pools = [self.make_pool(seed) for seed in self._seeds]
         obs = np.array(self._begin(self._all))
@@ -173,6 +186,7 @@ class EnvPoolEngine:
         raw = RawStep(*self._in_pools(ids, step))
         self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
         self._watch.stepped(raw, ids)
+        raw.truncated = (raw.truncated | self._watch.too_long(ids)) & ~raw.terminated
         return raw
 
     def _in_pools(

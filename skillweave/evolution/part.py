@@ -29,8 +29,6 @@ from skillweave.training.replay_learner import ReplayLearner, check_counts, stor
 from skillweave.training.scene import Scene
 from skillweave.types import Array, prefixed, unprefixed
 
-NEVER = 2**62
-"""Steps between cuts: a generation is one piece."""
 OnGenerationTick = Callable[[int, dict[str, float]], None]
 """Is told the steps of all members in this generation so far, and the metrics of an update."""
 
@@ -106,7 +104,7 @@ class Part:
             joined = self._together(places, [stack])
             end = train(
                 RolloutLearner(stack, seeds / i), Collectors([joined], count), self.episodes,
-                seeds / i, until * count, resume_from=Progress(steps=start), cut_every=NEVER,
+                seeds / i, until * count, resume_from=Progress(steps=start),
                 schedule_steps=schedule_steps * count, skip_diverged=True,
                 on_tick=_telling(on_tick, spent - start),
             )  # fmt: skip
@@ -137,7 +135,7 @@ class Part:
         end = train(
             learner, Collectors([joined], count), self.episodes, seeds, until * count,
             resume_from=Progress(self.rounds, start), schedule_steps=schedule_steps * count,
-            skip_diverged=True, cut_every=NEVER, on_tick=_telling(on_tick, -start),
+            skip_diverged=True, on_tick=_telling(on_tick, -start),
         )  # fmt: skip
         parted(joined, self.places)
         for stack, group in zip(stacks, groups, strict=True):
@@ -172,13 +170,8 @@ class Part:
             for m in members
         ])  # fmt: skip
 
-    def cut(self, seeds: Seeds) -> Array:
-        """Make ready for ``state``; (k,) environments that begin anew."""
-        cuts = [place.cut(seeds / i) for i, place in enumerate(self.places, self._first)]
-        return self._begun_anew(cuts)
-
     def state(self) -> dict[str, Tensor]:
-        """What resuming from a clean cut needs of the environments, and of what was counted."""
+        """Return what a checkpoint needs of the environments and the counts. It changes nothing."""
         found = prefixed("episodes", self.episodes.state())
         for i, place in enumerate(self.places):
             found |= prefixed(str(i), place.state())

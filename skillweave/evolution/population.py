@@ -87,13 +87,12 @@ class Population:
         """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
         return self.part.fitness(self.members, arena, seeds)
 
-    def cut(self, seeds: Seeds) -> dict[str, Tensor]:
-        """Make a clean cut; what resuming from it needs of the environments."""
-        self.part.cut(seeds)
+    def state(self) -> dict[str, Tensor]:
+        """Return what a checkpoint needs of the environments. It changes nothing."""
         return self.part.state()
 
     def resume(self, saved: dict[str, Tensor], store: dict[str, Tensor]) -> Array:
-        """Stand where a cut was; (k,) environments that begin anew."""
+        """Stand where ``state`` was called; (k,) environments that begin anew."""
         return self.part.restore(saved, self.members, store)
 
     def close(self) -> None:

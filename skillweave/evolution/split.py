@@ -108,12 +108,8 @@ class Parts:
         self.steps_elsewhere += sum(steps for _, steps in found)
         return np.concatenate([fitness for fitness, _ in found])
 
-    def cut(self, seeds: Seeds) -> Array:
-        """Make ready for ``state``; (k,) environments that begin anew."""
-        return self._columns(self._workers.ask("cut", [seeds] * (len(self._bounds) - 1)))
-
     def state(self) -> dict[str, Tensor]:
-        """What resuming from a clean cut needs of the environments."""
+        """Return what a checkpoint needs of the environments. It changes nothing."""
         return _tensors(joined_states(self._workers.states()))
 
     def restore(
@@ -160,10 +156,6 @@ class StationedPart:
         members = _received(task[0], self._part.spaces)
         found = self._part.fitness(members, self._arena, task[1])
         return found, self._arena.engine.steps_made - before
-
-    def cut(self, seeds: Seeds) -> Array:
-        """Make ready for ``state``."""
-        return self._part.cut(seeds)
 
     def state(self) -> dict[str, Array]:
         """What ``restore`` needs."""

@@ -26,6 +26,7 @@ from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, Origin
 from skillweave.runs.population_schema import Generation
 from skillweave.seeding import Seeds
+from skillweave.training import interrupts
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
 from skillweave.types import Array, prefixed, unprefixed
@@ -110,6 +111,8 @@ class EvolvingPopulation:
         """
         while not self.over:
             self.generation()
+            if interrupts.requested() and not self.over:
+                interrupts.stop()
         return {self.stage.name: self._finish()}
 
     def states(self) -> dict[str, Any]:
@@ -222,7 +225,7 @@ class EvolvingPopulation:
 
     def _save(self) -> None:
         """A checkpoint of the whole population, as it is to go on."""
-        tensors = prefixed("collector", self.population.cut(self.seeds / "cut" / self.done))
+        tensors = prefixed("collector", self.population.state())
         for i, member in enumerate(self.population.members):
             tensors |= prefixed(str(i), vars(member.state))
         store = self.population.part.store

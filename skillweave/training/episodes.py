@@ -59,12 +59,10 @@ class Tick:
 
     update: int
     steps: int
+    since: int  # steps at the report before
     seconds: float  # of training, this process's part and those before it
     metrics: dict[str, float]
     state: Any
-    cut: bool  # a clean cut: resuming from this state is exact
-    extra: dict[str, torch.Tensor] | None = None
-    """What else resuming needs: where the environments are, and the replay buffer."""
 
 
 def to_numbers(

@@ -13,11 +13,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from skillweave.algorithms.base import ActingParams
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Anchor, Experience
 from skillweave.seeding import Seeds
-from skillweave.types import Array
+from skillweave.types import Array, prefixed, unprefixed
 
 
 @dataclass
@@ -67,7 +68,11 @@ class Learner(Protocol):
         ...
 
     def kept(self) -> dict[str, Tensor]:
-        """What going on exactly needs beside the states of the stacks, at a clean cut."""
+        """Return what going on exactly needs beside the states of the stacks.
+
+        The latest request is made and not yet answered; the parameters it acts by are a part of
+        this, as with overlap they are one update older than the states.
+        """
         ...
 
     def load(self, kept: dict[str, Tensor]) -> None:
@@ -92,11 +97,12 @@ class RolloutLearner:
         self.anchor: Anchor | None = None
         """The policy that it is to stay near, if there is one."""
         self._progress = 0.0  # where the rollout began, so that the first has the whole rate
+        self._resumed: ActingParams | None = None  # of the first request after a checkpoint
 
     def request(self, update: int, steps: int, progress: float) -> Request:
         """A rollout of ``n_steps`` environment steps of each environment."""
         algorithm, state = self._stack.algorithm, self._stack.state
-        params = algorithm.acting_params(state, progress)
+        params, self._resumed = self._resumed or algorithm.acting_params(state, progress), None
         seeds = self._seeds / "collect" / update
         self._asked = params, progress
         return Request(algorithm.config.n_steps, (params,), state.gamma.cpu().numpy(), seeds)
@@ -126,19 +132,32 @@ class RolloutLearner:
         """Nothing to do: trajectories end with each experience."""
 
     def kept(self) -> dict[str, Tensor]:
-        """Rows of which there are not enough yet, and what a nat of divergence costs."""
+        """Rows of which there are not enough yet, what a nat of divergence costs, who acts next."""
         coef = {} if self.anchor is None else {"anchor_coef": self.anchor.coef.cpu().clone()}
-        return self._store.state() | coef
+        params, _ = self._asked
+        return self._store.state() | coef | prefixed("acting", params.state())
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint kept."""
         algorithm = self._stack.algorithm
+        self._resumed = acting_of(self._stack, unprefixed("acting", kept))
         self._store.load(kept, algorithm.observation_space, algorithm.codec)
         if self.anchor is not None:
             coef = kept["anchor_coef"]
             if coef.shape != self.anchor.coef.shape or not bool(coef.isfinite().all()):
                 raise ValueError(f"the price of divergence is {coef.tolist()}")
             self.anchor.coef = coef.to(self.anchor.coef.device)
+
+
+def acting_of(stack: Stack, saved: dict[str, Tensor]) -> ActingParams:
+    """Return the acting parameters of a stack whose state was ``saved``.
+
+    Raises:
+        ValueError: it does not fit.
+    """
+    found: ActingParams = stack.algorithm.acting_params(stack.state, 0.0)
+    found.load(saved)
+    return found
 
 
 def keep_to_guide(learner: Learner, target_kl: float | None) -> None:

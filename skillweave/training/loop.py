@@ -1,8 +1,13 @@
-"""The loop of all training: collect, keep, learn, report, and now and then a clean cut.
+"""The loop of all training: collect, keep, learn, report, and now and then a checkpoint.
 
 Where the learner may, learning overlaps with collecting: while it learns from one experience on a
 thread of its own, the next one is collected with the parameters from before. The lag is always
 exactly one update, so a run is as reproducible as without it.
+
+A checkpoint changes nothing: rows are requested, updates made and reports written in the same order
+with checkpoints at any places, or with none. The next rows are already requested when one is
+written, so it holds the parameters by which they are collected, too, and an update's metrics that
+are not reported yet.
 """
 
 from __future__ import annotations
@@ -10,7 +15,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,21 +26,86 @@ from skillweave.collecting.group import Collectors
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
+from skillweave.training import interrupts
 from skillweave.training.episodes import Episodes, Tick, to_numbers
 from skillweave.training.learner import Learner, crossed
 from skillweave.types import Array, prefixed, unprefixed
 
+CHECKPOINT_SECONDS = 60.0
+"""A checkpoint is written when the latest one is this old."""
+CHECKPOINT_SHARE = 0.05
+"""The largest share of time for checkpoints by time; large ones are written less often."""
+
+
+@dataclass
+class Report:
+    """What is to be reported of an update that was begun."""
+
+    update: int  # its number, from 1 on
+    steps: int  # when it is done
+    due: bool  # it is to be reported
+    summary: dict[str, float]  # of the episodes, when it began
+
 
 @dataclass
 class Progress:
-    """Where training stands: a clean cut, or the start."""
+    """Where training stands."""
 
     update: int = 0
     steps: int = 0  # environment steps
     seconds: float = 0.0
+    reported: int = 0
+    """Environment steps at the latest report."""
+    report: Report | None = None
+    """Of the latest update, where it is not reported yet."""
+    metrics: dict[str, Tensor] = field(default_factory=dict)
+    """The latest of each, (P,), since the latest report."""
+
+    def state(self) -> dict[str, Tensor]:
+        """Return what a checkpoint needs beside ``update``, ``steps`` and ``seconds``."""
+        report = self.report or Report(0, 0, False, {})
+        numbers = [self.reported, report.update, report.steps, int(report.due)]
+        summary = {k: torch.tensor(v, dtype=torch.float64) for k, v in report.summary.items()}
+        metrics = {k: v.detach().cpu().clone() for k, v in self.metrics.items()}
+        return (
+            {"counts": torch.tensor(numbers, dtype=torch.int64)}
+            | prefixed("summary", summary)
+            | prefixed("metrics", metrics)
+        )
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Take over a ``state``.
+
+        Raises:
+            ValueError: it does not fit.
+        """
+        counts, metrics = state["counts"], unprefixed("metrics", state)
+        summary = unprefixed("summary", state)
+        if counts.shape != (4,) or counts.dtype != torch.int64 or not bool((counts >= 0).all()):
+            raise ValueError("its latest report is no row of four counts")
+        reported, update, steps, due = counts.tolist()
+        if reported > self.steps or steps > self.steps or update > self.update or due > 1:
+            raise ValueError("its latest report is of a later time")
+        if any(v.ndim != 1 or not v.is_floating_point() for v in metrics.values()):
+            raise ValueError("its metrics are no rows of numbers")
+        if any(v.ndim or v.dtype != torch.float64 for v in summary.values()):
+            raise ValueError("its means of episodes are no numbers")
+        self.reported, self.metrics = reported, metrics
+        means = {k: float(v) for k, v in summary.items()}
+        self.report = Report(update, steps, bool(due), means) if update else None
+
+
+@dataclass
+class Saved:
+    """What a checkpoint holds."""
+
+    at: Progress
+    states: list[Any]  # of each stack
+    extra: dict[str, Tensor]  # environments, replay, and the rows that are requested
 
 
 OnTick = Callable[[Tick], None]
+OnCheckpoint = Callable[[Saved], None]
 
 
 def train(
@@ -47,43 +118,52 @@ def train(
     resume_from: Progress | None = None,
     schedule_steps: int | None = None,
     skip_diverged: bool = False,
-    cut_every: int = 250_000,
+    checkpoint_every: int = 250_000,
     on_tick: OnTick | None = None,
+    on_checkpoint: OnCheckpoint | None = None,
 ) -> Progress:
     """Train until ``budget`` environment steps are spent; states of the learner change.
 
     Args:
-        collectors: fresh or under way.
+        collectors: fresh or already started.
         episodes: the latest ones, for the metrics; added to.
         schedule_steps: steps at which schedules end; None: the budget.
         skip_diverged: a member that diverges does not stop the others.
-        cut_every: environment steps between clean cuts (contract 8).
-        on_tick: told after updates; may raise to stop.
+        checkpoint_every: environment steps between checkpoints. They are also written by time
+            (``CHECKPOINT_SECONDS``), and on an interrupt.
+        on_tick: called with each report; may raise to stop.
+        on_checkpoint: writes a checkpoint; None: none is written, and an interrupt is not for this
+            loop.
 
     Returns:
         Where training stands.
 
     Raises:
         SkillweaveError: parameters or losses are no longer finite.
+        KeyboardInterrupt: an interrupt came, and a checkpoint is written.
     """
     loop = _Loop(learner, collectors, episodes, seeds, resume_from or Progress(), on_tick)
     loop.schedule_steps, loop.skip_diverged = schedule_steps or budget, skip_diverged
+    loop.checkpoint_every, loop.on_checkpoint = checkpoint_every, on_checkpoint
     with torch_threads(1 if learner.overlap else learner.threads):
         try:
             collectors.start(seeds / "start")
-            loop.ask()
+            loop.request()
             while loop.at.steps < budget:
-                loop.round(budget, cut_every)
+                loop.round(budget)
+            loop.report()
         finally:
             loop.close()
     return loop.at
 
 
 class _Loop:
-    """One stage's training under way."""
+    """One stage's training."""
 
     schedule_steps: int
     skip_diverged: bool
+    checkpoint_every: int
+    on_checkpoint: OnCheckpoint | None
 
     def __init__(
         self,
@@ -94,75 +174,73 @@ class _Loop:
         at: Progress,
         on_tick: OnTick | None,
     ) -> None:
-        self.learner, self.collectors, self.episodes, self.seeds = (
-            learner, collectors, episodes, seeds,
-        )  # fmt: skip
+        self.learner, self.collectors = learner, collectors
+        self.episodes, self.seeds = episodes, seeds
         self.at, self._on_tick = at, on_tick
         self._started = time.perf_counter() - at.seconds
-        self._metrics: dict[str, Tensor] = {}
-        self._summary: dict[str, float] = {}
         set_threads = torch.set_num_threads  # torch counts threads for each thread
         self._thread = ThreadPoolExecutor(1, "learner", set_threads, (learner.threads,))
         self._pending: Future[dict[str, Tensor]] | None = None
-        self._told = 0, 0, False
-        """The pending update's number, the steps when it is done, and whether it is reported."""
+        self._saved_at, self._saving_took = time.perf_counter(), 0.0
 
-    def round(self, budget: int, cut_every: int) -> None:
+    def round(self, budget: int) -> None:
         """Collect, and learn from it, or begin to."""
         at, learner = self.at, self.learner
         collected = self.collectors.collect(self._request)
-        self.wait()
+        self.report()
         before, at.steps = at.steps, at.steps + collected.experience.spent
         update, at.update = at.update, at.update + 1
         over = at.steps >= budget
-        cut = crossed(cut_every, before, at.steps) or over
         self.episodes.extend(collected.episodes)
         if len(collected.begun_anew):
             learner.cut(collected.begun_anew)
         learner.take(collected.experience)
-        if learner.overlap and not cut:
-            self.ask()  # before the parameters change
+        if learner.overlap and not over:
+            self.request()  # before the parameters change
         every = learner.report_every
-        self._begin(update, not every or cut or crossed(every, before, at.steps))
-        if cut or not learner.overlap:
-            self.wait(cut, self._cut() if cut and not over else None)
+        self._begin(update, not every or over or crossed(every, before, at.steps))
+        if not learner.overlap:
+            self.report()
             if not over:
-                self.ask()
+                self.request()
+        if not over:
+            self._save_if_due(before)
 
-    def ask(self) -> None:
-        """Say what is to be collected next, with the parameters as they are now."""
+    def request(self) -> None:
+        """Decide what is collected next, with the parameters as they are now."""
         at = self.at
         self._request = self.learner.request(at.update, at.steps, self._progress(at.steps))
 
     def _begin(self, update: int, due: bool) -> None:
         """Learn, on the thread if it may overlap; the update is reported if that is due."""
         about = update, self.at.steps, self._progress(self.at.steps)
-        self._told = update + 1, self.at.steps, due
+        # Means of the episodes are of this moment, however long the update takes.
+        summary = self.episodes.summary() if due and self._on_tick is not None else {}
+        self.at.report = Report(update + 1, self.at.steps, due, summary)
         if self.learner.overlap:
-            self._summary = self.episodes.summary() if due else {}
             self._pending = self._thread.submit(self.learner.learn, *about)
         else:
-            self._pending = Future()
-            self._pending.set_result(self.learner.learn(*about))
+            self.at.metrics |= self.learner.learn(*about)
 
-    def wait(self, cut: bool = False, kept: dict[str, Tensor] | None = None) -> None:
+    def _finish_update(self) -> None:
+        """Wait for a pending update."""
+        if self._pending is not None:
+            metrics, self._pending = self._pending.result(), None
+            self.at.metrics |= metrics
+
+    def report(self) -> None:
         """Let a pending update end, and report it."""
-        if self._pending is None:
+        self._finish_update()
+        report, self.at.report = self.at.report, None
+        if report is None or not report.due:
             return
-        found, self._pending = self._pending.result(), None
-        self._metrics |= found
-        update, steps, due = self._told
-        if not due:
-            return
-        self.at.seconds = time.perf_counter() - self._started
-        metrics = to_numbers(self._metrics, update, skip_diverged=self.skip_diverged)
-        self._metrics = {}
-        if self._on_tick is None:
-            return
-        # Those of the episodes are from when the update began, where it was not waited for.
-        metrics |= self._summary if self.learner.overlap else self.episodes.summary()
-        state = [stack.state for stack in self.learner.stacks]
-        self._on_tick(Tick(update, steps, self.at.seconds, metrics, state, cut, kept))
+        self._take_time()
+        metrics = to_numbers(self.at.metrics, report.update, skip_diverged=self.skip_diverged)
+        self.at.metrics, since, self.at.reported = {}, self.at.reported, report.steps
+        if self._on_tick is not None:
+            state = [stack.state for stack in self.learner.stacks]
+            metrics |= report.summary
+            self._on_tick(Tick(report.update, report.steps, since, self.at.seconds, metrics, state))
 
     def close(self) -> None:
         """Stop; a pending update is finished first, as it changes states in place."""
@@ -171,25 +249,63 @@ class _Loop:
     def _progress(self, steps: int) -> float:
         return min(1.0, steps / self.schedule_steps)
 
-    def _cut(self) -> dict[str, Tensor]:
-        """Make a clean cut; what going on from it needs beside the states of the stacks."""
-        if self._pending is not None:
-            self._pending.result()
-        self.learner.cut(self.collectors.cut(self.seeds / "cut" / self.at.update))
-        found = self.collectors.state() | prefixed("episodes", self.episodes.state())
-        self.learner.cut(self.collectors.differing())
-        tensors = {k: to_tensor(np.array(v)) for k, v in found.items()}
-        return prefixed("collector", tensors) | prefixed("learner", self.learner.kept())
+    def _take_time(self) -> None:
+        self.at.seconds = time.perf_counter() - self._started
+
+    def _save_if_due(self, before: int) -> None:
+        """Write a checkpoint if it is time to, or if an interrupt came; then stop for that."""
+        if self.on_checkpoint is None:
+            return
+        stopping = interrupts.requested()
+        if stopping or self.is_due(before):
+            self._save()
+        if stopping:
+            interrupts.stop()
+
+    def is_due(self, before: int) -> bool:
+        """Whether a checkpoint is to be written; ``before`` are the steps before this round."""
+        age = time.perf_counter() - self._saved_at
+        by_time = age > max(CHECKPOINT_SECONDS, self._saving_took / CHECKPOINT_SHARE)
+        return by_time or crossed(self.checkpoint_every, before, self.at.steps)
+
+    def _save(self) -> None:
+        """Write a checkpoint; the next rows are requested already, and stay so."""
+        assert self.on_checkpoint is not None
+        since = time.perf_counter()
+        arrays = self.collectors.state()  # while the learner learns
+        self._finish_update()
+        if not all(bool(torch.isfinite(v).all()) for v in self.at.metrics.values()):
+            return  # it has diverged, as the next report says; the one before is better
+        differing = self.collectors.differing()
+        if len(differing):
+            self.learner.cut(differing)
+        arrays |= prefixed("episodes", self.episodes.state())
+        tensors = {k: to_tensor(np.array(v)) for k, v in arrays.items()}
+        extra = prefixed("collector", tensors) | prefixed("learner", self.learner.kept())
+        self._take_time()
+        states = [stack.state for stack in self.learner.stacks]
+        self.on_checkpoint(Saved(self.at, states, extra | prefixed("loop", self.at.state())))
+        self._saved_at = time.perf_counter()
+        self._saving_took = self._saved_at - since
 
 
 def resume(
-    learner: Learner, collectors: Collectors, episodes: Episodes, saved: dict[str, Tensor]
+    learner: Learner,
+    collectors: Collectors,
+    episodes: Episodes,
+    saved: dict[str, Tensor],
+    at: Progress,
 ) -> Array:
-    """Stand where a clean cut left everything; (k,) environments that begin anew.
+    """Stand where a checkpoint left everything; (k,) environments that begin anew.
 
     They are those that did not repeat themselves.
+
+    Args:
+        saved: its ``extra``.
+        at: its steps; what else it says of them is added.
     """
     arrays = {k: v.numpy() for k, v in unprefixed("collector", saved).items()}
+    at.load(unprefixed("loop", saved))
     episodes.load(unprefixed("episodes", arrays))
     begun = collectors.restore(arrays)
     learner.load(unprefixed("learner", saved))

@@ -18,24 +18,23 @@ class PeriodicEvaluation:
 
     def __init__(self, scene: Scene, seeds: Seeds, every: int | None, episodes: int) -> None:
         self._scene, self._episodes = scene, episodes
-        self._seeds, self._every, self._last = seeds / "probe", every, 0
+        self._seeds, self._every = seeds / "probe", every
         self._arena: Collector | None = None
         self._counted = 0
 
-    def start(self, steps: int) -> None:
-        """Training stands at ``steps``: what was due until here is done."""
-        self._last = steps
-
-    def due(self, steps: int, play: Callable[[Collector, Seeds], Array]) -> dict[str, float]:
-        """Evaluate where it is time to, and tell metrics; else none.
+    def due(
+        self, since: int, steps: int, play: Callable[[Collector, Seeds], Array]
+    ) -> dict[str, float]:
+        """Evaluate if it is time to, and return metrics; else none.
 
         Args:
+            since: steps of training at the report before.
+            steps: at this one.
             play: plays an episode in each environment of an arena: (n, 4), as
                 ``Collected.episodes``.
         """
-        if self._every is None or not crossed(self._every, self._last, steps):
+        if self._every is None or not crossed(self._every, since, steps):
             return {}
-        self._last = steps
         self._arena = self._arena or self._scene.collector(self._episodes, None)
         told = play(self._arena, self._seeds)
         returns, success = told[:, RETURN], told[:, SUCCESS]

@@ -10,13 +10,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.algorithms.base import ActingParams
 from skillweave.buffers.replay import ReplayStore, replay_store
 from skillweave.collecting.acting import ActionRepeat, Request
 from skillweave.experience import Experience
 from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
-from skillweave.training.learner import Learner, RolloutLearner, Stack, member_seeds
+from skillweave.training.learner import (
+    Learner,
+    RolloutLearner,
+    Stack,
+    acting_of,
+    member_seeds,
+)
 from skillweave.types import Array, prefixed, unprefixed
 
 DRAWN_AT_ONCE = 8
@@ -58,6 +65,8 @@ class ReplayLearner:
         self._learns_from = self._random_until + (0 if len(store) else goes_on_at)
         self._transitions = np.zeros(2)  # of a member, all so far: when last learnt, and now
         self._returns: Array | None = None  # (N,), the open episodes' discounted returns
+        self._acting: tuple[ActingParams, ...] = ()  # of the latest request
+        self._resumed: tuple[ActingParams, ...] = ()  # of the first request after a checkpoint
 
     def act_from_the_start(self) -> None:
         """Never act at random: it has learnt before."""
@@ -66,7 +75,10 @@ class ReplayLearner:
     def request(self, update: int, steps: int, progress: float) -> Request:
         """``train_freq`` rows of every environment."""
         explored = progress if self._acts_at_random else 1.0  # ε of DQN does not begin anew
-        params = tuple(s.algorithm.acting_params(s.state, explored) for s in self.stacks)
+        params = self._resumed or tuple(
+            s.algorithm.acting_params(s.state, explored) for s in self.stacks
+        )
+        self._acting, self._resumed = params, ()
         rows = int(self.config.train_freq) * self._row_steps
         at_random = self._acts_at_random and steps < self._random_until
         seeds = self._seeds / "collect" / update
@@ -164,8 +176,11 @@ class ReplayLearner:
             self._returns[columns] = 0.0
 
     def kept(self) -> dict[str, Tensor]:
-        """What is counted, and the store, if it is to be saved."""
+        """What is counted, who acts next, and the store, if it is to be saved."""
         store = prefixed("store", self.store.state()) if self.config.save_buffer else {}
+        acting = {str(i): params.state() for i, params in enumerate(self._acting)}
+        for i, state in acting.items():
+            store |= prefixed(f"acting.{i}", state)
         return self.counts() | store
 
     def counts(self) -> dict[str, Tensor]:
@@ -181,6 +196,10 @@ class ReplayLearner:
         self._transitions = kept["transitions"].numpy().copy()
         if "returns" in kept:
             self._returns = kept["returns"].numpy().copy()
+        if acting := unprefixed("acting", kept):  # a generation begins with a request of its own
+            self._resumed = tuple(
+                acting_of(stack, unprefixed(str(i), acting)) for i, stack in enumerate(self.stacks)
+            )
         if saved := unprefixed("store", kept):
             self.store.load(saved)
             self._learns_from = self._random_until

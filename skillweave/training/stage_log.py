@@ -84,6 +84,10 @@ class StageLog:
         for listener in self.listeners:
             listener.tick(name, steps, seconds, metrics)
 
+    def stands(self, update: int, steps: int, seconds: float) -> None:
+        """Training stands here, and a checkpoint of it is written."""
+        self.at.update(update=update, steps=steps, seconds=seconds)
+
     def tell(self, text: str) -> None:
         """Something that people should know."""
         for listener in self.listeners:
@@ -107,7 +111,11 @@ class StageLog:
         )
 
     def save(self, state: Any | None, extra: Mapping[str, Tensor] | None, **more: Any) -> None:
-        """Write a checkpoint: a state, what else resuming needs, and ``more`` in its header."""
+        """Write a checkpoint: a state, what else resuming needs, and ``more`` in its header.
+
+        What ``at`` says of updates and steps must be of this moment; its metrics are the latest
+        that were reported.
+        """
         kept = ("update", "steps", "evaluation_steps", "seconds", "metrics")
         header = {"stage": self.entry["name"]} | {k: self.at[k] for k in kept} | more
         self.run.save_checkpoint(state, header, extra)

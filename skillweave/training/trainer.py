@@ -22,8 +22,9 @@ from skillweave.runs.starts import drop_starts, start_of
 from skillweave.seeding import Seeds
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.interrupts import deferred
 from skillweave.training.learner import Learner, Stack, keep_to_guide
-from skillweave.training.loop import Progress, resume, train
+from skillweave.training.loop import Progress, Saved, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.scene import Scene
@@ -111,26 +112,21 @@ class OneAgent:
         (policy,) = self.policies().values()
         return episodes_of(policy, arena, seeds)
 
-    def save(self, tick: Tick, log: StageLog) -> None:
-        """Write a checkpoint."""
+    def save(self, extra: dict[str, Tensor], log: StageLog) -> None:
+        """Write a checkpoint; ``extra`` is what else resuming needs."""
         (stack,) = self.learner.stacks
-        log.save(state_to(stack.state, "cpu"), tick.extra)
+        log.save(state_to(stack.state, "cpu"), extra)
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says."""
         self.learner = self.learner_from(state, extra, log)
-        self._steps_before = int(log.at["steps"])
-        if self._steps_before >= self.stage.budget:
-            pass  # nothing is collected any more, and the last checkpoint holds no episodes
-        elif extra and "collector.collectors" not in extra:
-            log.tell(
-                "the checkpoint is of an older version: learning goes on where it stood, but all "
-                "episodes, and what was kept to learn from, begin anew"
-            )
-        elif extra:
-            ids = resumed(log, lambda: resume(self.learner, self.collectors, self.episodes, extra))
+        self.at = at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
+        self._steps_before = at.steps
+        # Where the budget is spent nothing is collected, and the last checkpoint has no episodes.
+        if extra and at.steps < self.stage.budget:
+            learner, collectors, episodes = self.learner, self.collectors, self.episodes
+            ids = resumed(log, lambda: resume(learner, collectors, episodes, extra, at))
             log.tell_begun_anew(len(ids), self.collectors.num_envs)
-        self.evaluation.start(log.at["steps"])
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Learn until the budget is spent or the target is reached."""
@@ -139,28 +135,36 @@ class OneAgent:
         def on_tick(tick: Tick) -> None:
             log.tell_begun_anew(self.collectors.begun_anew, self.collectors.num_envs)
             self.collectors.begun_anew = 0
-            found = self.evaluation.due(tick.steps, self.play)
+            found = self.evaluation.due(tick.since, tick.steps, self.play)
             log.at["evaluation_steps"] += self.evaluation.spent()
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
             if target is not None and target.reached(found, self.stage.name) is not None:
-                # No checkpoint: who resumes from the one before comes here again.
+                # No checkpoint: a run resumed from the one before comes here again.
                 raise _TargetReached
-            if tick.cut:
-                self.save(tick, log)
 
-        at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
+        def on_checkpoint(saved: Saved) -> None:
+            log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
+            self.save(saved.extra, log)
+
         try:
             train(
-                self.learner, self.collectors, self.episodes, self.stage.seeds, self.stage.budget,
-                resume_from=at, cut_every=int(self.stage.run.manifest["checkpoint_every"]),
+                self.learner,
+                self.collectors,
+                self.episodes,
+                self.stage.seeds,
+                self.stage.budget,
+                resume_from=self.at,
+                checkpoint_every=int(self.stage.run.manifest["checkpoint_every"]),
                 on_tick=on_tick,
-            )  # fmt: skip
+                on_checkpoint=on_checkpoint,
+            )
         except _TargetReached:
             assert target is not None
             # What was collected since the update was made, too.
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
         else:
+            self.save({}, log)  # all is learnt, should writing the policy fail
             if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
                 log.tell_learnt_nothing()
         return self.policies()
@@ -209,17 +213,19 @@ def train_stage(
         return run.load_policies(stage.name)
     known = policies or {}
     learner = make_learner(StageRun(entry, run, seeds, stage.scene(known), known))
-    try:
-        fresh = learner.open()
-        kind = None if fresh is None else type(fresh)
-        found = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
-        state, at, extra = found or (fresh, START, {})
-        log = StageLog(stage.name, run, listeners, at)
-        learner.go_on(state, extra, log)
-        policies = learner.train(log)
-    finally:
-        learner.close()
-    log.done(policies, learner.states())
+    evolves = entry.get("evolution") is not None
+    with deferred("at the end of this generation" if evolves else "after this round"):
+        try:
+            fresh = learner.open()
+            kind = None if fresh is None else type(fresh)
+            found = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
+            state, at, extra = found or (fresh, START, {})
+            log = StageLog(stage.name, run, listeners, at)
+            learner.go_on(state, extra, log)
+            policies = learner.train(log)
+        finally:
+            learner.close()
+        log.done(policies, learner.states())
     return policies
 
 

@@ -27,7 +27,6 @@ from skillweave.ops.threads import torch_threads
 from skillweave.runs.starts import start_of
 from skillweave.runs.states import load_state
 from skillweave.seeding import Seeds
-from skillweave.training.episodes import Tick
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
@@ -260,13 +259,13 @@ class WovenAgents(OneAgent):
         with torch_threads(1):
             return player.play(asked, seeds / "start", LONGEST_EPISODE)
 
-    def save(self, tick: Tick, log: StageLog) -> None:
-        """Write a checkpoint: all states are in ``extra``."""
+    def save(self, extra: dict[str, Tensor], log: StageLog) -> None:
+        """Write a checkpoint: all states are in its extra tensors, too."""
         assert isinstance(self.learner, WovenLearner)
         states = {"counts": torch.tensor(list(self.learner.counts.values()))}
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
-        log.save(None, (tick.extra or {}) | states)
+        log.save(None, extra | states)
 
 
 def _collector(

@@ -266,7 +266,6 @@ def test_restored_it_goes_on_as_if_it_had_not_been_stopped(rows):
     first, asked = fresh(), requests(rows)
     for _ in range(3):
         first.collect(next(asked))
-    first.cut(Seeds(1))
     again = fresh()
     assert not len(again.restore(first.state()))
     for request in [next(asked) for _ in range(3)]:

@@ -301,7 +301,6 @@ def test_a_collector_goes_on_where_a_state_was_taken():
     other = collector_of(Paid, 4, 5, env=Again)
     first, second, third = itertools.islice(asked(17), 3)
     other.collect(first)
-    other.cut(Seeds(3))
     state = other.state()
     restored = collector_of(Paid, 4, 5, env=Again)
     restored.restore(state)

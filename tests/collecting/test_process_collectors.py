@@ -102,8 +102,7 @@ def test_killed_workers_are_made_again_and_find_the_same(in_processes, kind):
                 victim.join()
         equal(plain.collect(request), apart.collect(request))
         if at % 13 == 12:
-            seeds = Seeds(5) / at
-            np.testing.assert_array_equal(plain.cut(seeds), apart.cut(seeds))
+            assert plain.state().keys() == apart.state().keys()
 
 
 class Restless(Again):
@@ -119,7 +118,7 @@ class Restless(Again):
         return obs
 
 
-@pytest.mark.parametrize("after", ["collect", "cut", "state"])
+@pytest.mark.parametrize("after", ["collect", "state"])
 def test_environments_that_do_not_repeat_themselves_are_told_where_a_worker_was_lost(
     in_processes, after
 ):
@@ -129,15 +128,10 @@ def test_environments_that_do_not_repeat_themselves_are_told_where_a_worker_was_
     for _ in range(2):
         assert not len(apart.collect(next(asked)).begun_anew)
     if after == "state":
-        apart.cut(Seeds(4))
         apart.state()
     victim = apart._workers[1].process
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
-    if after == "cut":
-        np.testing.assert_array_equal(apart.cut(Seeds(4)), [3, 4, 5])
-        assert not len(apart.collect(next(asked)).begun_anew)
-        return
     np.testing.assert_array_equal(apart.collect(next(asked)).begun_anew, [3, 4, 5])
     assert not len(apart.collect(next(asked)).begun_anew)
     assert apart.begun_anew == 3
@@ -226,7 +220,6 @@ def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):
     asked = requests(9)
     for request in itertools.islice(asked, 5):
         apart.collect(request)
-    apart.cut(Seeds(1))
     state = apart.state()
     assert not len(plain.restore({k: np.array(v) for k, v in state.items()}))
     again = in_processes(deciding())
@@ -240,7 +233,6 @@ def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):
 def test_a_state_of_another_number_of_collectors_is_refused(in_processes):
     apart = in_processes(deciding())
     apart.start(Seeds(0))
-    apart.cut(Seeds(1))
     with pytest.raises(SkillweaveError, match="of 2 collectors, but there are 1"):
         Collectors([deciding()(6, 0)]).restore(apart.state())
 

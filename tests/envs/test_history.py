@@ -46,11 +46,11 @@ def test_a_history_plays_again_what_was_done(plan):
     assert played == done
 
 
-def run(engine, steps: int, seed: int, renew: int = 0) -> list:
+def run(engine, steps: int, seed: int) -> list:
     """Everything that an engine shows while it is acted in at random."""
     rng, shown = np.random.default_rng(seed), []
     engine.action_space.seed(seed)
-    for t in range(steps):
+    for _ in range(steps):
         ids = np.sort(rng.permutation(N)[: rng.integers(1, N + 1)])
         action = np.stack([engine.action_space.sample() for _ in ids])
         raw = engine.step(action, ids)
@@ -58,8 +58,6 @@ def run(engine, steps: int, seed: int, renew: int = 0) -> list:
         shown += [raw.next_obs, raw.reward, ended]
         if len(ended):
             shown.append(engine.reset_some(ended))
-        if renew and t % renew == renew - 1:
-            engine.renew(int(rng.integers(2**31)))
     return shown
 
 
@@ -73,7 +71,7 @@ def test_an_engine_that_is_restored_goes_on_as_if_nothing_had_happened(engine, e
     first, second = make_engine(spec, N, threads=1), make_engine(spec, N, threads=1)
     try:
         first.reset(3)
-        run(first, 333, 0, renew=50)
+        run(first, 333, 0)
         state = first.state()
         made = first.steps_made
         obs, early = second.restore(state)
@@ -98,7 +96,6 @@ def test_old_pools_are_left_one_episode_at_a_time_and_histories_stay_short(monke
     longest, pools = 0, set()
     for part in range(40):
         run(engine, 20, part)
-        engine.renew(part)
         longest, pools = max(longest, engine.state()["length"].sum()), pools | {len(engine._pools)}
     assert pools == {1, 2}
     assert longest < 400, "a hundred steps, and the episodes that were open"

@@ -164,7 +164,7 @@ def test_one_part_is_the_population_itself(network):
             until = population.steps // 5 + 40
             population.train(until, 200, seeds / generation, partial(_add, ticks))
             found.append(population.fitness(arena, seeds / "fitness" / generation))
-            population.cut(seeds / "cut" / generation)
+            population.state()
             population.evolve(found[-1], seeds / "evolve" / generation)
         np.testing.assert_array_equal(*found)
         assert told[0] == told[1]

@@ -401,19 +401,6 @@ def test_the_steps_of_members_are_those_that_their_environments_made(name):
     population.close()
 
 
-@pytest.mark.parametrize("name", ["dqn", "sac"])
-def test_what_begins_anew_at_a_cut_ends_its_returns_too(name, monkeypatch):
-    config = replace(CONFIGS[name], normalize_rewards=True)
-    population = Population.fresh(config, Evolution(2, 2, 1), skill_scene(spec(name)), Seeds(0))
-    population.train(25, 100, Seeds(1), lambda steps, metrics: None)
-    before = population.part._kept["returns"].clone()
-    assert (before != 0).all()
-    monkeypatch.setattr("skillweave.collecting.collector.LONGEST_EPISODE", -1)
-    population.cut(Seeds(2))
-    assert not population.part._kept["returns"].any()
-    population.close()
-
-
 def test_it_ends_early_at_the_target(tmp_path):
     run = train("ppo", tmp_path / "run", Evolution(3, 9, 2, target=-1e9))
     assert run.info()["stages"][0]["winner"]["generations"] == 1

@@ -30,7 +30,7 @@ from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack, crossed
-from skillweave.training.loop import Progress, train
+from skillweave.training.loop import Progress, Saved, train
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.types import SkillweaveError, unprefixed
 
@@ -134,22 +134,22 @@ def test_no_gradient_step_is_lost_or_made_twice_however_many_members_there_are(m
     assert spy.log.count("learn") == int(made * ratio) > 5
 
 
-def test_reports_come_every_thousand_steps_and_at_cuts_and_the_store_at_cuts_but_the_last():
+def test_reports_come_every_thousand_steps_wherever_checkpoints_are_written():
     ticks: list[Tick] = []
     config = replace(CONFIG, update_ratio=0.05)
-    learn(config, Countdown(4), 3000, cut_every=1500, on_tick=ticks.append)
-    assert [t.steps for t in ticks] == [1000, 1500, 2000, 3000]
-    assert [t.update for t in ticks] == [250, 375, 500, 750]
-    assert [t.cut for t in ticks] == [False, True, False, True]
-    assert [t.extra is not None for t in ticks] == [False, True, False, False]  # none at the end
-    assert unprefixed("learner.store", ticks[1].extra)
+    saved: list[Saved] = []
+    how = {"checkpoint_every": 1500, "on_tick": ticks.append, "on_checkpoint": saved.append}
+    learn(config, Countdown(4), 3000, **how)
+    assert [t.steps for t in ticks] == [1000, 2000, 3000]
+    assert [t.update for t in ticks] == [250, 500, 750]
+    assert len(saved) == 1  # none at the end
+    assert unprefixed("learner.store", saved[0].extra)
     assert ticks[-1].metrics["return"] == ticks[-1].metrics["length"] == 5.0
     assert {"loss", "q", "grad_norm", "learning_rate"} <= ticks[-1].metrics.keys()
-    ticks.clear()
-    once = {"cut_every": 1000, "on_tick": ticks.append}
-    learn(replace(config, save_buffer=False), Countdown(4), 2000, **once)
-    assert unprefixed("collector", ticks[0].extra)
-    assert not unprefixed("learner.store", ticks[0].extra)
+    saved.clear()
+    learn(replace(config, save_buffer=False), Countdown(4), 3000, **how)
+    assert unprefixed("collector", saved[0].extra)
+    assert not unprefixed("learner.store", saved[0].extra)
 
 
 def test_a_multiple_is_crossed_where_it_is_reached():
@@ -206,10 +206,11 @@ def test_a_member_learns_from_shared_calls_with_its_own_discount(n_step):
             assert r == pytest.approx(lasts[known], rel=1e-4)
 
 
-def test_a_cut_ends_no_episode_and_nothing_is_learnt_as_an_end():
+def test_a_checkpoint_ends_no_episode_and_nothing_is_learnt_as_an_end():
     ticks: list[Tick] = []
-    spy = spied(CONFIG, 4 * 7 * 6, Countdown(4), cut_every=4 * 3, on_tick=ticks.append)
-    assert {t.metrics["length"] for t in ticks[1:]} == {5.0}
+    how = {"checkpoint_every": 4 * 3, "on_checkpoint": lambda saved: None}
+    spy = spied(CONFIG, 4 * 7 * 6, Countdown(4), on_tick=ticks.append, **how)
+    assert {t.metrics["length"] for t in ticks[1:]} <= {5.0}
     for s in spy.samples:  # what follows the step t is t + 1, also at a cut
         assert torch.equal(s.next_obs, s.obs + 1)
         assert torch.equal(s.discount == 0.0, s.obs == 4)
@@ -246,43 +247,44 @@ KINDS = {
 
 @pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", KINDS)
-def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights(name):
+def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights(name):
     config, kind = KINDS[name]
-    once = {"cut_every": 120}
     told: list[Tick] = []
-    _, whole = learn(config, kind(4), 500, on_tick=told.append, **once)
-    saved: list[tuple[Tick, Any]] = []
+    _, whole = learn(config, kind(4), 500, on_tick=told.append)
+    saved: list[tuple[Progress, Any, Any]] = []
 
-    def stop_at_second_cut(tick: Tick) -> None:
-        if tick.cut:
-            saved.append((tick, copied(tick.state[0])))
+    def stop_at_second(found: Saved) -> None:
+        saved.append((replace(found.at), copied(found.states[0]), found.extra))
         if len(saved) == 2:
             raise Stop
 
+    first: list[Tick] = []
     with pytest.raises(Stop):
-        learn(config, kind(4), 500, on_tick=stop_at_second_cut, **once)
-    tick, state = saved[-1]
-    assert (tick.update, tick.steps) == (60 // kind.row_steps, 240)
+        learn(
+            config, kind(4), 500, checkpoint_every=120, on_tick=first.append,
+            on_checkpoint=stop_at_second,
+        )  # fmt: skip
+    at, state, extra = saved[-1]
+    assert (at.update, at.steps) == (60 // kind.row_steps, 240)
     algorithm = make_algorithm(config, kind.observation_space, kind.action_space)
 
     def resumed(extra: dict[str, torch.Tensor]) -> Any:
-        again = training(algorithm, kind(4), state=copied(state), goes_on_at=tick.steps)
-        again.resume(extra)
+        again = training(algorithm, kind(4), state=copied(state), goes_on_at=at.steps)
+        now = Progress(at.update, at.steps)
+        again.resume(extra, now)
         ticks.clear()
-        at = Progress(tick.update, tick.steps)
-        again.run(500, resume_from=at, on_tick=ticks.append, **once)
+        how = {"checkpoint_every": 120, "on_checkpoint": lambda saved: None}
+        again.run(500, resume_from=now, on_tick=ticks.append, **how)
         return again.state
 
     ticks: list[Tick] = []
-    found = resumed(tick.extra)
+    found = resumed(extra)
     for f in fields(state):
         assert torch.equal(getattr(found, f.name), getattr(whole, f.name)), f.name
         assert getattr(found, f.name).dtype == getattr(algorithm.init([Seeds(0)]), f.name).dtype
-    assert [(t.steps, t.metrics) for t in ticks] == [
-        (t.steps, t.metrics) for t in told if t.steps > 240
-    ]
+    assert [(t.steps, t.metrics) for t in first + ticks] == [(t.steps, t.metrics) for t in told]
     # The store is part of it:
-    without = {k: v for k, v in tick.extra.items() if not k.startswith("learner.store.")}
+    without = {k: v for k, v in extra.items() if not k.startswith("learner.store.")}
     assert not torch.equal(resumed(without).params, whole.params)
 
 

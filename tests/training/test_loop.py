@@ -36,7 +36,7 @@ from skillweave.networks.config import RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack
-from skillweave.training.loop import Progress
+from skillweave.training.loop import Progress, Saved
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.scene import skill_scene
 from skillweave.types import SkillweaveError
@@ -182,11 +182,12 @@ def spied(updates: int, config: PPO = CONFIG, env: Toy | None = None, **how) -> 
     return spy
 
 
-@pytest.mark.parametrize(("overlap", "lags"), [(True, [0, 1, 1, 0, 1, 1]), (False, [0] * 6)])
+@pytest.mark.parametrize(("overlap", "lags"), [(True, [0] + [1] * 5), (False, [0] * 6)])
 @pytest.mark.parametrize("kind", [Identity, BoxIdentity])
-def test_data_is_one_update_old_with_overlap_but_fresh_after_a_cut(overlap, lags, kind):
+def test_data_is_one_update_old_with_overlap_also_after_a_checkpoint(overlap, lags, kind):
     config = replace(CONFIG, overlap=overlap)
-    assert spied(6, config, kind(16), cut_every=3 * 256).lags == lags
+    how = {"checkpoint_every": 3 * 256, "on_checkpoint": lambda saved: None}
+    assert spied(6, config, kind(16), **how).lags == lags
 
 
 @pytest.mark.parametrize("overlap", [True, False])
@@ -216,7 +217,7 @@ def lags_of_replay(overlap: bool) -> list[int]:
         return collect(request)
 
     found.learner.learn, found.collectors.collect = learnt, collected
-    found.run(16 * 9, cut_every=16 * 6)
+    found.run(16 * 9, checkpoint_every=16 * 6, on_checkpoint=lambda saved: None)
     acting = [v[:, : algorithm.acting.size] for v in versions]
     return [
         k - max(i for i, v in enumerate(acting) if torch.equal(v, used[k])) for k in range(3, 9)
@@ -225,17 +226,25 @@ def lags_of_replay(overlap: bool) -> list[int]:
 
 def test_replay_learns_beside_collecting_if_asked_with_a_lag_of_one_update():
     assert lags_of_replay(overlap=False) == [0] * 6
-    assert lags_of_replay(overlap=True) == [1, 1, 1, 0, 1, 1]  # the 6th is a cut
+    assert lags_of_replay(overlap=True) == [1] * 6
 
 
 @pytest.mark.parametrize("overlap", [True, False])
 def test_every_update_is_reported_once_and_in_order(overlap):
     ticks: list[Tick] = []
-    train(Identity(16), 5, replace(CONFIG, overlap=overlap), cut_every=512, on_tick=ticks.append)
+    saved: list[tuple[int, int]] = []
+    train(
+        Identity(16),
+        5,
+        replace(CONFIG, overlap=overlap),
+        checkpoint_every=512,
+        on_tick=ticks.append,
+        on_checkpoint=lambda s: saved.append((s.at.update, s.at.steps)),
+    )
     assert [t.update for t in ticks] == [1, 2, 3, 4, 5]
     assert [t.steps for t in ticks] == [256, 512, 768, 1024, 1280]
-    assert [t.cut for t in ticks] == [False, True, False, True, True]
-    assert [t.extra is not None for t in ticks] == [False, True, False, True, False]
+    assert [t.since for t in ticks] == [0, 256, 512, 768, 1024]
+    assert saved == [(2, 512), (4, 1024)]
     assert all(t.metrics["samples"] == 256 for t in ticks)
 
 
@@ -283,11 +292,16 @@ def test_a_stack_of_three_trains_like_three_single_members(overlap):
     config = replace(CONFIG, num_envs=4, batch_size=16, overlap=overlap)
     updates = 5
     stack = train(
-        Clockwork(range(12)), updates, config, seed=5, members=range(3), cut_every=2 * 12 * 16
+        Clockwork(range(12)),
+        updates,
+        config,
+        seed=5,
+        members=range(3),
+        checkpoint_every=2 * 12 * 16,
     )[1]
     for m in range(3):
         env, seeds = Clockwork(range(4 * m, 4 * m + 4)), SeedsOfMember(Seeds(5), m)
-        single = learn(config, env, updates * 4 * 16, seeds, [m], cut_every=2 * 4 * 16)[1]
+        single = learn(config, env, updates * 4 * 16, seeds, [m], checkpoint_every=2 * 4 * 16)[1]
         assert single.count.tolist() == [updates * 16]
         torch.testing.assert_close(stack.params[m], single.params[0], rtol=1e-3, atol=1e-4)
     assert (stack.params[0] - stack.params[1]).abs().max() > 0.1
@@ -341,20 +355,25 @@ def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_
 
     def weights(collectors: Collectors, kill: bool = False) -> torch.Tensor:
         learner = learner_of(Stack(algorithm, algorithm.init([Seeds(0)])), 4, Seeds(0))
-        ticks: list[Tick] = []
+        times: list[int] = []
 
-        def on_tick(tick: Tick) -> None:
-            ticks.append(tick)
+        def worker_dies(update: int) -> None:
+            times.append(update)
             if kill:  # while it collects, where learning overlaps
-                victim = collectors._workers[tick.update % 2].process
+                victim = collectors._workers[update % 2].process
                 os.kill(victim.pid, signal.SIGKILL)
 
         found = Training(learner, collectors, Seeds(0), Episodes())
         try:
-            found.run(320, cut_every=100, on_tick=on_tick)
+            found.run(
+                320,
+                checkpoint_every=100,
+                on_tick=lambda tick: worker_dies(tick.update),
+                on_checkpoint=lambda saved: worker_dies(saved.at.update),
+            )
         finally:
             collectors.close()
-        assert len(ticks) >= 3
+        assert len(times) >= 3
         return found.state.params
 
     here = weights(Collectors([collector(2, 0), collector(2, 2)]))
@@ -400,32 +419,37 @@ CUTS = {
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", CUTS)
-def test_a_run_resumed_at_a_clean_cut_ends_with_the_very_same_weights_and_metrics(name):
+def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights_and_metrics(name):
     config, env = CUTS[name]
     rollout, told, saved = 256, [], []
     whole = made(env(16), config)
-    whole.run(10 * rollout, cut_every=3 * rollout, on_tick=told.append)
+    whole.run(10 * rollout, on_tick=told.append)
 
-    def stop_at_second_cut(tick: Tick) -> None:
-        if tick.cut:
-            saved.append((tick, copied(tick.state[0])))
+    def stop_at_second(found: Saved) -> None:
+        saved.append((replace(found.at), copied(found.states[0]), found.extra))
         if len(saved) == 2:
             raise Stop
 
-    stopped = made(env(16), config)
+    stopped, first = made(env(16), config), []
     with pytest.raises(Stop):
-        stopped.run(10 * rollout, cut_every=3 * rollout, on_tick=stop_at_second_cut)
-    tick, state = saved[-1]
-    assert (tick.update, tick.steps) == (6, 6 * rollout)
+        stopped.run(
+            10 * rollout,
+            checkpoint_every=3 * rollout,
+            on_tick=first.append,
+            on_checkpoint=stop_at_second,
+        )
+    at, state, extra = saved[-1]
+    assert (at.update, at.steps) == (6, 6 * rollout)
     algorithm, again = PPOAlgorithm(config, env.observation_space, env.action_space), []
-    resumed = training(algorithm, env(16), state=state, goes_on_at=tick.steps)
-    assert not len(resumed.resume(tick.extra))
-    at = Progress(tick.update, tick.steps)
-    resumed.run(10 * rollout, resume_from=at, cut_every=3 * rollout, on_tick=again.append)
+    resumed = training(algorithm, env(16), state=state, goes_on_at=at.steps)
+    at = Progress(at.update, at.steps)
+    assert not len(resumed.resume(extra, at))
+    how = {"checkpoint_every": 3 * rollout, "on_checkpoint": lambda saved: None}
+    resumed.run(10 * rollout, resume_from=at, on_tick=again.append, **how)
     for f in fields(State):
         assert torch.equal(getattr(resumed.state, f.name), getattr(whole.state, f.name)), f.name
-    assert [(t.update, t.steps, t.metrics) for t in again] == [
-        (t.update, t.steps, t.metrics) for t in told[6:]
+    assert [(t.update, t.steps, t.metrics) for t in first + again] == [
+        (t.update, t.steps, t.metrics) for t in told
     ]
 
 
@@ -436,22 +460,24 @@ def test_reported_returns_and_lengths_are_those_of_whole_episodes():
     assert ticks[-1].metrics["length"] == 5.0
 
 
-def test_a_cut_ends_no_episode():
+def test_a_checkpoint_ends_no_episode():
     ticks: list[Tick] = []
-    # rollouts of 3 steps, each cut, and episodes of 5
+    saved: list[Saved] = []
+    # rollouts of 3 steps, a checkpoint after each but the last, and episodes of 5
     config = replace(CONFIG, n_steps=3, batch_size=48)
-    train(Countdown(16), 5, config, cut_every=3 * 16, on_tick=ticks.append)
-    assert [t.cut for t in ticks] == [True] * 5
+    how = {"checkpoint_every": 3 * 16, "on_checkpoint": saved.append}
+    train(Countdown(16), 5, config, on_tick=ticks.append, **how)
+    assert len(saved) == 4
     assert ["return" in t.metrics for t in ticks] == [False, True, True, True, True]
     assert {t.metrics["length"] for t in ticks[1:]} == {5.0}
 
 
 def test_a_checkpoint_of_other_environments_is_refused():
     one, other = made(Identity(16)), made(Identity(8), replace(CONFIG, num_envs=8))
-    saved: list[Tick] = []
-    one.run(512, cut_every=1, on_tick=saved.append)
+    saved: list[Saved] = []
+    one.run(512, checkpoint_every=1, on_checkpoint=saved.append)
     with pytest.raises(SkillweaveError, match=r"'age' of open episodes is int64 \(16,\)"):
-        other.resume(saved[0].extra)
+        other.resume(saved[0].extra, Progress(saved[0].at.update, saved[0].at.steps))
 
 
 # Divergence and stopping
@@ -477,7 +503,7 @@ def test_nothing_is_asked_for_after_the_last_round(config, monkeypatch):
     monkeypatch.setattr(
         found.collectors, "collect", lambda what: collected.append(what) or collect(what)
     )
-    end = found.run(3 * 16 * 16, cut_every=16 * 16)
+    end = found.run(3 * 16 * 16, checkpoint_every=16 * 16)
     assert len(asked) == len(collected) == end.update
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -87,7 +88,7 @@ def test_equal_seeds_give_equal_starts_and_others_other_ones():
     assert first == again != other
 
 
-def test_an_evaluation_is_made_once_in_every_so_many_steps_also_after_a_resume():
+def test_an_evaluation_is_made_once_in_every_so_many_steps():
     scene: Any = SimpleNamespace(collector=lambda n, acting: Countdown(n).collector(acting))
     policy = fresh(Countdown(1))
 
@@ -95,14 +96,14 @@ def test_an_evaluation_is_made_once_in_every_so_many_steps_also_after_a_resume()
         return episodes_of(policy, arena, seeds)
 
     evaluation = PeriodicEvaluation(scene, Seeds(0), 100, 3)
-    evaluation.start(250)
-    ticks = (260, 299, 300, 350, 520, 599, 601)
-    assert [t for t in ticks if evaluation.due(t, play)] == [300, 520, 601]
+    ticks = (250, 260, 299, 300, 350, 520, 599, 601)
+    pairs = itertools.pairwise(ticks)
+    assert [t for since, t in pairs if evaluation.due(since, t, play)] == [300, 520, 601]
     assert evaluation.spent() == 3 * 3 * 5
-    assert evaluation.due(700, play) == {"eval_return": 5.0, "eval_return_min": 5.0}
+    assert evaluation.due(601, 700, play) == {"eval_return": 5.0, "eval_return_min": 5.0}
     assert (evaluation.spent(), evaluation.spent()) == (15, 0)
     never = PeriodicEvaluation(scene, Seeds(0), None, 3)
-    assert never.due(10**6, play) == {}
+    assert never.due(0, 10**6, play) == {}
 
 
 class Balance(Skill):

@@ -124,10 +124,9 @@ def test_a_target_that_is_not_reached_changes_nothing(tmp_path: Path) -> None:
 def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: Any, where: str
 ) -> None:
-    # Evaluations every 100 steps tell 1, 2, 3, …; each falls together with a clean cut.
-    def due(self: Any, steps: int, policy: Any) -> dict[str, float]:
-        before, self._last = self._last, steps
-        return {"eval_return": float(steps // 100)} if steps // 100 > before // 100 else {}
+    # Evaluations every 100 steps tell 1, 2, 3, …; each falls together with a checkpoint.
+    def due(self: Any, since: int, steps: int, policy: Any) -> dict[str, float]:
+        return {"eval_return": float(steps // 100)} if steps // 100 > since // 100 else {}
 
     monkeypatch.setattr(PeriodicEvaluation, "due", due)
     agent = Agent(WALK, algorithm, 2_000, target_return=4.0)

@@ -1,0 +1,67 @@
+"""Ctrl-C and SIGTERM while a stage trains: the first one asks for a checkpoint, the next stops.
+
+Only the main thread receives signals, and only signals that Python or the system would handle by
+default are taken over: a program that has a handler of its own keeps it.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
+_received: list[str] = []  # names of signals, while they are deferred
+
+
+@contextmanager
+def deferred(until: str) -> Iterator[None]:
+    """Let the first interrupt set ``requested`` and the second one raise KeyboardInterrupt.
+
+    An interrupt that nothing has stopped for by the end raises KeyboardInterrupt then.
+
+    Args:
+        until: when training stops, for the message.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def on_signal(number: int, frame: Any) -> None:
+        _received.append(signal.Signals(number).name)
+        if len(_received) > 1:
+            raise KeyboardInterrupt
+        with suppress(RuntimeError, OSError, ValueError):  # it may interrupt another print
+            print(
+                f"\nstopping {until}, and saving; press Ctrl-C again to stop at once",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    _received.clear()
+    before = {s: signal.getsignal(s) for s in SIGNALS}
+    replaced = [s for s in SIGNALS if before[s] in _DEFAULTS]
+    for number in replaced:
+        signal.signal(number, on_signal)
+    try:
+        yield
+        if _received:
+            stop()
+    finally:
+        for number in replaced:
+            signal.signal(number, before[number])
+        _received.clear()
+
+
+def requested() -> bool:
+    """Return whether training is to save and stop."""
+    return bool(_received)
+
+
+def stop() -> NoReturn:
+    """Stop for the interrupt that came."""
+    raise KeyboardInterrupt
