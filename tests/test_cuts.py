@@ -35,6 +35,7 @@ from skillweave.training.loop import _Loop
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
 
+SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 STEPS = 1_600
 SELDOM = TrainDefaults(checkpoint_every=10**9)
 REPORTED = {"checkpoint_every": 10**9, "eval_every": 300, "eval_episodes": 2}
@@ -67,7 +68,7 @@ def skills(learn: str, algorithm: Any = ON, **how: Any) -> Callable[[], Hierarch
             "train_defaults": SELDOM,
         } | how
         return Hierarchy(
-            EnvSpec("CartPole-v1", engine="sync"),
+            SYNC,
             [Left(), Balance(), Push()],
             learn=learn,  # type: ignore[arg-type]
             **settings,
@@ -79,7 +80,7 @@ def skills(learn: str, algorithm: Any = ON, **how: Any) -> Callable[[], Hierarch
 def nested() -> Hierarchy:
     """A hierarchy in which a skill is one."""
     inner = Hierarchy(
-        "CartPole-v1",
+        SYNC,
         [Left(), Push()],
         algorithm=ON,
         selector=ON,
@@ -88,7 +89,7 @@ def nested() -> Hierarchy:
         train_defaults=SELDOM,
     )
     return Hierarchy(
-        "CartPole-v1",
+        SYNC,
         [inner.as_skill("inner"), Balance()],
         algorithm=ON,
         selector=ON,
@@ -99,9 +100,8 @@ def nested() -> Hierarchy:
     )
 
 
-SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 KINDS: dict[str, Callable[[], Any]] = {
-    "plain, ppo": plain(ON),
+    "plain, ppo": plain(ON, SYNC),
     "plain, ppo without overlap": plain(replace(ON, overlap=False), SYNC),
     "plain, recurrent ppo": plain(MEMORY, SYNC),
     "plain, in a pool": plain(ON, EnvSpec("CartPole-v1", engine="envpool", workers=1)),

@@ -109,6 +109,13 @@ CASES = [
     ("together", "collector.0.kept.skills.limit", "far too large"),
     ("together", "collector.0.open.obs", "missing"),
     ("together", "counts", "negative"),
+    ("together", "loop.report", "negative"),
+    ("together", "loop.report", "doubles"),
+    ("together", "loop.report", "empty"),
+    ("together", "loop.report", "far too large"),
+    ("together", "learner.left.acting.views.actor.0.weight", "infinite"),
+    ("together", "learner.left.acting.views.actor.0.weight", "flat"),
+    ("together", "learner.left.acting.views.actor.0.weight", "missing"),
 ]
 
 

@@ -68,7 +68,7 @@ class Progress:
         summary = {k: torch.tensor(v, dtype=torch.float64) for k, v in report.summary.items()}
         metrics = {k: v.detach().cpu().clone() for k, v in self.metrics.items()}
         return (
-            {"counts": torch.tensor(numbers, dtype=torch.int64)}
+            {"report": torch.tensor(numbers, dtype=torch.int64)}
             | prefixed("summary", summary)
             | prefixed("metrics", metrics)
         )
@@ -79,7 +79,7 @@ class Progress:
         Raises:
             ValueError: it does not fit.
         """
-        counts, metrics = state["counts"], unprefixed("metrics", state)
+        counts, metrics = state["report"], unprefixed("metrics", state)
         summary = unprefixed("summary", state)
         if counts.shape != (4,) or counts.dtype != torch.int64 or not bool((counts >= 0).all()):
             raise ValueError("its latest report is no row of four counts")
