@@ -34,6 +34,7 @@ from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.replay_learner import ReplayLearner
 from skillweave.training.stage import Target
 
 NET = Network((8,))
@@ -129,6 +130,7 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
         return {"eval_return": float(steps // 100)} if steps // 100 > since // 100 else {}
 
     monkeypatch.setattr(PeriodicEvaluation, "due", due)
+    monkeypatch.setattr(ReplayLearner, "report_every", 100)
     agent = Agent(WALK, algorithm, 2_000, target_return=4.0)
     often = {"eval_every": 100, "checkpoint_every": 100}
     whole = agent.train(tmp_path / "whole", quiet=True, **often)
