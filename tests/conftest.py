@@ -31,7 +31,7 @@ if importlib.util.find_spec("jaxtyping") and importlib.util.find_spec("beartype"
 
 # Reasons of tests that would run if something were installed; others want a GPU or a small disk.
 WANTING = re.compile(
-    r"could not import|not installed|no browser|no EGL|no C\\+\\+ compiler", re.IGNORECASE
+    r"could not import|not installed|no browser|no EGL|no C\+\+ compiler", re.IGNORECASE
 )
 
 

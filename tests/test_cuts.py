@@ -169,6 +169,7 @@ def at_random_places(share: float, seed: int, stop_after: int | None = None) -> 
         yield places
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_checkpoints_at_twenty_random_places_change_no_weight_and_no_report(
     kind: str, tmp_path: Path, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
@@ -180,6 +181,7 @@ def test_checkpoints_at_twenty_random_places_change_no_weight_and_no_report(
     assert_same(tmp_path / "run", reference)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(
     kind: str, tmp_path: Path, whole: Callable[[str], Path]
@@ -201,6 +203,7 @@ def test_a_run_that_stops_at_checkpoints_and_goes_on_ends_as_one_without_any(
     assert_same(path, reference)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", POPULATIONS)
 def test_a_population_that_stops_after_generations_ends_as_one_that_does_not(
     kind: str, tmp_path: Path, whole: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
@@ -269,6 +272,8 @@ def interrupted(path: Path, declared: Any, *signals: int) -> None:
 def test_an_interrupt_saves_the_round_that_was_begun_and_loses_nothing(
     number: int, tmp_path: Path, whole: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
+    # Ray, where a test before used it, handles SIGTERM by itself.
+    signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     before = signal.getsignal(number)
     reference, declared = whole("plain, ppo without overlap"), KINDS["plain, ppo without overlap"]()
     interrupted(tmp_path / "run", declared, number)

@@ -10,7 +10,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from declaring import plainly
-from small_runs import MEMORY, OFF, ON, Balance, Left, Push, Whole, lines, policies, stopped_run
+from small_runs import (
+    MEMORY,
+    OFF,
+    ON,
+    Balance,
+    Left,
+    Push,
+    Whole,
+    lines,
+    policies,
+    reports_every,
+    stopped_run,
+)
 
 from skillweave import (
     TD3,
@@ -187,6 +199,9 @@ def far(obs):
 def ready(obs):
     """A selector that is not trained."""
     return np.where(np.abs(obs[:, 2]) < 0.05, 0, 1)
+
+
+often = reports_every(75)
 
 
 @pytest.fixture(scope="module")

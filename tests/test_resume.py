@@ -23,6 +23,7 @@ from small_runs import (
     lines,
     new_run,
     policies,
+    reports_every,
     stopped_run,
 )
 from toys import ASKS, Echo
@@ -33,10 +34,12 @@ from skillweave.cli.overrides import apply_overrides
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
+from skillweave.training.replay_learner import ReplayLearner
 from skillweave.training.scene import Scene
 from skillweave.training.stage import Stage
 from skillweave.training.trainer import train_stage
 
+often = reports_every(75)
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
 
 RECIPE = '''
@@ -349,6 +352,9 @@ def echo_run(path: Path, stage: Stage) -> RunDirectory:
     return RunDirectory.create(path, manifest)
 
 
+REPORTED_AT = [76, 152, 228, 300, 376, 452, 528, 600, 652]
+
+
 def train_echo(run: RunDirectory, stage: Stage, *listeners: Any) -> None:
     try:
         train_stage(stage, run, Seeds(3) / stage.name, listeners)
@@ -364,14 +370,14 @@ def test_a_run_with_a_replay_buffer_ends_as_if_it_had_not_been_stopped(
     stage = stage_of(name)
     train_echo(echo_run(tmp_path / "whole", stage), stage)
     run = echo_run(tmp_path / "run", stage)
-    for stop in (3, 4):  # a tick at each cut, every 125 steps
+    for stop in (3, 4):  # a checkpoint every 125 steps
         with pytest.raises(Stopped):
             train_echo(run, stage, StopAt(stop))
         run = RunDirectory.open(run.path)
         assert (run.path / "checkpoint.safetensors").exists()
     train_echo(run, stage)
     assert policies(run.path) == policies(tmp_path / "whole")
-    assert [r["steps"] for r in lines(run.path)] == [128, 252, 376, 500, 628, 652]
+    assert [r["steps"] for r in lines(run.path)] == REPORTED_AT
     assert_metrics_fit(run.path, tmp_path / "whole")
 
 
@@ -394,7 +400,7 @@ def test_a_run_that_does_not_save_its_buffer_goes_on_with_an_empty_one(
     assert RunDirectory.open(run.path).finished
     mine, theirs = policies(run.path), policies(tmp_path / "whole")
     assert mine["echo.safetensors"][1] != theirs["echo.safetensors"][1]
-    assert [r["steps"] for r in lines(run.path)] == [128, 252, 376, 500, 628, 652]
+    assert [r["steps"] for r in lines(run.path)] == REPORTED_AT
 
 
 @pytest.mark.slow
@@ -449,6 +455,7 @@ LEARNERS = {
 }
 
 
+IMPORTS = {"    Apart, Network, PPO,": "    DQN, RNN, SAC, SelfImitationPPO, Apart, Network, PPO,"}
 FEWER_STEPS = {
     "skill_steps=300": "skill_steps=200",
     "selector_steps=750": "selector_steps=400",
@@ -458,13 +465,7 @@ FEWER_STEPS = {
 
 def recipe_of(folder: Path, learner: str, workers: int) -> str:
     text = RECIPE.replace("ENGINE", "sync").replace("workers=1", f"workers={workers}")
-    for old, new in FEWER_STEPS.items():
-        assert old in text
-        text = text.replace(old, new)
-    text = text.replace(
-        "import Network, PPO,", "import DQN, RNN, SAC, SelfImitationPPO, Network, PPO,"
-    )
-    for old, new in LEARNERS[learner].items():
+    for old, new in (IMPORTS | FEWER_STEPS | LEARNERS[learner]).items():
         assert old in text
         text = text.replace(old, new)
     path = folder / "recipe.py"
@@ -507,6 +508,7 @@ def test_a_run_of_any_learner_stopped_again_and_again_ends_as_if_it_had_not_been
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, learner: str, workers: int
 ) -> None:
     gone_on = restored_stages(monkeypatch)
+    monkeypatch.setattr(ReplayLearner, "report_every", 50)
     recipe = recipe_of(tmp_path, learner, workers)
     whole = new_run(recipes.load(recipe), tmp_path / "whole")
     training.train(recipes.load(recipe), whole)

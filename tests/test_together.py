@@ -24,6 +24,7 @@ from small_runs import (
     lines,
     new_run,
     policies,
+    reports_every,
 )
 
 from skillweave import (
@@ -93,6 +94,9 @@ KINDS = {
     ),
     "interrupt apart": lambda: declare(learn="apart", interrupt=True, selector_steps=450),
 }
+
+
+often = reports_every(75)
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ class ActingParams:
     extra: dict[str, Tensor] = field(default_factory=dict)  # of exploration, such as ε, (P, 1)
 
     def state(self) -> dict[str, Tensor]:
-        """Return copies of all tensors by name, for a checkpoint."""
+        """Return copies of the tensors by name, (P, ...) each, for a checkpoint."""
         scaling = {"shift": self.shift, "scale": self.scale}
         found = {k: v for k, v in scaling.items() if v is not None}
         found |= prefixed("views", self.views) | prefixed("extra", self.extra)

@@ -232,12 +232,11 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not(c
 
 def stacked(case: Case, config: AlgorithmConfig, budget: int) -> Any:
     """Three members as a stack, and each alone."""
-    env, cut = case.env(range(12)), budget // 2
-    stack = learn(config, env, 3 * budget, 5, range(3), cut_every=3 * cut)[1]
+    stack = learn(config, case.env(range(12)), 3 * budget, 5, range(3))[1]
     singles = []
     for m in range(3):
         env, seeds = case.env(range(4 * m, 4 * m + 4)), SeedsOfMember(Seeds(5), m)
-        singles.append(learn(config, env, budget, seeds, [m], cut_every=cut)[1])
+        singles.append(learn(config, env, budget, seeds, [m])[1])
     return stack, singles
 
 

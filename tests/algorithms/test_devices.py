@@ -137,6 +137,7 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
         batch.anchor = learner.anchor
         monkeypatch.setattr(learner._store, "rollout", lambda *about: batch)
         learner.learn(0, 0, 0.0)
+        learner._asked = algorithm.acting_params(learner.stacks[0].state, 0.0), 0.0
         assert learner.anchor.coef.device == THERE
         assert learner.kept()["anchor_coef"].device.type == "cpu"
 

@@ -10,7 +10,16 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch
-from small_runs import OFF, ON, Left, assert_same, lines, stopped_again, stopped_run
+from small_runs import (
+    OFF,
+    ON,
+    Left,
+    assert_same,
+    lines,
+    reports_every,
+    stopped_again,
+    stopped_run,
+)
 
 import skillweave as sw
 from skillweave import DQN, PPO, SAC, TD3, Hierarchy, Linear, SelfImitationPPO, SkillweaveError
@@ -22,6 +31,7 @@ from skillweave.runs.manifest import read_manifest
 from skillweave.seeding import Seeds
 
 KINDS = (PPO, SelfImitationPPO, SkillCritic, DQN, SAC, TD3)
+often = reports_every(75)
 
 
 def halving(remaining: float) -> float:

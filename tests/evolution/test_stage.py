@@ -211,15 +211,15 @@ def test_a_killed_population_of_selectors_ends_with_the_very_same_weights(
     )
     evolve = {"selector": Evolution(3, 4, 2, mutations=EVERYTHING)}
     whole = hierarchy.train(tmp_path / "whole", quiet=True, evolve=evolve)
-    cut, cuts = Population.cut, [0]
+    state, cuts = Population.state, [0]
 
-    def dies(self: Population, seeds: Seeds) -> Any:
+    def dies(self: Population) -> Any:
         cuts[0] += 1
         if cuts[0] == 3:  # goes on from the second
             raise KeyboardInterrupt
-        return cut(self, seeds)
+        return state(self)
 
-    monkeypatch.setattr(Population, "cut", dies)
+    monkeypatch.setattr(Population, "state", dies)
     with pytest.raises(KeyboardInterrupt):
         hierarchy.train(tmp_path / "run", quiet=True, evolve=evolve)
     monkeypatch.undo()

@@ -9,7 +9,7 @@ import pytest
 from declaring import plainly
 from ready_selectors import chain
 from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, got_key, has_key
-from small_runs import OFF, ON, SMALL, Whole, lines
+from small_runs import OFF, ON, SMALL, Whole, lines, reports_every
 
 from skillweave import (
     PPO,
@@ -125,12 +125,17 @@ KINDS = {
 }
 
 
+often = reports_every(75)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     return Whole(KINDS, tmp_path_factory)
 
 
 STOPS = dict.fromkeys(KINDS, (3, 4))
+# The last one is in the selector's stage.
+STOPS |= dict.fromkeys(("restricted, from replay", "near a tree", "lengths by a rule"), (3, 2, 12))
 STOPS |= dict.fromkeys(("tree, then", "near and restricted, then"), (3, 4, 19))
 # After (3, 4) their episodes, of 40 steps, are still the first ones.
 STOPS |= dict.fromkeys(("automaton", "restricted"), (3, 9))

@@ -245,7 +245,7 @@ KINDS = {
 }
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", KINDS)
 def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights(name):
     config, kind = KINDS[name]
