@@ -35,9 +35,7 @@ def learn(seed: int, steps: int, every: float) -> dict[str, object]:
             copies.append((tick.seconds, tick.steps, policy))
 
     seeds = Seeds(seed) / "flat"
-    stack = train_bare(
-        hierarchy.spec, config, seeds, steps, on_tick, hierarchy.train_defaults.checkpoint_every
-    )
+    stack = train_bare(hierarchy.spec, config, seeds, steps, on_tick)
     seconds = last[-1].seconds
     scores = []
     reached = None

@@ -47,7 +47,7 @@ class Flat(Agent):
             content["stages"][0]["workers"] = 1  # runs go side by side
             learnt = {} if self.starts_from is None else learnt_in(self.starts_from)
             if self.starts_from is not None:
-                begin_with(content["stages"], learnt, self.starts_from)
+                begin_with(content["stages"], learnt, str(self.starts_from))
             keep = partial(keep_starts, learnt=learnt)
             run = RunDirectory.create(path, content | {"recipe": None, "track": ()}, keep)
         try:
