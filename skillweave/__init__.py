@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from skillweave.seeding import Seeds
     from skillweave.selectors import Automaton, LastCall, tree
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
+    from skillweave.training.callback import TrainEvent
     from skillweave.training.defaults import TrainDefaults
     from skillweave.training.evaluation import Evaluation, evaluate
     from skillweave.training.stage import Together
@@ -100,6 +101,7 @@ _HOME = {
     "Together": "training.stage",
     "Tournament": "evolution.config",
     "TrainDefaults": "training.defaults",
+    "TrainEvent": "training.callback",
     "Truncation": "evolution.config",
     "adam_": "ops.optim",
     "clip_grad_norm_": "ops.optim",
@@ -176,6 +178,7 @@ __all__ = [
     "Together",
     "Tournament",
     "TrainDefaults",
+    "TrainEvent",
     "Truncation",
     "adam_",
     "clip_grad_norm_",

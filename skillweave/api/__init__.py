@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 
@@ -28,6 +28,7 @@ from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
 from skillweave.messages import as_path, whole_number
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill
+from skillweave.training.callback import Callback
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
 
@@ -58,18 +59,28 @@ class Agent(PlainAgent):
         evolve: Evolve = None,
         cluster: Ray | None = None,
         start_from: StartFrom = None,
+        callback: Callback | None = None,
+        keep: Literal["last", "best"] | None = None,
+        log_info: Sequence[str] | None = None,
     ) -> Run:
         """Train the agent and write everything to ``run_dir``.
 
         ``seed``, ``eval_every``, ``eval_episodes``, ``checkpoint_every``, ``quiet``, ``track``,
-        ``evolve``, ``cluster`` and ``start_from`` are as in ``Hierarchy.train``.
+        ``evolve``, ``cluster``, ``start_from``, ``callback``, ``keep`` and ``log_info`` are as in
+        ``Hierarchy.train``.
         """
         self.validate()
         how = self.train_defaults.given(
-            eval_every=eval_every, eval_episodes=eval_episodes, checkpoint_every=checkpoint_every
+            eval_every=eval_every,
+            eval_episodes=eval_episodes,
+            checkpoint_every=checkpoint_every,
+            keep=keep,
+            log_info=log_info,
         )
         content = self.manifest(whole_number(seed, "seed", 0), how)
-        return begin(self, content, run_dir, quiet, track, evolve, cluster, start_from)
+        return begin(
+            self, content, run_dir, quiet, track, evolve, cluster, start_from, callback=callback
+        )
 
     @checked_names
     def resume(
@@ -79,15 +90,17 @@ class Agent(PlainAgent):
         quiet: bool = False,
         evolve: Evolve = None,
         cluster: Ray | None = None,
+        callback: Callback | None = None,
     ) -> Run:
         """Finish the run in ``run_dir``.
 
-        ``quiet``, ``evolve`` and ``cluster`` are as in ``Hierarchy.resume``.
+        ``quiet``, ``evolve``, ``cluster`` and ``callback`` are as in ``Hierarchy.resume``.
         """
         self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
-        return go_on(self, run, quiet, evolve, cluster, told_differences(self, run))
+        note = told_differences(self, run)
+        return go_on(self, run, quiet, evolve, cluster, note, callback)
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
@@ -170,6 +183,9 @@ class Hierarchy(Declaration):
         evolve: Evolve = None,
         cluster: Ray | None = None,
         start_from: StartFrom = None,
+        callback: Callback | None = None,
+        keep: Literal["last", "best"] | None = None,
+        log_info: Sequence[str] | None = None,
     ) -> Run:
         """Train skills and selector and write everything to ``run_dir``.
 
@@ -195,6 +211,19 @@ class Hierarchy(Declaration):
                 taken over is the policy (of PPO and DQN all networks, of SAC and TD3
                 the actor). The task may be another one; spaces, networks and the names of a
                 selector's skills must be the same.
+            callback: a function that is called with a ``TrainEvent`` for each report of training
+                and each checkpoint. Where it returns False, the stage ends with what it has
+                learnt, as at a target, and the next one starts. An exception in it stops the
+                training and leaves ``train`` as it is; the run can be resumed from its last
+                checkpoint. It is called in this process, and is not stored in the run.
+            keep: "best": each stage ends with the weights whose periodic evaluation was best, by
+                the mean return or by what its target is of; the last weights are evaluated, too.
+                It needs ``eval_every``. A population ends with its best member in any case. None:
+                as ``train_defaults`` says, by default "last".
+            log_info: keys of ``info``: the mean of each over the latest 100 episodes is
+                ``info/<key>`` in ``metrics.jsonl`` and in trackers. Of an episode the value in its
+                last step counts (in a skill's own stage: of its call). None, NaN and infinity are
+                left out.
 
         Returns:
             The finished run.
@@ -206,11 +235,17 @@ class Hierarchy(Declaration):
         self.validate()
         seed = whole_number(seed, "seed", 0)
         how = self.train_defaults.given(
-            eval_every=eval_every, eval_episodes=eval_episodes, checkpoint_every=checkpoint_every
+            eval_every=eval_every,
+            eval_episodes=eval_episodes,
+            checkpoint_every=checkpoint_every,
+            keep=keep,
+            log_info=log_info,
         )
         own, note = (self, "") if flat is not False else evolving(self, evolve)
         content = training.manifest(own, seed=seed, flat=flat, how=how)
-        return begin(own, content, run_dir, quiet, track, evolve, cluster, start_from, note)
+        return begin(
+            own, content, run_dir, quiet, track, evolve, cluster, start_from, note, callback
+        )
 
     @checked_names
     def resume(
@@ -220,6 +255,7 @@ class Hierarchy(Declaration):
         quiet: bool = False,
         evolve: Evolve = None,
         cluster: Ray | None = None,
+        callback: Callback | None = None,
     ) -> Run:
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
@@ -228,12 +264,13 @@ class Hierarchy(Declaration):
 
         ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
         selection of your own. ``cluster``: where its collectors run from now on; their number
-        stays.
+        stays. ``callback``: as in ``train``; the one of ``train`` is not stored.
         """
         self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         own = adopted(self, run)
-        return go_on(own, run, quiet, evolve, cluster, told_differences(self, run))
+        note = told_differences(self, run)
+        return go_on(own, run, quiet, evolve, cluster, note, callback)
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
@@ -308,6 +345,9 @@ def train_agent(
     evolve: Evolve = None,
     cluster: Ray | None = None,
     start_from: StartFrom = None,
+    callback: Callback | None = None,
+    keep: Literal["last", "best"] = "last",
+    log_info: Sequence[str] = (),
 ) -> Run:
     """Train one plain agent on an environment's own reward; the run is like any other.
 
@@ -329,6 +369,10 @@ def train_agent(
             where it pays.
         start_from: another plain agent's run, or its directory: it begins with that policy; see
             ``Hierarchy.train``.
+        callback: is called with a ``TrainEvent`` for each report and each checkpoint; returning
+            False ends the training; see ``Hierarchy.train``.
+        keep: "best": end with the weights whose periodic evaluation was best.
+        log_info: keys of ``info`` that are logged; see ``Hierarchy.train``.
 
     Returns:
         The finished run.
@@ -354,6 +398,9 @@ def train_agent(
         evolve=evolve,
         cluster=cluster,
         start_from=start_from,
+        callback=callback,
+        keep=keep,
+        log_info=log_info,
     )
 
 

@@ -27,7 +27,9 @@ from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
 from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
+from skillweave.training.callback import Callback, TrainCallback, check_callback
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
+from skillweave.training.stage_log import Listener
 from skillweave.types import Interrupted, SkillweaveError
 
 if TYPE_CHECKING:
@@ -59,13 +61,15 @@ def begin(
     cluster: Ray | None,
     start_from: StartFrom = None,
     note: str = "",
+    callback: Callback | None = None,
 ) -> Run:
     """Check everything, begin a run of this manifest, and train it; ``note`` is printed first."""
     _may_train()
+    check_callback(callback)
     run_dir = as_path(run_dir, "run_dir")
     spaces = _plan(declared, content, evolve, cluster)
     learnt, told = starts(declared, content, start_from, spaces)
-    note = " ".join(filter(None, (note, told)))
+    note = " ".join(filter(None, (note, told, _kept_by_populations(content))))
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
@@ -77,7 +81,15 @@ def begin(
         content | {"recipe": declared.recipe, "track": track},
         partial(keep_starts, learnt=learnt),
     )
-    return go_on(declared, run, quiet, evolve, cluster, note)
+    return go_on(declared, run, quiet, evolve, cluster, note, callback)
+
+
+def _kept_by_populations(content: dict[str, Any]) -> str:
+    """Return a sentence where ``keep="best"`` changes nothing; empty if it does everywhere."""
+    names = [stage["name"] for stage in content["stages"] if stage.get("evolution")]
+    if content["keep"] != "best" or not names:
+        return ""
+    return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
 
 
 def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
@@ -116,7 +128,7 @@ def _plan(
     """Check everything, and write into a manifest's stages how they are trained; the spaces."""
     observation_space, action_space = declared.check_spaces()
     plan(content["stages"], evolve)
-    check_stages(content["stages"], content["eval_every"])
+    check_stages(content["stages"], content["eval_every"], content["keep"])
     spec = declared.spec
     _check(cluster)
     if cluster is not None and cluster.collectors is not None:
@@ -142,8 +154,10 @@ def go_on(
     evolve: Evolve,
     cluster: Ray | None,
     note: str = "",
+    callback: Callback | None = None,
 ) -> Run:
     """Train what is left of a run; ``note``: what people should know first."""
+    check_callback(callback)
     if not run.finished:
         _may_train()
     must_be_own(run.path)
@@ -157,10 +171,13 @@ def go_on(
         trackers = make_trackers(run.manifest.get("track", ()), run)
         for tracker in trackers:
             stack.callback(tracker.close)
+        listeners: tuple[Listener, ...] = (progress, *trackers)
+        if callback is not None:  # last: what it is called with is written by then
+            listeners = (*listeners, TrainCallback(callback, run))
         make = _where(cluster, run, progress, stack)
         learner = make_learner(run.manifest["stages"], evolve, make)
         try:
-            policy = training.train(declared, run, (progress, *trackers), learner)
+            policy = training.train(declared, run, listeners, learner)
         except KeyboardInterrupt:
             again = f"resume({str(run.path)!r})"
             raise Interrupted(f"{saved_words(run)}; go on with: {again}") from None

@@ -54,6 +54,12 @@ class Train(OnRay):
     start_from: UseAppendAction[tuple[str, ...]] = ()
     """Another run: whoever has learnt there, too, begins with that (not --versus-flat's agent).
     Several runs, by the name of who begins: --start-from left=RUN --start-from right=RUN."""
+    keep: Literal["last", "best"] | None = None
+    """best: end with the weights whose evaluation while training was best, not with the last ones
+    (needs --set train.eval_every=STEPS, if the recipe does not set it)."""
+    log_info: UseAppendAction[tuple[str, ...]] = ()
+    """A key of info, for example: --log-info distance. Its mean at the ends of episodes is
+    info/distance in metrics.jsonl and in trackers."""
     evolve: UseAppendAction[tuple[str, ...]] = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
     track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()

@@ -181,6 +181,8 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return Linear(*(_parse(name, part.strip(), float) for part in linear[1].split(",")))
         if option is Lengths and isinstance(value, tuple | list):
             return Lengths(*value)
+        if origin is Sequence and isinstance(value, str):
+            return tuple(part.strip() for part in value.split(","))
         if origin is tuple and isinstance(value, tuple | list | int):
             return tuple(value) if isinstance(value, tuple | list) else (value,)
         if origin is typing.Literal and value in typing.get_args(option):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skillweave.collecting.lengths import calls_from_json
-from skillweave.runs.kept import kept_words
+from skillweave.runs.kept import best_words, kept_words
 from skillweave.training.evaluation_file import SavedEvaluation
 
 
@@ -37,6 +37,12 @@ def run_lines(
                 f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "
                 f"{p['target']['of']} {reached['value']:g}"
             )
+        if stopped := p.get("stopped"):
+            lines.append(
+                f"    a callback ended it after {stopped['steps']:,} of {p['budget']:,} steps"
+            )
+        if best := p.get("best"):
+            lines.append(f"    {best_words(best)}")
         if winner := p.get("winner"):
             lines.append(
                 f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "

@@ -84,6 +84,8 @@ def _trained(
             evolve=evolve,
             cluster=cluster,
             start_from=None if baseline else _start_from(command.start_from),
+            keep=command.keep,
+            log_info=command.log_info or None,
         )
     except KeyboardInterrupt:
         raise _interrupted(path, command.ray) from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,12 +12,15 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.columns import as_wide
 from skillweave.collecting.restored import check_numbers, opened
 from skillweave.envs.engine import Engine, checksums
+from skillweave.envs.infos import info_keys, info_numbers
 from skillweave.experience import Experience
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
-"""The columns of ``Collected.episodes``."""
+"""The first columns of ``Collected.episodes``."""
+TOLD = 4
+"""How many these are; those of logged keys of ``info`` follow."""
 
 
 @dataclass
@@ -25,10 +28,12 @@ class Collected:
     """What a learner is to learn from, and what people want to know of it."""
 
     experience: Experience
-    episodes: Array  # (K, 4) float64, those that ended; NaN where there is no such number
+    episodes: Array  # (K, 4 + I) float64, those that ended; NaN where there is no such number
     stands: Array | None = None  # (N,) checksums of what the environments show now; of workers
     begun_anew: Array = field(default_factory=lambda: np.empty(0, np.int64))
     """(k,) environments whose first row here does not follow from their last row before."""
+    info_keys: frozenset[str] = frozenset()
+    """Keys of ``info`` where episodes ended without a key that is logged."""
 
 
 class Collector:
@@ -60,6 +65,9 @@ class Collector:
         """The same of what has a shape that is known only when it begins."""
         self.begun = False
         self._all = np.arange(n)
+        self.log_info: tuple[str, ...] = ()
+        """I keys of ``info`` whose values at the ends of episodes are logged."""
+        self._info_keys: set[str] = set()
         self._ended: list[Array] = []  # what is told of episodes, and in which environments
         self._who: list[Array] = []
 
@@ -73,10 +81,11 @@ class Collector:
     def collect(self, request: Request) -> Collected:
         """``request.rows`` steps of each environment."""
         before, self._ended, self._who = self.engine.steps_made, [], []
+        self._info_keys = set()
         experience = self._collect(request)
         experience.spent = self.engine.steps_made - before
-        empty = np.zeros((0, 4))
-        return Collected(experience, np.concatenate([empty, *self._ended]))
+        episodes = np.concatenate([np.zeros((0, TOLD + len(self.log_info))), *self._ended])
+        return Collected(experience, episodes, info_keys=frozenset(self._info_keys))
 
     def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
         """Play one episode in each environment, from its start.
@@ -86,11 +95,11 @@ class Collector:
             limit: steps after which an episode is cut.
 
         Returns:
-            (N, 4), as ``Collected.episodes``; NaN where none could begin.
+            (N, 4 + I), as ``Collected.episodes``; NaN where none could begin.
         """
         self.begun = False
         self.start(seeds)
-        found = np.full((self.num_envs, 4), np.nan)
+        found = np.full((self.num_envs, TOLD + len(self.log_info)), np.nan)
         playing = np.ones(self.num_envs, bool)
         self._prepare(request)
         for _ in range(limit):
@@ -173,9 +182,23 @@ class Collector:
             self._forget(ids)
         return ids
 
-    def _tell(self, ids: Array, success: Array | None = None, *, task: bool = False) -> None:
-        """The episodes of environments ``ids`` (k,) are over."""
-        told = np.full((len(ids), 4), np.nan)
+    def _tell(
+        self, ids: Array, info: Mapping[str, Any], success: Array | None = None, *, task: bool
+    ) -> None:
+        """Keep what is told of the episodes of environments ``ids`` (k,), which are over.
+
+        Args:
+            info: of all environments, at this step.
+            success: (k,), whether they have succeeded.
+            task: their return of the task is another one than that of who acts.
+        """
+        told = np.full((len(ids), TOLD + len(self.log_info)), np.nan)
+        for column, key in enumerate(self.log_info, TOLD):
+            numbers = info_numbers(info, key, ids, self.num_envs)
+            if numbers is None:
+                self._info_keys |= set(info_keys(info))
+            else:
+                told[:, column] = numbers
         told[:, :3] = self.kept["sums"][ids]
         if not task:
             told[:, TASK_RETURN] = np.nan
@@ -197,6 +220,7 @@ _OF_LEARNERS = {"memory", "before"}
 def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
     """Several collectors of one kind as one, over an engine of all their environments."""
     found: Collector = collectors[0].like(engine, acting)
+    found.log_info = collectors[0].log_info
     for name, rows in found.kept.items():
         if name not in _OF_LEARNERS:
             rows[:] = np.concatenate([c.kept[name] for c in collectors])
@@ -224,7 +248,8 @@ def side_by_side(parts: Sequence[Collected], members: int) -> Collected:
     if len(parts) == 1:
         return parts[0]
     joined = _joined([p.experience for p in parts], members)
-    return Collected(joined, np.concatenate([p.episodes for p in parts]))
+    keys = frozenset[str]().union(*(p.info_keys for p in parts))
+    return Collected(joined, np.concatenate([p.episodes for p in parts]), info_keys=keys)
 
 
 def _joined(experiences: Sequence[Experience], members: int) -> Experience:

@@ -121,7 +121,8 @@ class DecisionCollector(Collector):
             if ended.any():
                 ids = np.flatnonzero(ended)
                 success = told_success(raw.info, self.num_envs)
-                self._tell(ids, None if success is None else success[ids])
+                succeeded = None if success is None else success[ids]
+                self._tell(ids, raw.info, succeeded, task=False)
                 self._begin_anew(ids)
 
     def _act(self, obs: Array, mask: Array | None) -> Array:

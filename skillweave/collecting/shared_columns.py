@@ -22,6 +22,7 @@ class SharedColumns:
     spent: int
     episodes: Array
     stands: Array | None
+    info_keys: frozenset[str]
 
     def read(self, memory: SharedMemory | None) -> tuple[SharedMemory, Collected]:
         """The memory, and the experience: views of it, good until the next request.
@@ -39,7 +40,8 @@ class SharedColumns:
             k: np.ndarray(shape, dtype, memory.buf, at)
             for k, (at, dtype, shape) in self.places.items()
         }
-        return memory, Collected(_experience(found, self.spent), self.episodes, self.stands)
+        experience = _experience(found, self.spent)
+        return memory, Collected(experience, self.episodes, self.stands, info_keys=self.info_keys)
 
 
 def _experience(found: dict[str, Array], spent: int = 0) -> Experience:
@@ -86,7 +88,10 @@ class ColumnWriter:
                 np.ndarray(a.shape, a.dtype, self.memory.buf, at)[...] = a
                 where[id(a)], at = at, at + _room(a)
             places[k] = (where[id(a)], a.dtype, a.shape)
-        return SharedColumns(name, places, experience.spent, collected.episodes, collected.stands)
+        return SharedColumns(
+            name, places, experience.spent, collected.episodes, collected.stands,
+            collected.info_keys,
+        )  # fmt: skip
 
 
 def _room(array: Array) -> int:

@@ -142,7 +142,7 @@ class SkillCollector(Collector):
         if len(ids):
             told = ids if playing is None else np.flatnonzero(playing & ended)
             success = None if judged.success is None else judged.success[told]
-            self._tell(told, success, task=self.skill is not None)
+            self._tell(told, raw.info, success, task=self.skill is not None)
             more = self._call_again(told[(judged.truncated & ~raw.truncated)[told]])
             self._begin_anew(np.setdiff1d(ids, more) if len(more) else ids)
         if playing is not None:

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.messages import short
 from skillweave.spaces import action_codec
 from skillweave.types import Array, SkillweaveError
 
@@ -99,6 +100,50 @@ def told_success(info: Mapping[str, Any], n: int) -> Array | None:
         return None
     here = np.asarray(info.get("_success", np.ones(n, bool)))
     return np.where(here, told != 0, np.nan)
+
+
+def info_numbers(info: Mapping[str, Any], key: str, ids: Array, n: int) -> Array | None:
+    """Return the numbers under a key in the infos of environments ``ids`` (k,), of n.
+
+    Returns:
+        (k,) float64, NaN where an environment gives none, or none that is finite; None: no
+        environment gives any.
+
+    Raises:
+        SkillweaveError: something else than a number lies there; the message names its type.
+    """
+    if key not in info:
+        return None
+    values = info[key]
+    here = np.asarray(info.get(f"_{key}", np.ones(n, bool)))[ids]
+    if not here.any():
+        return None
+    if not isinstance(values, np.ndarray) or values.shape[:1] != (n,):
+        raise _no_number(key, f"of type {type(values).__name__}")
+    if values.size > n:
+        raise _no_number(key, f"an array of shape {values.shape[1:]}")
+    found = np.full(len(ids), np.nan)
+    for row in np.flatnonzero(here):
+        value = values.reshape(n)[ids[row]]
+        if value is None:
+            continue
+        if not isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
+            raise _no_number(key, f"of type {type(value).__name__}")
+        found[row] = value
+    found[~np.isfinite(found)] = np.nan
+    return found
+
+
+def _no_number(key: str, what: str) -> SkillweaveError:
+    return SkillweaveError(
+        f"log_info names {short(key)}, but info[{short(key)}] is {what} at the end of an episode; "
+        "let the environment give a number there, or leave the key out of log_info"
+    )
+
+
+def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the keys of a batched info, without Gymnasium's masks (``_key``)."""
+    return tuple(key for key in info if not (key.startswith("_") and key[1:] in info))
 
 
 def allowed_rows(mask: Array | None, rows: Array) -> Array | None:

@@ -73,6 +73,27 @@ class SyncEnvs(SyncVectorEnv[Any, Any]):
         self._over[ids] = terminated | truncated
         return self._batch(obs), reward, terminated, truncated, infos
 
+    def _add_info(
+        self, vector_infos: dict[str, Any], env_info: dict[str, Any], env_num: int
+    ) -> dict[str, Any]:
+        """Add one environment's info to a batch.
+
+        Gymnasium takes the type of the first value of a key and casts all others to it, 0.5 to 0
+        for example. Here the array becomes wide enough for all.
+        """
+        for key, value in env_info.items():
+            array = vector_infos.get(key)
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+                continue
+            if isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
+                if array.dtype.kind != "f" and isinstance(value, float | np.floating):
+                    vector_infos[key] = array.astype(np.float64)
+                elif array.dtype.kind == "b" and not isinstance(value, bool | np.bool_):
+                    vector_infos[key] = array.astype(np.int64)
+            elif not isinstance(value, np.ndarray | dict):
+                vector_infos[key] = array.astype(object)
+        return super()._add_info(vector_infos, env_info, env_num)
+
     def _batch(self, obs: list[Any]) -> Any:
         """Observations as one batch of the space's kind."""
         space = self.single_observation_space

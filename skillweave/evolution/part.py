@@ -22,7 +22,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.arena import returns_of
-from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.episodes import Episodes, InfoTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.loop import Progress, train
 from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
@@ -56,11 +56,12 @@ class Part:
         self._seeds, self._first, each = seeds, first, config.num_envs
         self.replays = make_algorithm(config, *self.spaces).store == "replay"
         self.places = [
-            scene.collector(each, None, (first + i) * each, self.replays) for i in range(count)
+            scene.learners_collector(each, None, (first + i) * each, self.replays)
+            for i in range(count)
         ]
         """Where members act: an heir goes on with its place's open episodes."""
         self.num_envs = count * each
-        self.episodes = Episodes()
+        self.episodes = Episodes(scene.log_info)
         self.rounds = 0
         """Of the loop in which all members learn from one store."""
         self.store: ReplayStore | None = None
@@ -162,6 +163,11 @@ class Part:
     def _make_store(self, members: Sequence[Member]) -> ReplayStore:
         algorithm, count = members[0].algorithm(self.spaces), len(self.places)
         return store_of(algorithm, count * self.places[0].num_envs, count, shared=True)
+
+    @property
+    def tally(self) -> InfoTally:
+        """Which logged keys of ``info`` occurred."""
+        return self.episodes.tally
 
     def fitness(self, members: Sequence[Member], arena: Collector, seeds: Seeds) -> Array:
         """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""

@@ -24,6 +24,7 @@ from skillweave.collecting.where import MakeWorkers
 from skillweave.evolution.part import OnGenerationTick, Part
 from skillweave.evolution.stacks import Member
 from skillweave.seeding import Seeds
+from skillweave.training.episodes import InfoTally
 from skillweave.training.scene import Scene
 from skillweave.types import Array
 
@@ -48,6 +49,8 @@ class Trained:
     states: list[dict[str, Array]]
     steps: list[int]
     ticks: list[tuple[int, dict[str, float]]]
+    tally: InfoTally
+    """Of all episodes at this part so far."""
 
 
 class Parts:
@@ -79,6 +82,8 @@ class Parts:
         self._each = config.num_envs
         self.steps_elsewhere = 0
         """Environment steps of measuring fitness that were made in other processes."""
+        self.tally = InfoTally()
+        """Which logged keys of ``info`` occurred."""
         make = partial(_stationed, scene, _alone(config), seeds, self._bounds, episodes)
         self._workers, self._closed = make_workers(make, parts, scene.name), False
 
@@ -93,10 +98,11 @@ class Parts:
         """Train members until each has ``until`` steps; ticks are told when all parts are done."""
         groups = self._divided(members)
         tasks = [Training(_sent(group), until, schedule_steps, seeds) for group in groups]
-        before = 0
+        before, self.tally = 0, InfoTally()
         for group, trained in zip(groups, self._workers.ask("train", tasks), strict=True):
             for steps, metrics in trained.ticks:
                 on_tick(before + steps, dict(metrics))
+            self.tally.add(trained.tally)
             before += sum(trained.steps) - sum(m.steps for m in group)
             for member, state, steps in zip(group, trained.states, trained.steps, strict=True):
                 member.state, member.steps = type(member.state)(**_tensors(state)), steps
@@ -148,7 +154,8 @@ class StationedPart:
         self._part.train(
             members, task.until, task.schedule_steps, task.seeds, lambda *tick: ticks.append(tick)
         )
-        return Trained([_arrays(m.state) for m in members], [m.steps for m in members], ticks)
+        states, steps = [_arrays(m.state) for m in members], [m.steps for m in members]
+        return Trained(states, steps, ticks, self._part.tally)
 
     def fitness(self, task: tuple[Sequence[Sent], Seeds]) -> tuple[Array, int]:
         """Their fitness, and the environment steps that it took."""

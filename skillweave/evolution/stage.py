@@ -113,6 +113,7 @@ class EvolvingPopulation:
             self.generation()
             if interrupts.requested() and not self.over:
                 interrupts.stop()
+        log.tell_absent(self.population.part.tally, over=True)
         return {self.stage.name: self._finish()}
 
     def states(self) -> dict[str, Any]:
@@ -125,9 +126,13 @@ class EvolvingPopulation:
 
     @property
     def over(self) -> bool:
-        """Whether all generations are complete, the target is reached, or the budget is spent."""
+        """Whether all generations are complete, or it ends before.
+
+        The target is reached, the budget is spent, or a callback has asked for it.
+        """
         spent = self.done > 0 and self.log.at["steps"] >= self.budget
-        return self._good or spent or self.done >= self.evolution.generations
+        early = self._good or spent or self.log.stop_requested
+        return early or self.done >= self.evolution.generations
 
     @property
     def _good(self) -> bool:
@@ -154,6 +159,9 @@ class EvolvingPopulation:
         self.log.at["steps"] += self.fitness_steps
         self._note(fitness)
         self.done += 1
+        self.log.tell_absent(self.population.part.tally, over=False)
+        if self.log.stop_requested:
+            return  # no checkpoint: a run resumed from the one before comes here again
         if not self.over:
             self.population.evolve(fitness, seeds)
         self._save()
@@ -169,6 +177,8 @@ class EvolvingPopulation:
         asked = self.evolution.generations
         if self._good:
             self.log.reached(self.best.fitness)
+        elif self.log.stop_requested:
+            self.log.stopped()
         elif self.done < asked:
             self.log.tell(
                 f"its budget of {self.budget:,} steps is spent after {self.done} of {asked} "

@@ -63,6 +63,8 @@ def manifest(
         "checkpoint_every": how.checkpoint_every,
         "eval_every": how.eval_every,
         "eval_episodes": how.eval_episodes,
+        "keep": how.keep,
+        "log_info": how.log_info,
         "skills": [
             _skill_entry(path, s, together=_learns_together(declaration, path))
             for path, s in every_skill(declaration.skills)

@@ -65,6 +65,8 @@ class RunDirectory:
         self.lineage = JsonLines(path / "lineage.jsonl", LineageLine)
         self._checkpoints = Checkpoints(path)
         self._lock: Lock | None = None
+        self.told_absent: set[str] = set()
+        """Logged keys of ``info`` of which users know already that they do not occur."""
 
     @classmethod
     def create(

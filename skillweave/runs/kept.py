@@ -45,6 +45,15 @@ def kept_words(kept: Mapping[str, Any]) -> str:
     return f"mean return {returns} ({kept['episodes']} episodes each); kept: {_WORDS[kept['kept']]}"
 
 
+def best_words(best: Mapping[str, Any]) -> str:
+    """Return a sentence on the evaluation whose weights a stage ended with (``keep="best"``)."""
+    what = "mean return" if best["of"] == "return" else "share of successes"
+    return (
+        f"kept the weights of step {best['steps']:,}, whose evaluation was best: "
+        f"{what} {best['value']:.4g}"
+    )
+
+
 def to_be_judged(entry: Mapping[str, Any]) -> bool:
     """Whether a stage of a run is to end with the best of several hierarchies."""
     return entry["kind"] == "together" and bool(entry["compared"] or entry["greedy_judged"])

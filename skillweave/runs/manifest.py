@@ -94,6 +94,27 @@ class Reached(TypedDict):
     value: float
 
 
+class Stopped(TypedDict):
+    """That a callback ended a stage."""
+
+    steps: Count
+
+
+class Best(TypedDict):
+    """The evaluation whose weights a stage ended with."""
+
+    steps: Count
+    of: Literal["return", "success"]
+    value: float
+
+
+class BestSoFar(TypedDict):
+    """The best evaluation of a stage that goes on."""
+
+    steps: Count
+    metrics: dict[str, float]
+
+
 class Start(TypedDict):
     """What one begins a stage with, from another run."""
 
@@ -123,6 +144,8 @@ class StageEntry(TypedDict):
     evolution: NotRequired[dict[str, Any] | None]
     target: NotRequired[TargetEntry | None]
     reached: NotRequired[Reached]
+    stopped: NotRequired[Stopped]
+    best: NotRequired[Best]
     metrics_bytes: NotRequired[Count]
     lineage_bytes: NotRequired[Count]
     steps: NotRequired[Count]
@@ -170,6 +193,10 @@ class Manifest(TypedDict):
     id: NotRequired[str]
     eval_every: Positive | None
     eval_episodes: Positive
+    keep: NotRequired[Literal["last", "best"]]
+    """What stages end with."""
+    log_info: NotRequired[list[str]]
+    """Keys of ``info`` that are logged."""
     resume_needs_recipe: bool
     recipe: NotRequired[str | None]
     track: NotRequired[list[str]]
@@ -206,6 +233,8 @@ class Checkpoint(TypedDict):
     metrics_bytes: Count
     lineage_bytes: NotRequired[Count]
     run: NotRequired[str]
+    kept_best: NotRequired[BestSoFar]
+    """Where the best weights are kept."""
 
 
 def check_manifest(data: Mapping[str, Any], file: str) -> None:
@@ -242,7 +271,7 @@ def identity(manifest: Mapping[str, Any]) -> str:
 
     Runs that are bound to end with the same weights have the same.
     """
-    settled = {k: v for k, v in manifest.items() if k not in ("recipe", "track")}
+    settled = {k: v for k, v in manifest.items() if k not in ("recipe", "track", "log_info")}
     return hashlib.sha256(json.dumps(settled, sort_keys=True, default=str).encode()).hexdigest()[
         :16
     ]

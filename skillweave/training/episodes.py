@@ -3,54 +3,87 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 
+from skillweave.collecting.collector import TOLD
 from skillweave.types import Array, SkillweaveError
 
 WINDOW = 100  # episodes in the reported means
 
 
 @dataclass
+class InfoTally:
+    """Which logged keys of ``info`` occurred where episodes ended."""
+
+    keys: tuple[str, ...] = ()
+    """Those that are logged."""
+    ended: int = 0
+    """Episodes."""
+    found: set[str] = field(default_factory=set)
+    """Logged keys with a number in any of them."""
+    others: set[str] = field(default_factory=set)
+    """All keys where a logged one was absent."""
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Logged keys without a number so far."""
+        return tuple(key for key in self.keys if key not in self.found)
+
+    def add(self, other: InfoTally) -> None:
+        """Take the episodes of another tally into account, too."""
+        self.keys, self.ended = other.keys, self.ended + other.ended
+        self.found |= other.found
+        self.others |= other.others
+
+
 class Episodes:
-    """Returns, lengths and successes of the latest episodes, for people to watch."""
+    """Numbers of the latest episodes, for people to watch.
 
-    returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    task_returns: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    lengths: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    successes: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    Args:
+        log_info: keys of ``info`` that are logged.
+    """
 
-    def extend(self, ended: Array) -> None:
-        """Take episodes (K, 4) into account, as ``Collected.episodes``; NaN: not told."""
-        windows = self.returns, self.task_returns, self.lengths, self.successes
-        for column, window in enumerate(windows):
+    def __init__(self, log_info: Sequence[str] = ()) -> None:
+        names = "return", "task_return", "length", "success", *(f"info/{k}" for k in log_info)
+        self._windows: dict[str, deque[float]] = {k: deque(maxlen=WINDOW) for k in names}
+        """By the name of the metric, in the order of the columns of ``Collected.episodes``."""
+        self.tally = InfoTally(tuple(log_info))
+
+    def extend(self, ended: Array, info_keys: frozenset[str] = frozenset()) -> None:
+        """Take episodes into account.
+
+        Args:
+            ended: (K, 4 + I), as ``Collected.episodes``; NaN: not told.
+            info_keys: as ``Collected.info_keys``.
+        """
+        for column, window in enumerate(self._windows.values()):
             known = ended[:, column]
             window.extend(known[~np.isnan(known)].tolist())
+        if self.tally.keys:
+            logged = {k: ended[:, column] for column, k in enumerate(self.tally.keys, TOLD)}
+            found = {key for key, numbers in logged.items() if not np.isnan(numbers).all()}
+            self.tally.add(InfoTally(self.tally.keys, len(ended), found, set(info_keys)))
 
     def state(self) -> dict[str, Array]:
         """The latest episodes, to go on from."""
-        return {k: np.array(v, np.float64) for k, v in vars(self).items()}
+        return {k: np.array(v, np.float64) for k, v in self._windows.items()}
 
     def load(self, state: dict[str, Array]) -> None:
         """The inverse of ``state``."""
-        for name, window in vars(self).items():
+        for name, window in self._windows.items():
             if state[name].ndim != 1 or not np.isfinite(state[name]).all():
-                raise ValueError(f"{name} of the latest episodes are no row of numbers")
+                raise ValueError(f"{name} of the latest episodes is no row of numbers")
             window.clear()
             window.extend(state[name].tolist())
 
     def summary(self) -> dict[str, float]:
         """Means over the window; empty before the first episode ended."""
-        named: dict[str, deque[Any]] = {
-            "return": self.returns,
-            "task_return": self.task_returns,
-            "length": self.lengths,
-            "success": self.successes,
-        }
-        return {k: float(np.mean(v)) for k, v in named.items() if v}
+        return {k: float(np.mean(v)) for k, v in self._windows.items() if v}
 
 
 @dataclass

@@ -23,7 +23,12 @@ class PeriodicEvaluation:
         self._counted = 0
 
     def due(
-        self, since: int, steps: int, play: Callable[[Collector, Seeds], Array]
+        self,
+        since: int,
+        steps: int,
+        play: Callable[[Collector, Seeds], Array],
+        *,
+        also: bool = False,
     ) -> dict[str, float]:
         """Evaluate if it is time to, and return metrics; else none.
 
@@ -32,8 +37,9 @@ class PeriodicEvaluation:
             steps: at this one.
             play: plays an episode in each environment of an arena: (n, 4), as
                 ``Collected.episodes``.
+            also: evaluate at this report in any case, if there are evaluations at all.
         """
-        if self._every is None or not crossed(self._every, since, steps):
+        if self._every is None or not (also or crossed(self._every, since, steps)):
             return {}
         self._arena = self._arena or self._scene.collector(self._episodes, None)
         told = play(self._arena, self._seeds)

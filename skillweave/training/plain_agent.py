@@ -106,6 +106,8 @@ class PlainAgent:
             "checkpoint_every": how.checkpoint_every,
             "eval_every": how.eval_every,
             "eval_episodes": how.eval_episodes,
+            "keep": how.keep,
+            "log_info": how.log_info,
             "needs_recipe": code,
             "resume_needs_recipe": code or stage.learns_by_code or self.spec.engine != "auto",
             "stages": [stage.entry()],

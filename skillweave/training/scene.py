@@ -52,6 +52,16 @@ class Scene:
     collector: MakeCollector
     row_steps: int = 1
     """Environment steps of a row of experience, about."""
+    log_info: tuple[str, ...] = ()
+    """Keys of ``info`` that collectors of learners log."""
+
+    def learners_collector(
+        self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
+    ) -> Collector:
+        """Return a collector whose episodes are reported; arguments are as of ``collector``."""
+        found = self.collector(num_envs, acting, first, shared)
+        found.log_info = self.log_info
+        return found
 
 
 def skill_scene(

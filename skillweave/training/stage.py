@@ -229,8 +229,16 @@ class Stage:
         return entry
 
 
-def check_stages(entries: Sequence[dict[str, Any]], eval_every: int | None) -> None:
+def check_stages(
+    entries: Sequence[dict[str, Any]], eval_every: int | None, keep: str = "last"
+) -> None:
     """Raise a SkillweaveError where a stage of a manifest could not do what it is to do."""
+    alone = any(entry.get("evolution") is None for entry in entries)
+    if keep == "best" and eval_every is None and alone:
+        raise SkillweaveError(
+            "keep is 'best', but nothing is evaluated while it trains: set eval_every to the "
+            "environment steps between evaluations"
+        )
     for entry in entries:
         where, population = f"stage {entry['name']!r}", entry.get("evolution")
         try:

@@ -8,13 +8,20 @@ from typing import Any, Protocol, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.messages import close_matches
 from skillweave.reading import shown
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.kept import best_words
 from skillweave.runs.starts import drop_starts
 from skillweave.runs.states import drop_states, learns_again, save_state
+from skillweave.training.callback import TrainCallback
+from skillweave.training.episodes import InfoTally
+from skillweave.training.keep_best import KeepBest
 from skillweave.types import SkillweaveError
 
+ENOUGH = 20
+"""Episodes after which a logged key of ``info`` that never occurred is reported."""
 T = TypeVar("T")
 START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
 """Where a stage stands before its first update."""
@@ -69,6 +76,7 @@ class StageLog:
         self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: Mapping[str, Any]
     ) -> None:
         self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), dict(at)
+        self._callbacks = [x for x in listeners if isinstance(x, TrainCallback)]
         run.rewind(self.entry | self.at)
         self.entry.update(run.line_bytes() | self.entry, status="training")
         run.save()
@@ -83,6 +91,11 @@ class StageLog:
         self.run.log(now | {"seconds": round(seconds, 4)} | metrics)
         for listener in self.listeners:
             listener.tick(name, steps, seconds, metrics)
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether a callback has asked to end the stage."""
+        return any(callback.stopped for callback in self._callbacks)
 
     def stands(self, update: int, steps: int, seconds: float) -> None:
         """Training stands here, and a checkpoint of it is written."""
@@ -119,6 +132,37 @@ class StageLog:
         kept = ("update", "steps", "evaluation_steps", "seconds", "metrics")
         header = {"stage": self.entry["name"]} | {k: self.at[k] for k in kept} | more
         self.run.save_checkpoint(state, header, extra)
+        for callback in self._callbacks:
+            callback.checkpoint(self.entry["name"], self.at["steps"], self.at["metrics"])
+
+    def tell_absent(self, tally: InfoTally, *, over: bool) -> None:
+        """Say once in a run which logged keys of ``info`` never occurred.
+
+        Args:
+            over: the stage is, so there are no more episodes to wait for.
+        """
+        if not tally.absent or not tally.ended or (tally.ended < ENOUGH and not over):
+            return
+        absent = [key for key in tally.absent if key not in self.run.told_absent]
+        self.run.told_absent |= set(absent)
+        others = sorted(tally.others - set(absent))
+        there = f"its keys there were {', '.join(others)}" if others else "it was empty there"
+        for key in absent:
+            self.tell(
+                f"none of {tally.ended} episodes ended with a number in info[{key!r}] (log_info); "
+                f"{there}.{close_matches(key, others)}"
+            )
+
+    def stopped(self) -> None:
+        """The stage ends here, as a callback has asked for."""
+        self.entry["stopped"] = {"steps": self.at["steps"]}
+        self.tell(f"the callback returned False after {self.at['steps']:,} steps: it ends here")
+
+    def kept_best(self, best: KeepBest) -> None:
+        """The stage ends with the weights of its best evaluation."""
+        self.entry["best"] = {"steps": best.steps, "of": best.of, "value": best.value}
+        self.at["metrics"] = self.at["metrics"] | best.metrics
+        self.tell(best_words(self.entry["best"]))
 
     def reached(self, value: float) -> None:
         """The stage has reached its target and ends here."""

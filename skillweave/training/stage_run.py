@@ -13,6 +13,7 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
+from skillweave.training.keep_best import KeepBest
 from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Target
 from skillweave.training.stage_log import StageLog
@@ -51,6 +52,13 @@ class StageRun:
         """Where the stage may end early."""
         told = self.entry.get("target")
         return None if told is None else Target(**told)
+
+    @property
+    def best(self) -> KeepBest | None:
+        """What keeps the best weights; None: the last ones count."""
+        if self.run.manifest.get("keep") != "best":
+            return None
+        return KeepBest("return" if self.target is None else self.target.of)
 
 
 class StageLearner(Protocol):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,6 +24,7 @@ from skillweave.seeding import Seeds
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.interrupts import deferred
+from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.loop import Progress, Saved, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
@@ -62,7 +64,8 @@ class OneAgent:
             self.maker(), config.num_envs, workers, 1, scene.name
         )
         self._open.callback(self.collectors.close)
-        self.episodes = Episodes()
+        self.episodes = Episodes(scene.log_info)
+        self.best = stage.best
         return fresh
 
     def make_agents(self) -> Any:
@@ -115,13 +118,23 @@ class OneAgent:
     def save(self, extra: dict[str, Tensor], log: StageLog) -> None:
         """Write a checkpoint; ``extra`` is what else resuming needs."""
         (stack,) = self.learner.stacks
-        log.save(state_to(stack.state, "cpu"), extra)
+        log.save(state_to(stack.state, "cpu"), extra | self.best_tensors(), **self.best_header())
+
+    def best_tensors(self) -> dict[str, Tensor]:
+        """What a checkpoint holds of the best weights."""
+        return {} if self.best is None else self.best.tensors()
+
+    def best_header(self) -> dict[str, Any]:
+        """What its header says of them."""
+        return {} if self.best is None else self.best.header()
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says."""
         self.learner = self.learner_from(state, extra, log)
         self.at = at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
         self._steps_before = at.steps
+        if self.best is not None:
+            self.best.load(log.at, extra, self.states(), str(log.run.path))
         # Where the budget is spent nothing is collected, and the last checkpoint has no episodes.
         if extra and at.steps < self.stage.budget:
             learner, collectors, episodes = self.learner, self.collectors, self.episodes
@@ -135,16 +148,25 @@ class OneAgent:
         def on_tick(tick: Tick) -> None:
             log.tell_begun_anew(self.collectors.begun_anew, self.collectors.num_envs)
             self.collectors.begun_anew = 0
-            found = self.evaluation.due(tick.since, tick.steps, self.play)
+            log.tell_absent(self.episodes.tally, over=False)
+            # Where the best is kept, the last weights must have their chance.
+            last = self.best is not None and tick.steps >= self.stage.budget
+            found = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
             log.at["evaluation_steps"] += self.evaluation.spent()
+            if self.best is not None:
+                self.best.see(found, tick.steps, self.states)
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
+            # No checkpoint where it ends: a run resumed from the one before comes here again.
             if target is not None and target.reached(found, self.stage.name) is not None:
-                # No checkpoint: a run resumed from the one before comes here again.
                 raise _TargetReached
+            if log.stop_requested:
+                raise _Stopped
 
         def on_checkpoint(saved: Saved) -> None:
             log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
             self.save(saved.extra, log)
+            if log.stop_requested:
+                raise _Stopped
 
         try:
             train(
@@ -158,16 +180,28 @@ class OneAgent:
                 on_tick=on_tick,
                 on_checkpoint=on_checkpoint,
             )
-        except _TargetReached:
-            assert target is not None
+        except (_TargetReached, _Stopped) as end:
             # What was collected since the update was made, too.
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
-            log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
+            if isinstance(end, _Stopped):
+                log.stopped()
+            else:
+                assert target is not None
+                log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
         else:
             self.save({}, log)  # all is learnt, should writing the policy fail
             if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
                 log.tell_learnt_nothing()
+        log.tell_absent(self.episodes.tally, over=True)
+        if self.best is not None and self.best.metrics:
+            self._end_with(self.best)
+            log.kept_best(self.best)
         return self.policies()
+
+    def _end_with(self, best: KeepBest) -> None:
+        """Let all who learn have what they had at the best evaluation."""
+        for stack, state in zip(self.learner.stacks, best.states.values(), strict=True):
+            stack.state = state_to(state, stack.state.params.device)
 
     def _learnt_nothing(self) -> bool:
         """Whether its weights are those that it began with."""
@@ -182,11 +216,15 @@ class OneAgent:
 
 
 def _collector(scene: Scene, algorithm: Algorithm, num_envs: int, first: int) -> Collector:
-    return scene.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
+    return scene.learners_collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
 
 
 class _TargetReached(Exception):
     """Ends a loop: what it has learnt is good enough."""
+
+
+class _Stopped(Exception):
+    """Ends a loop: a callback has asked for it."""
 
 
 def train_stage(
@@ -212,7 +250,10 @@ def train_stage(
         drop_starts(run, stage.name)  # it may have been killed just before
         return run.load_policies(stage.name)
     known = policies or {}
-    learner = make_learner(StageRun(entry, run, seeds, stage.scene(known), known))
+    scene = stage.scene(known)
+    if keys := run.manifest.get("log_info"):
+        scene = replace(scene, log_info=tuple(keys))
+    learner = make_learner(StageRun(entry, run, seeds, scene, known))
     evolves = entry.get("evolution") is not None
     with deferred("at the end of this generation" if evolves else "after this round"):
         try:

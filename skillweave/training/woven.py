@@ -265,7 +265,7 @@ class WovenAgents(OneAgent):
         states = {"counts": torch.tensor(list(self.learner.counts.values()))}
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
-        log.save(None, extra | states)
+        log.save(None, extra | states | self.best_tensors(), **self.best_header())
 
 
 def _collector(
@@ -275,7 +275,9 @@ def _collector(
     num_envs: int,
     first: int,
 ) -> Collector:
-    return _woven(scene, algorithms, margins, make_engine(scene.spec, num_envs, first=first))
+    found = _woven(scene, algorithms, margins, make_engine(scene.spec, num_envs, first=first))
+    found.log_info = scene.log_info
+    return found
 
 
 def _woven(

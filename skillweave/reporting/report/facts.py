@@ -8,13 +8,13 @@ from typing import Any
 from skillweave.reporting.report.numbers import number
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.kept import kept_words
+from skillweave.runs.kept import best_words, kept_words
 from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
     "steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers",
-    "succeeded", "compared", "greedy_judged",
+    "succeeded", "compared", "greedy_judged", "stopped", "best",
 }  # fmt: skip
 """Of a stage's entry what training wrote, or what follows from settings of the hierarchy."""
 
@@ -62,6 +62,10 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
         notes = []
         if reached := entry.get("reached"):
             notes.append(f"target reached after {reached['steps']:,} steps")
+        if stopped := entry.get("stopped"):
+            notes.append(f"a callback ended it after {stopped['steps']:,} steps")
+        if best := entry.get("best"):
+            notes.append(best_words(best))
         if kept := entry.get("kept"):
             notes.append(kept_words(kept))
         if winner := entry.get("winner"):
@@ -119,6 +123,7 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
         "checkpoint_every",
         "eval_every",
         "eval_episodes",
+        "keep",
     )
     found |= {k: m[k] for k in told if k in m}
     for skill in m.get("skills", ()):

@@ -1,0 +1,152 @@
+"""A user's function that sees each report of training and each checkpoint, and may stop a stage."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from skillweave.arguments import checked_names
+from skillweave.messages import short
+from skillweave.runs.command_words import saved_words
+from skillweave.runs.directory import RunDirectory
+from skillweave.tracebacks import place
+from skillweave.types import SkillweaveError
+
+
+@checked_names
+@dataclass(frozen=True)
+class TrainEvent:
+    """A report of training, or a checkpoint, as ``train(callback=...)`` gets it."""
+
+    kind: Literal["report", "checkpoint"]
+    """A report comes after each update, with replay about every 1,000 steps; a checkpoint when it
+    is written."""
+    stage: str
+    """The stage that trains: "agent", "selector", "together" or a skill's name."""
+    steps: int
+    """Environment steps of this stage so far."""
+    budget: int
+    """Environment steps that this stage may take."""
+    total_steps: int
+    """Environment steps of all stages so far."""
+    progress: float
+    """Share of the whole run's budget that is done, from 0 to 1; stages that ended early count
+    whole."""
+    metrics: dict[str, float]
+    """The numbers of the report, as in ``metrics.jsonl``; of a checkpoint, those of the report
+    before it. ``eval_return`` and ``eval_success`` are there where an evaluation was due."""
+    run_dir: Path
+    """The run's directory."""
+
+
+Callback = Callable[[TrainEvent], Any]
+"""A function of one event; where it returns False, the stage ends."""
+
+
+class TrainCallback:
+    """The listener that calls a user's function.
+
+    Args:
+        function: checked by ``check_callback``.
+        run: what trains.
+    """
+
+    def __init__(self, function: Callback, run: RunDirectory) -> None:
+        self._function, self._run = function, run
+        self.stopped = False
+        """The function has returned False in this stage."""
+
+    def stage(self, name: str, budget: int) -> None:
+        """A stage begins, or goes on."""
+        self.stopped = False
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """Call the function with a report."""
+        self._call("report", name, steps, metrics)
+
+    def checkpoint(self, name: str, steps: int, metrics: Mapping[str, float | None]) -> None:
+        """Call the function with a checkpoint."""
+        self._call("checkpoint", name, steps, metrics)
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """A stage is over; no event."""
+
+    def message(self, text: str) -> None:
+        """Messages are no events."""
+
+    def _call(
+        self,
+        kind: Literal["report", "checkpoint"],
+        name: str,
+        steps: int,
+        metrics: Mapping[str, float | None],
+    ) -> None:
+        event = self._event(kind, name, steps, metrics)
+        try:
+            answer = self._function(event)
+        except Exception as error:
+            # The same exception, so that Optuna and others still catch their own.
+            where = place(error)
+            error.add_note(
+                "The callback of train() raised this"
+                + (f" ({where})" if where else "")
+                + f", so training stopped. The run is {saved_words(self._run)}; go on with: "
+                f"resume({str(self._run.path)!r}, callback=...)"
+            )
+            raise
+        if isinstance(answer, bool | np.bool_) and not answer:
+            self.stopped = True
+
+    def _event(
+        self,
+        kind: Literal["report", "checkpoint"],
+        name: str,
+        steps: int,
+        metrics: Mapping[str, float | None],
+    ) -> TrainEvent:
+        stages = self._run.manifest["stages"]
+        done = [s for s in stages if s["status"] == "done"]
+        budget = int(self._run.stage(name)["budget"])
+        passed = sum(int(s["budget"]) for s in done) + min(steps, budget)
+        return TrainEvent(
+            kind=kind,
+            stage=name,
+            steps=steps,
+            budget=budget,
+            total_steps=sum(int(s["steps"]) for s in done) + steps,
+            progress=passed / sum(int(s["budget"]) for s in stages),
+            metrics={k: float(v) for k, v in metrics.items() if v is not None},
+            run_dir=self._run.path,
+        )
+
+
+def check_callback(callback: Any) -> None:
+    """Raise a SkillweaveError where ``callback`` is no function of one event, and not None."""
+    if callback is None:
+        return
+    advice = "give a function of one event: def callback(event): ..."
+    if not callable(callback):
+        raise SkillweaveError(f"callback is {short(callback)}; {advice}")
+    if isinstance(callback, type):
+        raise SkillweaveError(
+            f"callback is the class {callback.__name__}; give a function of one event, or an "
+            "object of a class with __call__(self, event)"
+        )
+    if inspect.iscoroutinefunction(callback) or inspect.isgeneratorfunction(callback):
+        kind = "a generator" if inspect.isgeneratorfunction(callback) else "an async function"
+        raise SkillweaveError(f"callback is {kind}, which would not run when called; {advice}")
+    try:
+        signature = inspect.signature(callback)
+    except (TypeError, ValueError):  # of some functions written in C
+        return
+    try:
+        signature.bind(object())
+    except TypeError:
+        raise SkillweaveError(
+            f"callback takes {signature}, but it is called with one event: def callback(event): ..."
+        ) from None
