@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -43,9 +44,10 @@ class KeepBest:
             steps: of the stage.
             states: returns what learners have learnt now.
         """
-        if f"eval_{self.of}" not in evaluation:
+        value = evaluation.get(f"eval_{self.of}", math.nan)
+        if math.isnan(value):  # no evaluation, or none of its episodes could start
             return
-        if self.metrics and not self._rank(evaluation) >= self._rank(self.metrics):
+        if self.metrics and self._rank(evaluation) < self._rank(self.metrics):
             return
         self.steps, self.metrics = steps, dict(evaluation)
         # Learners change their tensors in place.

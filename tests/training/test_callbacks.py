@@ -1,0 +1,313 @@
+"""``train(callback=...)``: what a callback gets, how it stops a stage, what its exceptions do."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_runs import OFF, ON, Balance, Left, Push, assert_same, lines
+
+import skillweave as sw
+from skillweave import Agent, Apart, EnvSpec, Evolution, Hierarchy, SkillweaveError, TrainEvent
+from skillweave.runs.directory import RunDirectory
+from skillweave.types import Interrupted
+
+SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)
+EVALUATED: dict[str, Any] = {"eval_every": 200, "eval_episodes": 2, "checkpoint_every": 150}
+
+
+def agent(steps: int = 640, algorithm: Any = ON) -> Agent:
+    return Agent(SYNC, algorithm, steps)
+
+
+def apart() -> Hierarchy:
+    """Two skills that learn, then the selector: 320 steps each."""
+    return Hierarchy(
+        SYNC,
+        [Left(), Balance(), Push()],
+        algorithm=ON,
+        selector=ON,
+        call_steps=6,
+        learn="apart",
+        apart=Apart(skill_steps=320, selector_steps=320),
+    )
+
+
+def never(event: TrainEvent) -> None:
+    raise AssertionError(f"called with {event}")
+
+
+class TrialPruned(Exception):
+    """Stands for Optuna's."""
+
+
+def test_a_callback_gets_each_report_and_each_checkpoint_as_the_run_has_them(
+    tmp_path: Path,
+) -> None:
+    events: list[TrainEvent] = []
+    agent().train(tmp_path / "run", quiet=True, callback=events.append, **EVALUATED)
+    reports = [e for e in events if e.kind == "report"]
+    checkpoints = [e for e in events if e.kind == "checkpoint"]
+    assert len(reports) + len(checkpoints) == len(events)
+    assert len(checkpoints) == 4 + 1, "at 160, 320, 480, ... steps, and at the end"
+    written = lines(tmp_path / "run")
+    assert [(e.stage, e.steps) for e in reports] == [(w["stage"], w["steps"]) for w in written]
+    for event, line in zip(reports, written, strict=True):
+        rest = {k: v for k, v in line.items() if k not in ("stage", "update", "steps", "seconds")}
+        assert event.metrics == rest
+        assert {type(v) for v in event.metrics.values()} == {float}
+        assert (event.budget, event.total_steps) == (640, event.steps)
+        assert event.progress == event.steps / 640
+        assert event.run_dir == tmp_path / "run"
+    assert [e.steps for e in reports if "eval_return" in e.metrics] == [224, 416, 608]
+    before = [events[i - 1] for i, e in enumerate(events) if e.kind == "checkpoint"]
+    assert [e.metrics for e in checkpoints] == [e.metrics for e in before]
+
+
+def test_steps_and_progress_count_all_stages(tmp_path: Path) -> None:
+    events: list[TrainEvent] = []
+    apart().train(tmp_path / "run", quiet=True, callback=events.append)
+    assert list(dict.fromkeys(e.stage for e in events)) == ["left", "balance", "selector"]
+    total = [e.total_steps for e in events]
+    assert total == sorted(total)
+    assert total[-1] == 960
+    assert [e.progress for e in events] == [e.total_steps / 960 for e in events]
+    assert {e.steps for e in events if e.stage == "balance"} <= set(range(321))
+
+
+def test_a_callback_changes_nothing_but_when_it_stops(tmp_path: Path) -> None:
+    def meddle(event: TrainEvent) -> str:
+        torch.manual_seed(5)
+        np.random.seed(5)  # noqa: NPY002  # as users do
+        random.seed(5)
+        torch.rand(7)
+        event.metrics.clear()
+        return ""  # not False
+
+    for declare, name in ((agent, "agent"), (lambda: agent(600, OFF), "dqn")):
+        declare().train(tmp_path / name, quiet=True, **EVALUATED)
+        declare().train(tmp_path / f"{name}-2", quiet=True, callback=meddle, **EVALUATED)
+        assert_same(tmp_path / f"{name}-2", tmp_path / name)
+
+
+def stops_at(steps: int, answer: Any = False, kind: str = "report") -> Callable[[TrainEvent], Any]:
+    return lambda event: answer if event.steps >= steps and event.kind == kind else None
+
+
+@pytest.mark.parametrize("answer", [False, np.bool_(False)], ids=["False", "numpy's"])
+def test_false_ends_a_plain_agent_with_what_it_has_learnt(answer: Any, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    run = agent().train(path, quiet=True, callback=stops_at(300, answer))
+    (entry,) = run.info()["stages"]
+    assert entry["status"] == "done"
+    assert 300 <= entry["stopped"]["steps"] == entry["steps"] < 400
+    assert lines(path)[-1]["steps"] == 320
+    assert len(run.evaluate(2).returns) == 2
+    assert not list(path.glob("checkpoint*"))
+    again = agent().resume(path, quiet=True, callback=never)
+    assert again.info()["stages"] == run.info()["stages"]
+
+
+def test_none_and_other_values_do_not_stop(tmp_path: Path) -> None:
+    for i, answer in enumerate((None, 0, True, "")):
+        run = agent(160).train(tmp_path / str(i), quiet=True, callback=stops_at(0, answer))
+        assert "stopped" not in run.info()["stages"][0]
+
+
+def test_false_at_a_checkpoint_ends_the_stage_too(tmp_path: Path) -> None:
+    run = agent().train(
+        tmp_path / "run", quiet=True, callback=stops_at(300, kind="checkpoint"), **EVALUATED
+    )
+    assert 300 <= run.info()["stages"][0]["steps"] < 400
+
+
+def test_false_ends_one_stage_and_the_next_one_starts(tmp_path: Path) -> None:
+    seen: list[str] = []
+
+    def stop(event: TrainEvent) -> bool:
+        seen.append(event.stage)
+        return not (event.stage == "left" and event.steps >= 100)
+
+    run = apart().train(tmp_path / "run", quiet=True, callback=stop)
+    steps = {entry["name"]: entry["steps"] for entry in run.info()["stages"]}
+    assert steps["left"] < 200
+    assert steps["balance"] == steps["selector"] == 320
+    assert "stopped" not in run.info()["stages"][1]
+    assert run.policy.labels == ("left", "balance", "push")
+
+
+def test_false_while_all_learn_together_ends_the_run_judged(tmp_path: Path) -> None:
+    hierarchy = Hierarchy(
+        SYNC, [Left(), Push()], algorithm=ON, selector=ON, call_steps=6, steps=640
+    )
+    run = hierarchy.train(tmp_path / "run", quiet=True, callback=stops_at(200))
+    (entry,) = run.info()["stages"]
+    assert entry["steps"] < 400
+    assert "kept" in entry
+    assert len(run.evaluate(2).returns) == 2
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_false_ends_a_population_after_its_generation(workers: int, tmp_path: Path) -> None:
+    env = EnvSpec("CartPole-v1", engine="sync", workers=workers)
+    seen: list[int] = []
+
+    def stop(event: TrainEvent) -> bool:
+        seen.append(event.steps)
+        return event.steps < 700
+
+    run = Agent(env, ON, 2_000).train(
+        tmp_path / "run", quiet=True, evolve=Evolution(2, 4, 2), callback=stop
+    )
+    (entry,) = run.info()["stages"]
+    assert entry["status"] == "done"
+    assert 700 <= entry["stopped"]["steps"] == entry["steps"]
+    assert entry["winner"]["generations"] < 4
+    generations = {
+        line["generation"] for line in RunDirectory.open(tmp_path / "run").lineage.read()
+    }
+    assert len(generations) == entry["winner"]["generations"], "no generation is left half done"
+    assert len(run.evaluate(2).returns) == 2
+
+
+def test_false_at_a_populations_checkpoint(tmp_path: Path) -> None:
+    run = Agent(SYNC, ON, 2_000).train(
+        tmp_path / "run",
+        quiet=True,
+        evolve=Evolution(2, 4, 2),
+        callback=stops_at(700, kind="checkpoint"),
+    )
+    (entry,) = run.info()["stages"]
+    assert entry["stopped"]["steps"] == entry["steps"] >= 700
+    assert entry["winner"]["generations"] < 4
+
+
+@pytest.mark.parametrize("error", [TrialPruned(), ValueError("no"), SkillweaveError("mine")])
+def test_an_exception_passes_through_and_leaves_a_run_to_resume(
+    error: Exception, tmp_path: Path
+) -> None:
+    def fail(event: TrainEvent) -> None:
+        if event.steps > 400:
+            raise error
+
+    agent().train(tmp_path / "whole", quiet=True, **EVALUATED)
+    path = tmp_path / "run"
+    with pytest.raises(type(error)) as caught:
+        agent().train(path, quiet=True, callback=fail, **EVALUATED)
+    assert caught.value is error
+    (note,) = error.__notes__
+    line = fail.__code__.co_firstlineno + 2
+    assert f"{Path(__file__).name}, line {line}" in note
+    assert "saved at 320 steps of agent" in note
+    assert f"resume({str(path)!r}, callback=...)" in note
+    error.__notes__.clear()
+    agent().resume(path, quiet=True)
+    assert_same(path, tmp_path / "whole")
+
+
+def test_an_exception_in_the_first_report_of_a_later_stage(tmp_path: Path) -> None:
+    def fail(event: TrainEvent) -> None:
+        if event.stage == "selector":
+            raise TrialPruned
+
+    apart().train(tmp_path / "whole", quiet=True)
+    with pytest.raises(TrialPruned) as caught:
+        apart().train(tmp_path / "run", quiet=True, callback=fail)
+    assert "saved after balance" in caught.value.__notes__[0]
+    events: list[TrainEvent] = []
+    apart().resume(tmp_path / "run", quiet=True, callback=events.append)
+    assert {e.stage for e in events} == {"selector"}
+    assert events[0].total_steps == 640 + events[0].steps
+    assert_same(tmp_path / "run", tmp_path / "whole")
+
+
+def test_a_keyboard_interrupt_of_a_callback_is_one(tmp_path: Path) -> None:
+    def stop(event: TrainEvent) -> None:
+        if event.steps > 400:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match="saved at 320 steps"):
+        agent().train(tmp_path / "run", quiet=True, callback=stop, **EVALUATED)
+    assert isinstance(Interrupted(), KeyboardInterrupt)
+
+
+def test_optuna_prunes_by_a_callback(tmp_path: Path) -> None:
+    optuna = pytest.importorskip("optuna")
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+    def objective(trial: Any) -> float:
+        def prune(event: TrainEvent) -> None:
+            if event.kind == "report" and "eval_return" in event.metrics:
+                trial.report(event.metrics["eval_return"], event.total_steps)
+                if trial.number:
+                    raise optuna.TrialPruned
+
+        run = agent().train(tmp_path / str(trial.number), quiet=True, callback=prune, **EVALUATED)
+        return run.evaluate(2).mean
+
+    study = optuna.create_study(direction="maximize")
+    study.optimize(objective, n_trials=2)
+    assert [t.state.name for t in study.trials] == ["COMPLETE", "PRUNED"]
+    assert list(study.trials[0].intermediate_values) == [224, 416, 608]
+
+
+def test_train_agent_takes_one(tmp_path: Path) -> None:
+    events: list[TrainEvent] = []
+    sw.train_agent(SYNC, ON, 160, tmp_path / "run", quiet=True, callback=events.append)
+    assert events
+
+
+class Wanders:
+    """As Stable-Baselines3's callbacks: an object that cannot be called."""
+
+
+async def asynchronous(event: TrainEvent) -> None: ...
+
+
+def generator(event: TrainEvent) -> Any:
+    yield event
+
+
+@pytest.mark.parametrize(
+    ("callback", "says"),
+    [
+        (3, r"callback is 3; give a function of one event: def callback\(event\)"),
+        (Wanders(), "callback is <.*Wanders object.*>; give a function of one event"),
+        (Wanders, "callback is the class Wanders; give a function of one event, or an object"),
+        (asynchronous, "callback is an async function, which would not run when called"),
+        (generator, "callback is a generator, which would not run when called"),
+        (lambda: None, r"callback takes \(\), but it is called with one event"),
+        (lambda a, b: None, r"callback takes \(a, b\), but it is called with one event"),
+    ],
+)
+def test_what_is_no_callback_is_refused_before_anything_is_written(
+    callback: Any, says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SkillweaveError, match=says):
+        agent().train(tmp_path / "run", callback=callback)
+    assert not (tmp_path / "run").exists()
+    agent(64).train(tmp_path / "other", quiet=True)
+    with pytest.raises(SkillweaveError, match=says):
+        agent(64).resume(tmp_path / "other", callback=callback)
+
+
+def test_functions_written_in_c_and_partial_ones_are_callbacks(tmp_path: Path) -> None:
+    events: dict[int, TrainEvent] = {}
+    agent(64).train(tmp_path / "a", quiet=True, callback=lambda e, seen=events: seen.update({1: e}))
+    agent(64).train(tmp_path / "b", quiet=True, callback=print)
+    assert events
+
+
+def test_a_run_says_that_a_callback_ended_it(tmp_path: Path) -> None:
+    from skillweave.cli.run_lines import run_lines
+    from skillweave.reporting.report.facts import stage_rows
+
+    agent().train(tmp_path / "run", quiet=True, callback=stops_at(300))
+    run = RunDirectory.open(tmp_path / "run")
+    assert any("a callback ended it after" in text for text in run_lines(run.manifest, [], "run"))
+    assert "a callback ended it after" in stage_rows(run, {})[0]["notes"]

@@ -1,0 +1,363 @@
+"""``train(log_info=...)``: numbers that the environment gives in ``info``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_runs import OFF, ON, Heard, assert_same, interrupt_at_checkpoint, lines, new_run
+from toys import Ledger
+
+from skillweave import (
+    Agent,
+    Apart,
+    EnvSpec,
+    Evolution,
+    Hierarchy,
+    Ray,
+    Skill,
+    SkillweaveError,
+    Together,
+    TrainDefaults,
+    train_agent,
+)
+from skillweave.cli import main
+from skillweave.envs.infos import info_keys, info_numbers
+from skillweave.envs.sync import SyncEnvs
+from skillweave.hierarchy import training
+from skillweave.runs.manifest import identity
+
+
+class Told(Ledger):
+    """A ledger with more in its info: its steps are ``t``."""
+
+    def step(self, action: int) -> Any:
+        obs, reward, terminated, truncated, info = super().step(action)
+        info |= {"late": self.t - 0.5, "flag": self.t > 2, "word": "text", "two": np.zeros(2)}
+        info |= {"one": np.array([2.0]), "none": None, "nan": np.nan, "far": np.inf}
+        if self.t == 1:
+            info["first"] = 1
+        if self.t > 2:
+            info["seldom"] = self.t
+        return obs, reward, terminated, truncated, info
+
+
+def spec(workers: int = 1) -> EnvSpec:
+    return EnvSpec(Told, engine="sync", workers=workers)
+
+
+class Place(gym.Wrapper[Any, Any, Any, Any]):
+    """Episodes that can be played again after a checkpoint."""
+
+    def step(self, action: Any) -> Any:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        info = {"place": float(obs[0])} | ({"right": 1} if obs[0] > 0 else {})
+        return obs, reward, terminated, truncated, info
+
+
+def place() -> gym.Env[Any, Any]:
+    return Place(gym.make("CartPole-v1"))
+
+
+class Odd(Skill):
+    """Acts for three steps at most."""
+
+    max_steps = 3
+
+    def reward(self, step):
+        return step.next_obs[:, 2]
+
+
+class Even(Odd):
+    """Acts for two."""
+
+    max_steps = 2
+
+
+def hierarchy(learn: str, algorithm: Any = ON, **how: Any) -> Hierarchy:
+    return Hierarchy(
+        spec(),
+        [Odd(), Even()],
+        algorithm=algorithm,
+        selector=ON,
+        call_steps=2,
+        learn=learn,  # type: ignore[arg-type]
+        apart=Apart(skill_steps=320, selector_steps=320),
+        together=Together(steps=320),
+        **how,
+    )
+
+
+def nested() -> Hierarchy:
+    inner = Hierarchy(spec(), [Odd(), Even()], algorithm=ON, selector=ON, call_steps=1)
+    return Hierarchy(
+        spec(), [inner.as_skill("inner"), Odd()], algorithm=ON, selector=ON, call_steps=2, steps=320
+    )
+
+
+KINDS = {
+    "ppo": lambda: Agent(spec(), ON, 320),
+    "dqn": lambda: Agent(spec(), OFF, 1_100),
+    "two processes": lambda: Agent(spec(2), ON, 320),
+    "together": lambda: hierarchy("together"),
+    "together, from replay": lambda: hierarchy("together", OFF),
+    "selector apart": lambda: hierarchy("apart"),
+    "nested": nested,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind: str, tmp_path: Path) -> None:
+    keys = ["t", "flag", "late"]
+    KINDS[kind]().train(tmp_path / "run", quiet=True, log_info=keys)
+    found = [x for x in lines(tmp_path / "run") if x["stage"] in ("agent", "selector", "together")]
+    assert found
+    for line in found:  # an episode's steps are its length
+        assert line["info/t"] == line["length"]
+        assert line["info/late"] == line["length"] - 0.5
+        assert 0.0 < line["info/flag"] < 1.0
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("algorithm", [ON, OFF], ids=["ppo", "dqn"])
+def test_populations_log_them(algorithm: Any, parts: int, tmp_path: Path) -> None:
+    if algorithm is OFF and parts > 1:
+        pytest.skip("members that learn from one buffer are in one part")
+    agent = Agent(spec(parts), algorithm, 4_400)
+    agent.train(tmp_path / "run", quiet=True, log_info=["t", "lat"], evolve=Evolution(2, 2, 4))
+    for line in lines(tmp_path / "run"):
+        assert line["info/t"] == line["length"]
+        assert "info/lat" not in line
+
+
+@pytest.mark.slow
+def test_actors_of_ray_log_them(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    agent = Agent(spec(2), ON, 320)
+    agent.train(tmp_path / "run", quiet=True, log_info=["t"], cluster=Ray(collectors=2))
+    for line in lines(tmp_path / "run"):
+        assert line["info/t"] == line["length"]
+
+
+@pytest.mark.filterwarnings("ignore:.*precision lowered")
+def test_pools_log_them(tmp_path: Path) -> None:
+    pytest.importorskip("envpool")
+    agent = Agent(EnvSpec("CartPole-v1", engine="envpool", workers=1), ON, 640)
+    agent.train(tmp_path / "run", quiet=True, log_info=["elapsed_step"])
+    for line in lines(tmp_path / "run"):
+        if "length" in line:
+            assert line["info/elapsed_step"] == line["length"]
+
+
+def test_in_a_skills_own_stage_the_end_of_its_call_counts(tmp_path: Path) -> None:
+    hierarchy("apart").train(tmp_path / "run", quiet=True, log_info=["t", "seldom"])
+    even = [x for x in lines(tmp_path / "run") if x["stage"] == "even"]
+    assert {x["info/t"] for x in even} == {2.0}
+    assert all("info/seldom" not in x for x in even), "it comes in step 3"
+
+
+def test_what_is_no_finite_number_is_left_out(tmp_path: Path) -> None:
+    Agent(spec(), ON, 320).train(
+        tmp_path / "run", quiet=True, log_info=["seldom", "none", "nan", "far", "one"]
+    )
+    for line in lines(tmp_path / "run"):
+        assert 3.0 <= line["info/seldom"] <= 4.0, "of the episodes in which it is"
+        assert line["info/one"] == 2.0
+        assert not {"info/none", "info/nan", "info/far"} & set(line)
+
+
+def said(declared: Any, path: Path, **how: Any) -> list[str]:
+    """Messages of a training."""
+    heard = Heard()
+    if isinstance(declared, Hierarchy):
+        run = new_run(declared, path, how=TrainDefaults(**how))
+    else:
+        from skillweave.runs.directory import RunDirectory
+
+        run = RunDirectory.create(path, declared.manifest(3, TrainDefaults(**how)))
+    training.train(declared, run, (heard,))
+    run.close()
+    return [text for text in heard.said if "log_info" in text]
+
+
+def test_a_key_that_never_occurs_is_said_once_with_those_that_do(tmp_path: Path) -> None:
+    found = said(hierarchy("apart"), tmp_path / "run", log_info=["lte", "t", "nan"])
+    assert len(found) == 2
+    keys = "far, flag, late, nested, none, one, seldom, t, two, word"
+    assert found[0].startswith("odd: none of ")
+    assert f"in info['lte'] (log_info); its keys there were {keys}. Close" in found[0]
+    assert "Close matches: late" in found[0]
+    assert "info['nan']" in found[1]
+
+
+def test_an_info_that_is_empty_is_said_to_be(tmp_path: Path) -> None:
+    agent = Agent(EnvSpec("CartPole-v1", engine="sync", workers=1), ON, 320)
+    (found,) = said(agent, tmp_path / "run", log_info=["fuel"])
+    assert found.endswith("in info['fuel'] (log_info); it was empty there.")
+
+
+@pytest.mark.parametrize(
+    ("key", "what"),
+    [
+        ("word", "of type str"),
+        ("two", r"an array of shape \(2,\)"),
+        ("nested", "of type dict"),
+    ],
+)
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_key_that_is_no_number_stops_the_training(
+    workers: int, key: str, what: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SkillweaveError, match=rf"info\['{key}'\] is {what} at the end of an ep"):
+        Agent(spec(workers), ON, 320).train(tmp_path / "run", quiet=True, log_info=[key])
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ("fuel", r"log_info is 'fuel'; it must be a list of keys: log_info=\['fuel'\]"),
+        (3, r"log_info is 3; it must be a list of keys: log_info=\['key'\]"),
+        ({"fuel": 1}, "log_info is {'fuel': 1}; it must be a list of keys"),
+        (["fuel", 3], "log_info has 3; each must be a key of info, such as 'distance'"),
+        ([""], "log_info has ''; each must be a key"),
+    ],
+)
+def test_wrong_lists_of_keys_are_refused(keys: Any, says: str, tmp_path: Path) -> None:
+    with pytest.raises(SkillweaveError, match=says):
+        train_agent(Told, ON, 320, tmp_path / "run", log_info=keys)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("kind", ["ppo", "dqn", "two processes", "together", "selector apart"])
+def test_a_resumed_run_logs_the_same(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def declare() -> Any:
+        declared = KINDS[kind]()
+        declared.env = replace(declared.env, env=place)
+        return declared
+
+    how: dict[str, Any] = {"log_info": ("place", "right"), "checkpoint_every": 70}
+    declare().train(tmp_path / "whole", quiet=True, **how)
+    with monkeypatch.context() as patch:
+        interrupt_at_checkpoint(patch, 2)
+        with pytest.raises(KeyboardInterrupt):
+            declare().train(tmp_path / "run", quiet=True, **how)
+    declare().resume(tmp_path / "run", quiet=True)
+    assert_same(tmp_path / "run", tmp_path / "whole")
+    assert {"info/place", "info/right"} <= set(lines(tmp_path / "run")[-1])
+
+
+def test_logging_changes_no_weights_and_no_identity(tmp_path: Path) -> None:
+    runs = [
+        Agent(spec(), ON, 320).train(tmp_path / f"{i}", quiet=True, log_info=keys)
+        for i, keys in enumerate([(), ("t", "t")])
+    ]
+    assert runs[0].info()["id"] == runs[1].info()["id"]
+    assert [run.info()["log_info"] for run in runs] == [[], ["t"]]
+    files = [(run.path / "policies/agent.safetensors").read_bytes() for run in runs]
+    assert files[0] == files[1]
+    first, second = (lines(run.path) for run in runs)
+    assert [{k: v for k, v in x.items() if k != "info/t"} | {"seconds": 0} for x in second] == [
+        x | {"seconds": 0} for x in first
+    ]
+
+
+def test_identity_counts_what_is_kept() -> None:
+    manifest = {"keep": "last", "log_info": ["a"], "seed": 0}
+    assert identity(manifest) == identity(manifest | {"log_info": []})
+    assert identity(manifest) != identity(manifest | {"keep": "best"})
+
+
+def test_numbers_of_an_info() -> None:
+    info = {"x": np.array([1, 2, 3]), "_x": np.array([True, False, True]), "_own": 1}
+    assert info_keys(info) == ("x", "_own")
+    np.testing.assert_array_equal(info_numbers(info, "x", np.array([2, 1]), 3), [3.0, np.nan])
+    assert info_numbers(info, "x", np.array([1]), 3) is None
+    assert info_numbers(info, "y", np.array([1]), 3) is None
+    with pytest.raises(SkillweaveError, match="of type int"):
+        info_numbers({"x": 3}, "x", np.array([0]), 3)
+
+
+class Mixed(gym.Env[Any, Any]):
+    """Its number is whole in some environments and not in others."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    made = 0
+
+    def __init__(self) -> None:
+        self.value = (False, 2, 0.5, None)[Mixed.made % 4]
+        Mixed.made += 1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), 0.0, False, False, {"x": self.value}
+
+
+def test_numbers_of_several_types_keep_their_values() -> None:
+    envs = SyncEnvs([Mixed] * 3, "mixed")
+    *_, info = envs.act(np.zeros(3, np.int64), np.arange(3))
+    np.testing.assert_array_equal(info["x"], [0.0, 2.0, 0.5])
+    Mixed.made = 1
+    envs = SyncEnvs([Mixed] * 3, "mixed")
+    *_, info = envs.act(np.zeros(3, np.int64), np.arange(3))
+    assert info["x"].tolist() == [2, 0.5, None]
+    np.testing.assert_array_equal(info_numbers(info, "x", np.arange(3), 3), [2, 0.5, np.nan])
+
+
+RECIPE = """
+import numpy as np
+import gymnasium as gym
+import skillweave as sw
+
+class Env(gym.Wrapper):
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return obs, reward, terminated, truncated, info | {"place": float(obs[0])}
+
+def make():
+    return Env(gym.make("CartPole-v1"))
+
+class Left(sw.Skill):
+    def reward(self, step):
+        return -step.next_obs[:, 0]
+
+class Right(sw.Skill):
+    def reward(self, step):
+        return step.next_obs[:, 0]
+
+small = sw.PPO(num_envs=4, n_steps=16, batch_size=32, network=sw.Network((8,)))
+hierarchy = sw.Hierarchy(
+    sw.EnvSpec(make, workers=1), [Left(), Right()], algorithm=small, selector=small, steps=320,
+    call_steps=5,
+)
+"""
+
+
+def test_the_command_line_logs_and_keeps(tmp_path: Path) -> None:
+    (tmp_path / "recipe.py").write_text(RECIPE)
+    words = ["train", str(tmp_path / "recipe.py"), "--evaluate", "0", "--quiet"]
+    best = ["--keep", "best", "--set", "train.eval_every=100", "--set", "train.eval_episodes=2"]
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main([*words, "-o", str(first), "--log-info", "place", *best]) == 0
+    assert "info/place" in lines(first)[-1]
+    (stage,) = manifest_of(first)["stages"]
+    assert stage["best"]["steps"] <= stage["steps"]
+    more = ["--set", "train.keep=best", "--set", "train.log_info=place, other"]
+    assert main([*words, "-o", str(second), *best[2:], *more]) == 0
+    assert manifest_of(second)["log_info"] == ["place", "other"]
+    assert manifest_of(second)["keep"] == "best"
+    assert main([*words, "-o", str(tmp_path / "third"), "--keep", "best"]) != 0
+
+
+def manifest_of(path: Path) -> dict[str, Any]:
+    from skillweave.runs.manifest import read_manifest
+
+    return read_manifest(path)
