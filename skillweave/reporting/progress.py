@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.reporting.displays import Display, Row, open_display
+from skillweave.training.episodes import INFO
 
 EVERY = 5.0
 """Seconds between two plain lines, at first."""
@@ -130,7 +131,8 @@ class Progress:
             part = f"{steps:,} of {budget:,} steps ({share:.0%})"
             seconds = self._left_in_all(name)
             in_all = f"{_clock(seconds)} left in all" if seconds else ""
-            told = ", ".join(filter(None, (part, result, speed, left, in_all)))
+            numbers = (f"{k} {v:.4g}" for k, v in metrics.items() if k.startswith(INFO))
+            told = ", ".join(filter(None, (part, result, *numbers, speed, left, in_all)))
             self._line(f"{self._numbered(name)}: {told}")
             if name in self._over:
                 for agent, _, acts, reward in _agents(metrics):
@@ -140,6 +142,9 @@ class Progress:
         self._display.put(Row(name, share, counted, result, speed, left))
         for agent, usage, acts, reward in _agents(metrics):
             self._display.put(Row(agent, usage, acts, reward, under=name))
+        for key, value in metrics.items():
+            if key.startswith(INFO):
+                self._display.put(Row(key, None, f"{value:.4g}", under=name))
         if self._several:
             self._put_total(name)
         self._display.draw()
@@ -261,6 +266,8 @@ def _agents(metrics: dict[str, float]) -> Iterator[tuple[str, float | None, str,
     """Yield who learns side by side: name, share of the steps in which it acts, both in words."""
     for key, value in metrics.items():
         name, _, what = key.rpartition(".")
+        if key.startswith(INFO):  # a key may have a dot of its own
+            continue
         if what == "usage":
             reward = metrics.get(f"{name}.reward")
             words = "" if reward is None else f"reward {reward:.3g} a step"

@@ -14,6 +14,8 @@ from skillweave.collecting.collector import TOLD
 from skillweave.types import Array, SkillweaveError
 
 WINDOW = 100  # episodes in the reported means
+INFO = "info/"
+"""How names of metrics begin that are values of ``info``."""
 
 
 @dataclass
@@ -49,7 +51,7 @@ class Episodes:
     """
 
     def __init__(self, log_info: Sequence[str] = ()) -> None:
-        names = "return", "task_return", "length", "success", *(f"info/{k}" for k in log_info)
+        names = "return", "task_return", "length", "success", *(INFO + k for k in log_info)
         self._windows: dict[str, deque[float]] = {k: deque(maxlen=WINDOW) for k in names}
         """By the name of the metric, in the order of the columns of ``Collected.episodes``."""
         self.tally = InfoTally(tuple(log_info))

@@ -80,7 +80,9 @@ def test_steps_and_progress_count_all_stages(tmp_path: Path) -> None:
     assert {e.steps for e in events if e.stage == "balance"} <= set(range(321))
 
 
-def test_a_callback_changes_nothing_but_when_it_stops(tmp_path: Path) -> None:
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("algorithm", [ON, OFF], ids=["ppo", "dqn"])
+def test_a_callback_changes_nothing_but_when_it_stops(algorithm: Any, tmp_path: Path) -> None:
     def meddle(event: TrainEvent) -> str:
         torch.manual_seed(5)
         np.random.seed(5)  # noqa: NPY002  # as users do
@@ -89,10 +91,9 @@ def test_a_callback_changes_nothing_but_when_it_stops(tmp_path: Path) -> None:
         event.metrics.clear()
         return ""  # not False
 
-    for declare, name in ((agent, "agent"), (lambda: agent(600, OFF), "dqn")):
-        declare().train(tmp_path / name, quiet=True, **EVALUATED)
-        declare().train(tmp_path / f"{name}-2", quiet=True, callback=meddle, **EVALUATED)
-        assert_same(tmp_path / f"{name}-2", tmp_path / name)
+    agent(600, algorithm).train(tmp_path / "without", quiet=True, **EVALUATED)
+    agent(600, algorithm).train(tmp_path / "with", quiet=True, callback=meddle, **EVALUATED)
+    assert_same(tmp_path / "with", tmp_path / "without")
 
 
 def stops_at(steps: int, answer: Any = False, kind: str = "report") -> Callable[[TrainEvent], Any]:
@@ -236,24 +237,36 @@ def test_a_keyboard_interrupt_of_a_callback_is_one(tmp_path: Path) -> None:
     assert isinstance(Interrupted(), KeyboardInterrupt)
 
 
-def test_optuna_prunes_by_a_callback(tmp_path: Path) -> None:
-    optuna = pytest.importorskip("optuna")
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
+class Trial:
+    """As Optuna's: it is told values by step, and says when there is no point in going on."""
 
-    def objective(trial: Any) -> float:
-        def prune(event: TrainEvent) -> None:
+    def __init__(self, number: int) -> None:
+        self.number, self.intermediate_values = number, dict[int, float]()
+
+    def report(self, value: float, step: int) -> None:
+        assert step not in self.intermediate_values, "Optuna warns of a step that comes twice"
+        self.intermediate_values[step] = float(value)
+
+    def should_prune(self) -> bool:
+        return self.number > 0
+
+
+def test_a_callback_prunes_trials_as_the_page_shows(tmp_path: Path) -> None:
+    states = []
+    for trial in (Trial(0), Trial(1)):
+
+        def prune(event: TrainEvent, trial: Trial = trial) -> None:
             if event.kind == "report" and "eval_return" in event.metrics:
                 trial.report(event.metrics["eval_return"], event.total_steps)
-                if trial.number:
-                    raise optuna.TrialPruned
+                if trial.should_prune():
+                    raise TrialPruned
 
-        run = agent().train(tmp_path / str(trial.number), quiet=True, callback=prune, **EVALUATED)
-        return run.evaluate(2).mean
-
-    study = optuna.create_study(direction="maximize")
-    study.optimize(objective, n_trials=2)
-    assert [t.state.name for t in study.trials] == ["COMPLETE", "PRUNED"]
-    assert list(study.trials[0].intermediate_values) == [224, 416, 608]
+        try:
+            agent().train(tmp_path / str(trial.number), quiet=True, callback=prune, **EVALUATED)
+            states.append(("COMPLETE", list(trial.intermediate_values)))
+        except TrialPruned:
+            states.append(("PRUNED", list(trial.intermediate_values)))
+    assert states == [("COMPLETE", [224, 416, 608]), ("PRUNED", [224])]
 
 
 def test_train_agent_takes_one(tmp_path: Path) -> None:

@@ -79,6 +79,7 @@ def evaluations(path: Path, stage: str) -> dict[int, float]:
     }
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", [WILD, replace(OFF, overlap=True)], ids=["ppo", "dqn"])
 def test_a_stage_ends_with_the_weights_of_its_best_evaluation(
     algorithm: Any, tmp_path: Path
@@ -108,7 +109,8 @@ def test_the_last_weights_are_evaluated_too(tmp_path: Path) -> None:
     assert evaluations(last.path, "agent") == {}
 
 
-@pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("learn", ["together", "apart", "apart, then together"])
 def test_every_stage_keeps_its_best_and_says_so(
     learn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,10 +151,8 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [k if k in ("ppo", "together") else pytest.param(k, marks=pytest.mark.slow) for k in KINDS],
-)
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_resumed_run_keeps_the_same(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

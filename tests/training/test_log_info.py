@@ -29,7 +29,9 @@ from skillweave.cli import main
 from skillweave.envs.infos import info_keys, info_numbers
 from skillweave.envs.sync import SyncEnvs
 from skillweave.hierarchy import training
-from skillweave.runs.manifest import identity
+from skillweave.reporting.report.curves import read_curves
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import identity, read_manifest
 
 
 class Told(Ledger):
@@ -103,6 +105,7 @@ KINDS = {
     "ppo": lambda: Agent(spec(), ON, 320),
     "dqn": lambda: Agent(spec(), OFF, 1_100),
     "two processes": lambda: Agent(spec(2), ON, 320),
+    "a population": lambda: Agent(spec(), ON, 2_000),
     "together": lambda: hierarchy("together"),
     "together, from replay": lambda: hierarchy("together", OFF),
     "selector apart": lambda: hierarchy("apart"),
@@ -110,7 +113,7 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "a population"])
 def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind: str, tmp_path: Path) -> None:
     keys = ["t", "flag", "late"]
     KINDS[kind]().train(tmp_path / "run", quiet=True, log_info=keys)
@@ -122,11 +125,11 @@ def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind: str, tmp_p
         assert 0.0 < line["info/flag"] < 1.0
 
 
-@pytest.mark.parametrize("parts", [1, 2])
-@pytest.mark.parametrize("algorithm", [ON, OFF], ids=["ppo", "dqn"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize(
+    ("algorithm", "parts"), [(ON, 1), (ON, 2), (OFF, 1)], ids=["ppo", "two parts", "dqn"]
+)
 def test_populations_log_them(algorithm: Any, parts: int, tmp_path: Path) -> None:
-    if algorithm is OFF and parts > 1:
-        pytest.skip("members that learn from one buffer are in one part")
     agent = Agent(spec(parts), algorithm, 4_400)
     agent.train(tmp_path / "run", quiet=True, log_info=["t", "lat"], evolve=Evolution(2, 2, 4))
     for line in lines(tmp_path / "run"):
@@ -176,8 +179,6 @@ def said(declared: Any, path: Path, **how: Any) -> list[str]:
     if isinstance(declared, Hierarchy):
         run = new_run(declared, path, how=TrainDefaults(**how))
     else:
-        from skillweave.runs.directory import RunDirectory
-
         run = RunDirectory.create(path, declared.manifest(3, TrainDefaults(**how)))
     training.train(declared, run, (heard,))
     run.close()
@@ -232,7 +233,10 @@ def test_wrong_lists_of_keys_are_refused(keys: Any, says: str, tmp_path: Path) -
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("kind", ["ppo", "dqn", "two processes", "together", "selector apart"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize(
+    "kind", ["ppo", "dqn", "two processes", "together", "selector apart", "a population"]
+)
 def test_a_resumed_run_logs_the_same(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,6 +246,7 @@ def test_a_resumed_run_logs_the_same(
         return declared
 
     how: dict[str, Any] = {"log_info": ("place", "right"), "checkpoint_every": 70}
+    how |= {"evolve": Evolution(2, 3, 4)} if kind == "a population" else {}
     declare().train(tmp_path / "whole", quiet=True, **how)
     with monkeypatch.context() as patch:
         interrupt_at_checkpoint(patch, 2)
@@ -358,6 +363,14 @@ def test_the_command_line_logs_and_keeps(tmp_path: Path) -> None:
 
 
 def manifest_of(path: Path) -> dict[str, Any]:
-    from skillweave.runs.manifest import read_manifest
-
     return read_manifest(path)
+
+
+def test_progress_and_curves_show_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = Agent(spec(), ON, 320).train(tmp_path / "run", log_info=["t"])
+    assert "info/t 3" in capsys.readouterr().err
+    directory = RunDirectory.open(run.path)
+    directory.log({"stage": "agent", "steps": 321, "info/one.usage": 0.5})
+    directory.close()
+    (curves,) = read_curves(directory)
+    assert {"info/t", "info/one.usage"} <= set(curves.points)

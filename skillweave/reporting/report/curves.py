@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from skillweave.runs.directory import RunDirectory
+from skillweave.training.episodes import INFO
 
 MOST_POINTS = 300
 TOLD_BY_ALL = ("stage", "update", "steps", "seconds")
@@ -47,7 +48,8 @@ def read_curves(run: RunDirectory) -> list[Curves]:
             number = isinstance(value, int | float) and not isinstance(value, bool)
             if key in TOLD_BY_ALL or not number or not math.isfinite(value):
                 continue
-            agent, dot, metric = key.rpartition(".")
+            # A key of info may have a dot of its own.
+            agent, dot, metric = ("", "", key) if key.startswith(INFO) else key.rpartition(".")
             agent = agent if dot else stage
             curves = found.setdefault((stage, agent), Curves(stage, agent))
             curves.points.setdefault(metric, []).append((int(line["steps"]), float(value)))
