@@ -183,11 +183,15 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return Lengths(*value)
         if origin is Sequence and isinstance(value, str):
             return tuple(part.strip() for part in value.split(","))
+        if origin is Sequence and isinstance(value, tuple | list):
+            return tuple(value)
         if origin is tuple and isinstance(value, tuple | list | int):
             return tuple(value) if isinstance(value, tuple | list) else (value,)
         if origin is typing.Literal and value in typing.get_args(option):
             return value
     wanted = getattr(hint, "__name__", str(hint).replace("typing.", ""))
+    if typing.get_origin(hint) is Sequence:
+        wanted = "names with commas between them"
     if typing.get_origin(hint) is typing.Literal:
         wanted = "one of " + ", ".join(map(str, typing.get_args(hint)))
     raise SkillweaveError(f"{name}={text}: expected {wanted}")
