@@ -126,7 +126,7 @@ def test_a_run_stopped_on_its_way_to_the_target_ends_as_if_it_had_not_been(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: Any, where: str
 ) -> None:
     # Evaluations every 100 steps tell 1, 2, 3, …; each falls together with a checkpoint.
-    def due(self: Any, since: int, steps: int, policy: Any) -> dict[str, float]:
+    def due(self: Any, since: int, steps: int, policy: Any, **how: Any) -> dict[str, float]:
         return {"eval_return": float(steps // 100)} if steps // 100 > since // 100 else {}
 
     monkeypatch.setattr(PeriodicEvaluation, "due", due)
