@@ -12,6 +12,9 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from skillweave.types import Array, SkillweaveError
 
+_FITS = {float: "fO", int: "iufO", bool: "biufO"}
+"""By the type of a number, the kinds of arrays that hold it as it is."""
+
 
 class SyncEnvs(SyncVectorEnv[Any, Any]):
     """Gymnasium's vector of environments, some of which begin and act.
@@ -83,12 +86,15 @@ class SyncEnvs(SyncVectorEnv[Any, Any]):
         """
         for key, value in env_info.items():
             array = vector_infos.get(key)
-            if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            if array is None or not isinstance(array, np.ndarray):
+                continue
+            kind = array.dtype.kind
+            if kind in _FITS.get(type(value), "") or kind not in "biuf":
                 continue
             if isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
-                if array.dtype.kind != "f" and isinstance(value, float | np.floating):
+                if kind != "f" and isinstance(value, float | np.floating):
                     vector_infos[key] = array.astype(np.float64)
-                elif array.dtype.kind == "b" and not isinstance(value, bool | np.bool_):
+                elif kind == "b" and not isinstance(value, bool | np.bool_):
                     vector_infos[key] = array.astype(np.int64)
             elif not isinstance(value, np.ndarray | dict):
                 vector_infos[key] = array.astype(object)

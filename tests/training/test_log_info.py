@@ -113,6 +113,7 @@ KINDS = {
 }
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "a population"])
 def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind: str, tmp_path: Path) -> None:
     keys = ["t", "flag", "late"]
@@ -125,7 +126,7 @@ def test_the_value_at_the_end_of_an_episode_is_logged_as_a_mean(kind: str, tmp_p
         assert 0.0 < line["info/flag"] < 1.0
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "parts"), [(ON, 1), (ON, 2), (OFF, 1)], ids=["ppo", "two parts", "dqn"]
 )
