@@ -222,7 +222,7 @@ def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kin
     whole.assert_resumes(kind, ticks, tmp_path / "run")
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
     whole.assert_loads(kind, tmp_path / "weights")

@@ -113,7 +113,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
 # Two uninterrupted runs
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(
     tmp_path: Path, reference: Reference, engine: str
@@ -149,7 +149,7 @@ def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
 # Interrupted within the process
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("tick", [1, 7, 10, 12, 15, 21, 24])
 def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(
@@ -183,6 +183,7 @@ def test_a_run_stopped_again_and_again_ends_as_if_it_had_not_been(
     assert_same(path, whole)
 
 
+@pytest.mark.slow
 def test_a_flat_run_stopped_in_the_middle_ends_as_if_it_had_not_been(tmp_path: Path) -> None:
     recipe = str(write_recipe(tmp_path))
     recipes.load(recipe).train(tmp_path / "whole", seed=3, flat=True, quiet=True)
@@ -277,7 +278,7 @@ SETTINGS = [  # a run that lost any of them would end otherwise
 ]
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_settings_changed_for_a_run_stay_changed_when_it_is_resumed(
     tmp_path: Path, settings: list[str]

@@ -114,7 +114,7 @@ def test_a_plain_agent_begins_with_the_weights_it_ended_with(kind, tmp_path):
     assert differ(weights_of(fresh.path)["agent"], weights_of(first.path)["agent"])
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
 def test_all_who_have_learnt_there_begin_with_it(learn, source, tmp_path):
     path = tmp_path / "run"
@@ -171,6 +171,7 @@ def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_
     assert ((a - b).abs() <= 0.03 * a).all(), "64 steps move what 6,400 have found by a hundredth"
 
 
+@pytest.mark.slow
 def test_who_learns_from_replay_does_not_begin_at_random(tmp_path, monkeypatch):
     config = DQN(num_envs=4, learning_starts=200, buffer_size=2_000, network=SMALL)
     asked, begin = [], Acting.begin
@@ -188,6 +189,7 @@ def test_who_learns_from_replay_does_not_begin_at_random(tmp_path, monkeypatch):
     assert not any(asked)
 
 
+@pytest.mark.slow
 def test_a_dqn_does_not_explore_anew(tmp_path, monkeypatch):
     epsilon, begin = [], Acting.begin
 
@@ -379,6 +381,7 @@ def test_a_population_does_not_start_from_a_run(source, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_run_that_is_not_finished_gives_what_it_has(source, tmp_path):
     path = tmp_path / "unfinished"
     run = new_run(declare(), path)
@@ -403,7 +406,7 @@ def other_runs(tmp_path_factory):
     return folder / "second", folder / "plain"
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", ["apart", "together"])
 def test_several_runs_are_a_start_by_the_name_of_who_begins(learn, source, other_runs, tmp_path):
     second, plain = other_runs

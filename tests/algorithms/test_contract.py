@@ -194,6 +194,7 @@ def test_it_learns_to_answer_what_it_sees(case):
     assert env.error(shown, action).mean() < 0.1
 
 
+@pytest.mark.fast_cases(3)
 @every_case
 def test_a_policy_in_a_file_acts_as_it_did(case, tmp_path):
     algorithm, state, env = case.learn()
@@ -221,6 +222,7 @@ def test_a_policy_in_a_file_acts_as_it_did(case, tmp_path):
 # Seeds and stacks
 
 
+@pytest.mark.fast_cases(4)
 @every_case
 def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_does_not(case):
     config = case.brief()
@@ -271,6 +273,7 @@ def test_members_that_share_what_they_did_still_differ(kind):
 SCALED = {"normalize_obs": True, "normalize_rewards": True}
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("config", [replace(ON, normalize_obs=True), *(
     kind(**BUFFERED, **SCALED) for kind in (DQN, TD3, SAC)
 )], ids=lambda c: type(c).__name__)  # fmt: skip
@@ -406,7 +409,7 @@ def test_a_short_call_is_preferred_over_a_long_one_that_pays_more_but_less_a_ste
             assert q.flatten().tolist()[1] == pytest.approx(LONG, rel=0.06)
 
 
-@pytest.mark.fast_cases(3)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", CHOOSERS)
 def test_a_forbidden_action_is_never_taken(name):
     env, config = Masked(8), VALUED[name]
@@ -496,6 +499,7 @@ def watched(config: PPO, updates: int = 3) -> Watched:
     return algorithm
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("kind", MEMORIES)
 def test_learning_begins_at_the_very_probabilities_that_acting_had(kind):
     algorithm = watched(MEMORIES[kind])

@@ -142,6 +142,7 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
         assert learner.kept()["anchor_coef"].device.type == "cpu"
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", OFF)
 def test_algorithms_of_replay_learn_and_act_where_their_state_is(name):
     config, space = OFF[name]

@@ -401,7 +401,7 @@ def test_weights_are_one_unless_what_acted_is_old(asks, rnn, overlap):
     assert [x > 1e-3 for x in off] == [False, overlap, overlap, overlap]
 
 
-@pytest.mark.fast_cases(20)
+@pytest.mark.fast_cases(5)
 @SPACES
 @MEMORIES
 @pytest.mark.parametrize(("columns", "steps"), [(1, 1), (1, 5), (4, 1), (4, 4)])

@@ -68,6 +68,7 @@ def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, updat
     assert np.array_equal(loaded.act({}, env.show(shown))[0], action)
 
 
+@pytest.mark.slow
 def test_its_values_are_those_of_the_ends_that_it_meets():
     algorithm, state = learn(own(), Countdown(8), 64 * 150)
     found = algorithm.value(state, torch.arange(5)[None])[0].tolist()

@@ -307,6 +307,7 @@ class TwoOfEight(Toy):
         return still, (action == 1) * 1.0, self.t == 1, self.never
 
 
+@pytest.mark.slow
 def test_under_a_mask_the_temperature_does_not_grow_without_bound():
     config = SAC(
         num_envs=8, learning_starts=64, buffer_size=1000, batch_size=16, learning_rate=5e-2,

@@ -129,6 +129,7 @@ def chance(algorithm, state, obs, action):
     return head[0].softmax(-1)[:, action]
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_what_was_paid_once_is_not_forgotten(seed):
     """One success, then forty updates in which nothing is won and all actions are tried."""

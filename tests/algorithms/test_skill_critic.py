@@ -54,6 +54,7 @@ def test_advantages_are_those_of_the_skill_that_acted():
     torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_it_learns_what_each_skill_is_worth():
     algorithm, state = critic(update_epochs=10, gae_lambda=0.0)
     rollout = chain()
@@ -83,6 +84,7 @@ def test_while_skills_are_tried_they_differ_less_in_worth_so_that_few_calls_are_
         torch.testing.assert_close(algorithm.act(params, obs, None, None)[1], share * whole)
 
 
+@pytest.mark.slow
 def test_it_learns_what_deciding_is_worth_where_one_decided():
     algorithm, state = critic(deciding=True, update_epochs=10, gae_lambda=0.0)
     # Four columns, each two calls of one step: skill 0 pays 1, and skill 1 pays 0. In state 0 skill

@@ -165,6 +165,7 @@ register_algorithm(Mine, MineAlgorithm)
 """
 
 
+@pytest.mark.slow
 def test_an_algorithm_of_the_users_own_is_known_where_it_arrives(tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(OWN_ALGORITHM)
     monkeypatch.syspath_prepend(tmp_path)

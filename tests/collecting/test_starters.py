@@ -123,7 +123,7 @@ def test_without_starters_it_says_that_chance_found_nothing():
         collector.collect(next(requests(6_000)))
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kinds", "skill"), [((Five,), Anywhere), ((Five,), Far)])
 def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill):
     collector = collector_of(*kinds, skill=skill, start_calls=6)

@@ -319,6 +319,7 @@ def test_networks_from_elsewhere_are_exported_too(tmp_path: Path) -> None:
         assert runner.act(obs, mask=with_mask) == player.act(obs, mask=with_mask) != 0
 
 
+@pytest.mark.slow
 def test_skills_that_sample_draw_as_often_as_their_network_says(tmp_path: Path) -> None:
     policy = trained(skill_set(Free, greedy=False))
     export = write_export(tmp_path, policy, "walk")

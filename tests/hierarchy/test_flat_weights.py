@@ -13,6 +13,7 @@ from skillweave.cli import main
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
 
 
+@pytest.mark.slow
 def test_a_flat_agents_weights_file_scores_as_its_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

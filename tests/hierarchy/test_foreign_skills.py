@@ -97,6 +97,7 @@ def test_trained_and_loaded_act_the_same_also_from_a_weights_file(made, tmp_path
     assert acts(declare(*all_kinds(folder)).load_weights(path).policy) == acts(run.policy)
 
 
+@pytest.mark.slow
 def test_what_a_run_keeps_is_what_acts_whatever_the_recipe_has_now(made, tmp_path):
     folder, run = made
     weights = run.save_weights(tmp_path / "weights.safetensors")

@@ -167,6 +167,7 @@ CASES = {
 }
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("case", CASES)
 def test_it_decides_and_acts_as_options_env_does_with_the_same_selector(case):
     make, selector, kinds, more = CASES[case]
@@ -284,6 +285,7 @@ def nested() -> tuple[HierarchyPolicy, One]:
     return top, One(Chooser(2), [as_middle, Left()], [one, Left.policy], 7)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_hierarchy_of_hierarchies_acts_as_scalar_ones_side_by_side_do(seed):
     top, one = nested()

@@ -181,7 +181,7 @@ ENDS = {
 }  # fmt: skip
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.usefixtures("_halves")
 @pytest.mark.parametrize("name", ENDS)
 def test_a_registered_encoder_learns_saves_and_loads(name):

@@ -152,6 +152,7 @@ def test_an_error_is_one_line_with_file_and_line(write: Write, text: str, says: 
     assert "skillweave_recipe_bad" not in sys.modules
 
 
+@pytest.mark.slow
 def test_the_command_line_imports_what_lies_beside_and_tells_errors_in_one_line(
     write: Write, tmp_path: Path
 ) -> None:

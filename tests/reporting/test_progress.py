@@ -342,6 +342,7 @@ def test_episodes_are_not_shown_without_a_terminal_where_quiet_or_under_another_
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_report_shows_the_episodes_that_it_plays_and_films(
     terminal: Terminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

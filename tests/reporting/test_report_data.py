@@ -213,6 +213,7 @@ def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder: Path) -
         grouped([runs[0], runs[0]])
 
 
+@pytest.mark.slow
 def test_curves_are_of_all_agents(folder: Path) -> None:
     curves = read_curves(RunDirectory.open(folder / "a"))
     assert [c.label for c in curves] == ["left", "balance", "selector"]

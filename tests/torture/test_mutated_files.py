@@ -161,6 +161,7 @@ def changed(folder, target, number):
     return told, content(target)
 
 
+@pytest.mark.slow
 def test_a_number_gives_the_same_change_again_and_nearly_all_change_something(folder, tmp_path):
     original, same, kinds = content(folder), 0, set()
     for number in range(300):

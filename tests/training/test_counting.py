@@ -65,7 +65,7 @@ def hierarchy(**settings) -> sw.Hierarchy:
     return sw.Hierarchy(spec, [Late(), Always()], call_steps=3, **plainly({**given, **settings}))
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     "settings",
     [
@@ -98,6 +98,7 @@ def test_the_fitness_of_a_population_is_reported_and_counts_against_the_budget(
     assert 2000 <= entry["steps"] <= 2400 + 3 * 64 + 4 * 100
 
 
+@pytest.mark.slow
 def test_what_a_killed_and_resumed_run_made_again_is_not_reported_twice(made, tmp_path):
     class Stop(Exception):
         pass

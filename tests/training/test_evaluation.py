@@ -65,6 +65,7 @@ CASES = {
 }
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("seed", [0, 3])
 def test_returns_and_lengths_are_those_of_a_scalar_loop_from_the_same_seeds(case, seed):

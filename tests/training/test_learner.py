@@ -134,6 +134,7 @@ def test_no_gradient_step_is_lost_or_made_twice_however_many_members_there_are(m
     assert spy.log.count("learn") == int(made * ratio) > 5
 
 
+@pytest.mark.slow
 def test_reports_come_every_thousand_steps_wherever_checkpoints_are_written():
     ticks: list[Tick] = []
     config = replace(CONFIG, update_ratio=0.05)
@@ -161,6 +162,7 @@ def test_a_multiple_is_crossed_where_it_is_reached():
 # From what
 
 
+@pytest.mark.slow
 def test_priorities_come_back_and_their_correction_becomes_whole():
     config = replace(CONFIG, prioritized=True, priority_beta=0.4)
     spy = spied(config, 400)
