@@ -82,12 +82,13 @@ class Checkpoints:
         return any(map(os.path.lexists, self._files))
 
     def keep(self, path: Path) -> None:
-        """Move the latest to ``path``, and remove the others.
+        """Move the latest to ``path``, if there is one, and remove the others.
 
         Raises:
             SkillweaveError: it cannot be moved, or the others cannot be removed.
         """
-        move(self._files[1], path)
+        if self._files[1].exists():
+            move(self._files[1], path)
         self.drop()
 
     def drop_previous(self) -> bool:
