@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from skillweave.algorithms.parameters import ParameterGroup
     from skillweave.algorithms.registry import register_algorithm
     from skillweave.algorithms.schedules import Linear
-    from skillweave.api import Agent, Hierarchy, Run, train_agent
+    from skillweave.api import Agent, Hierarchy, Run, load, train_agent
     from skillweave.api.hub import from_hub
     from skillweave.api.options import make_options_env
     from skillweave.api.player import Player
@@ -113,6 +113,7 @@ _HOME = {
     "from_sb3": "skills",
     "from_torch": "skills",
     "gae": "ops.returns",
+    "load": "api",
     "make_options_env": "api.options",
     "mask_logits": "ops.distributions",
     "masked_mean": "ops.moments",
@@ -190,6 +191,7 @@ __all__ = [
     "from_sb3",
     "from_torch",
     "gae",
+    "load",
     "make_options_env",
     "mask_logits",
     "masked_mean",

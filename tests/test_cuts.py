@@ -324,4 +324,4 @@ def test_ctrl_c_in_the_command_line_saves_and_names_the_command_to_go_on(tmp_pat
     assert process.returncode == 130
     assert "Traceback" not in err
     assert (run / "checkpoint.safetensors").exists()
-    assert f"go on with: skillweave resume {run} --recipe {recipe}" in err
+    assert f"Continue: skillweave resume {run} --recipe {recipe}" in err

@@ -92,7 +92,7 @@ def test_a_run_killed_while_it_was_judged_is_judged_when_it_is_resumed(
             training.train(then(), run)
     run.close()
     assert not run.finished
-    with pytest.raises(SkillweaveError, match=r"not judged yet.*skillweave resume"):
+    with pytest.raises(SkillweaveError, match=r"not judged yet.*resume=True"):
         then().load(run.path)
     then().resume(run.path, quiet=True)
     assert_same(run.path, whole[0])

@@ -509,7 +509,7 @@ def test_training_without_a_directory_is_either_refused_or_makes_one() -> None:
 
 def test_the_directory_of_a_finished_run_is_not_used_again() -> None:
     hierarchy = trained()
-    with pytest.raises(SkillweaveError, match="runs/ok already holds a run"):
+    with pytest.raises(SkillweaveError, match="runs/ok holds a finished run"):
         hierarchy.train("runs/ok", quiet=True)
 
 

@@ -20,7 +20,9 @@ Evaluation Evolution Export Guide Heir Hierarchy HierarchyPolicy LastCall Layout
 Mutations Net Network OnPolicy OptionsEnv PPO ParameterGroup ParentSelection Player Policy
 PoolWrapper RNN Range Ray Reflex Report Rollout Run SAC Sample Seeds Selection SelfImitationPPO
 Skill SkillweaveError Step TD3 Together Tournament TrainDefaults TrainEvent Truncation adam_
-clip_grad_norm_ envpool evaluate from_function from_hub from_onnx from_sb3 from_torch gae
+clip_grad_norm_ envpool evaluate from_function from_hub from_onnx from_sb3 from_torch gae load
+make_options_env mask_logits masked_mean normalise plot_curves register_algorithm register_encoder
+train_agent tree
 make_options_env mask_logits masked_mean normalise plot_curves register_algorithm register_encoder
 train_agent tree
 """

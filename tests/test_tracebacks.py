@@ -118,7 +118,7 @@ def test_ipython_shows_the_users_lines_and_one_sentence(tmp_path: Path) -> None:
     assert "direct cause" not in shown
     assert len(shown.splitlines()) < 25
     assert "In[3], line 4" in interrupted
-    assert "Interrupted: saved at the start; go on with: resume('stopped')" in interrupted
+    assert "Interrupted: saved at the start. Continue: " in interrupted
     assert "skillweave/" not in interrupted
 
 

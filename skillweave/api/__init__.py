@@ -12,9 +12,10 @@ from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
+from skillweave.api.loading import load
 from skillweave.api.notebook_tables import agent_html, agent_line, hierarchy_html, hierarchy_line
 from skillweave.api.run import Run
-from skillweave.api.running import begin, declared_of, evolving, go_on
+from skillweave.api.running import begin, evolving, go_on
 from skillweave.api.starting import StartFrom
 from skillweave.arguments import checked_names
 from skillweave.collecting.cluster import Ray
@@ -26,6 +27,7 @@ from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import below, copied
 from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
 from skillweave.messages import as_path, whole_number
+from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.callback import Callback
@@ -48,8 +50,9 @@ class Agent(PlainAgent):
     @checked_names
     def train(
         self,
-        run_dir: str | Path,
+        run_dir: str | Path | None = None,
         *,
+        resume: bool = False,
         seed: int = 0,
         eval_every: int | None = None,
         eval_episodes: int | None = None,
@@ -65,8 +68,9 @@ class Agent(PlainAgent):
     ) -> Run:
         """Train the agent and write everything to ``run_dir``.
 
-        ``seed``, ``eval_every``, ``eval_episodes``, ``checkpoint_every``, ``quiet``, ``track``,
-        ``evolve``, ``cluster``, ``start_from``, ``callback``, ``keep`` and ``log_info`` are as in
+        ``run_dir``, ``resume``, ``seed``, ``eval_every``, ``eval_episodes``, ``checkpoint_every``,
+        ``quiet``, ``track``, ``evolve``, ``cluster``, ``start_from``, ``callback``, ``keep`` and
+        ``log_info`` are as in
         ``Hierarchy.train``.
         """
         self.validate()
@@ -79,7 +83,16 @@ class Agent(PlainAgent):
         )
         content = self.manifest(whole_number(seed, "seed", 0), how)
         return begin(
-            self, content, run_dir, quiet, track, evolve, cluster, start_from, callback=callback
+            self,
+            content,
+            run_dir,
+            quiet,
+            track,
+            evolve,
+            cluster,
+            start_from,
+            callback=callback,
+            resume=resume,
         )
 
     @checked_names
@@ -104,11 +117,8 @@ class Agent(PlainAgent):
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
-        """The finished run of this agent in ``run_dir``."""
-        self.validate()
-        run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        check_run(self, run)
-        return Run(self, run.path, training.load(self, run))
+        """Load the finished run of this agent in ``run_dir``."""
+        return load(run_dir, self)
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
@@ -171,8 +181,9 @@ class Hierarchy(Declaration):
     @checked_names
     def train(
         self,
-        run_dir: str | Path,
+        run_dir: str | Path | None = None,
         *,
+        resume: bool = False,
         seed: int = 0,
         flat: bool | AlgorithmConfig = False,
         eval_every: int | None = None,
@@ -190,7 +201,13 @@ class Hierarchy(Declaration):
         """Train skills and selector and write everything to ``run_dir``.
 
         Args:
-            run_dir: a new directory; an existing run is never overwritten.
+            run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
+                recipe, the hierarchy or the environment. A run that has learnt something is never
+                replaced; one without a checkpoint, which no process trains, is.
+            resume: continue the run in ``run_dir`` if it has learnt something, else begin. Its
+                settings count, and those that differ are named. If steps have grown, a finished run
+                learns on: in new episodes, with schedules over the new budget. Steps of stages
+                whose learners learn again in a later one go to that stage.
             seed: the root of every random stream.
             flat: train one plain agent for the same number of steps instead: the baseline. True:
                 with the settings of ``train_defaults``; or its settings.
@@ -229,8 +246,8 @@ class Hierarchy(Declaration):
             The finished run.
 
         Raises:
-            SkillweaveError: the declaration does not fit the environment, training diverged, or
-                nobody can start from ``start_from``.
+            SkillweaveError: the declaration does not fit the environment, training diverged,
+                ``run_dir`` holds something else, or nobody can start from ``start_from``.
         """
         self.validate()
         seed = whole_number(seed, "seed", 0)
@@ -244,7 +261,17 @@ class Hierarchy(Declaration):
         own, note = (self, "") if flat is not False else evolving(self, evolve)
         content = training.manifest(own, seed=seed, flat=flat, how=how)
         return begin(
-            own, content, run_dir, quiet, track, evolve, cluster, start_from, note, callback
+            own,
+            content,
+            run_dir,
+            quiet,
+            track,
+            evolve,
+            cluster,
+            start_from,
+            note,
+            callback,
+            resume=resume,
         )
 
     @checked_names
@@ -259,8 +286,9 @@ class Hierarchy(Declaration):
     ) -> Run:
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
-        The run's settings count, and the code of this hierarchy: methods, functions, conditions.
-        Settings that differ are told, but for those of a population.
+        The run's settings count, its steps too, and the code of this hierarchy: methods, functions,
+        conditions. Settings that differ are told, but for those of a population. To train for more
+        steps: ``train(run_dir, resume=True)``.
 
         ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
         selection of your own. ``cluster``: where its collectors run from now on; their number
@@ -274,11 +302,8 @@ class Hierarchy(Declaration):
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
-        """The finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
-        self.validate()
-        run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        own = adopted(self, run)
-        return Run(declared_of(own, run), run.path, training.load(own, run))
+        """Load the finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
+        return load(run_dir, self)
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> Agent:
         """Return the flat baseline: one agent on the task itself, without skills and reflexes.
@@ -332,8 +357,9 @@ def train_agent(
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
     algorithm: AlgorithmConfig,
     steps: int,
-    run_dir: str | Path,
+    run_dir: str | Path | None = None,
     *,
+    resume: bool = False,
     target_return: float | None = None,
     target_success: float | None = None,
     eval_every: int | None = None,
@@ -360,7 +386,9 @@ def train_agent(
         eval_every: environment steps between these evaluations; None: none.
         eval_episodes: episodes of each.
         checkpoint_every: environment steps between checkpoints.
-        run_dir: a new directory; an existing run is never overwritten.
+        run_dir: a new directory; None: the next number of ``runs/<environment>-<n>``.
+        resume: continue the run in ``run_dir`` if it has learnt something, for more ``steps`` if
+            they have grown, else begin; see ``Hierarchy.train``.
         seed: the root of every random stream.
         quiet: no progress.
         track: any of "tensorboard", "wandb" and "mlflow".
@@ -387,21 +415,23 @@ def train_agent(
         target_return=target_return,
         target_success=target_success,
     )
-    return agent.train(
-        run_dir,
-        seed=seed,
-        eval_every=eval_every,
-        eval_episodes=eval_episodes,
-        checkpoint_every=checkpoint_every,
-        quiet=quiet,
-        track=track,
-        evolve=evolve,
-        cluster=cluster,
-        start_from=start_from,
-        callback=callback,
-        keep=keep,
-        log_info=log_info,
-    )
+    with called_by("train_agent"):
+        return agent.train(
+            run_dir,
+            resume=resume,
+            seed=seed,
+            eval_every=eval_every,
+            eval_episodes=eval_episodes,
+            checkpoint_every=checkpoint_every,
+            quiet=quiet,
+            track=track,
+            evolve=evolve,
+            cluster=cluster,
+            start_from=start_from,
+            callback=callback,
+            keep=keep,
+            log_info=log_info,
+        )
 
 
-__all__ = ["Agent", "Hierarchy", "Run", "train_agent"]
+__all__ = ["Agent", "Hierarchy", "Run", "load", "train_agent"]

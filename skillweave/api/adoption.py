@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -61,7 +62,19 @@ def told_differences(declared: Hierarchy | Agent, run: RunDirectory) -> str:
         content = manifest(declared, seed=seed, flat=flat)
     else:
         content = declared.manifest(seed)
+    return differences(content, run)
+
+
+def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool = True) -> str:
+    """Return a sentence on settings that a run has otherwise; empty if there are none.
+
+    Args:
+        content: the manifest that a new run would have.
+        budgets: also on the steps of stages.
+    """
     here, there = settings(content), settings(run.manifest)
+    if not budgets:
+        here = {k: v for k, v in here.items() if not k.endswith(".budget")}
     evolve = tuple(f"{s['name']}." for s in run.manifest["stages"] if s.get("evolution"))
     # A population's settings follow a plan. Where a file lies is no setting; its checksum is.
     both = [k for k in here if k in there and not k.startswith(evolve) and not k.endswith(".file")]
@@ -74,7 +87,7 @@ def told_differences(declared: Hierarchy | Agent, run: RunDirectory) -> str:
         f"{k} is {plain(there[k])} (declared now: {plain(here[k])})" for k in differ[:MOST_NAMED]
     ]
     more = f", and {len(differ) - MOST_NAMED} more differ" if len(differ) > MOST_NAMED else ""
-    return f"the run goes on with its own settings: {', '.join(named)}{more}"
+    return f"the run continues with its own settings: {', '.join(named)}{more}"
 
 
 def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:

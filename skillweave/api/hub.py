@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.api import Agent, Hierarchy, Run
-from skillweave.api.declared import declared_by
+from skillweave.api.loading import check_declared, load_from
 from skillweave.arguments import checked_names
-from skillweave.messages import as_path, short
+from skillweave.messages import as_path
 from skillweave.reporting.card import write_card
 from skillweave.reporting.plots import plot_run
 from skillweave.runs import hub
@@ -76,13 +76,8 @@ def from_hub(
             needs code that was not given, or the hub does not answer.
         MissingExtra: the extra 'hub' is not installed.
     """
-    if hierarchy is not None and not isinstance(hierarchy, Hierarchy | Agent):
-        raise SkillweaveError(
-            f"hierarchy is {short(hierarchy)}; it must be the Hierarchy or Agent that was trained"
-        )
-    path = hub.download(hub.check_name(name), revision)
-    declared = hierarchy or declared_by(RunDirectory.open(path), ask=ASK)
-    return declared.load(path)
+    check_declared(hierarchy)
+    return load_from(hub.download(hub.check_name(name), revision), hierarchy, ask=ASK)
 
 
 def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:

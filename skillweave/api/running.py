@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from skillweave.api.continuing import prepared, to_continue
 from skillweave.api.run import Run
 from skillweave.api.starting import Spaces, StartFrom, starts
 from skillweave.collecting.cluster import Ray
@@ -21,10 +22,11 @@ from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import copied, every_hierarchy
 from skillweave.messages import as_path, short
 from skillweave.reporting.progress import Progress
-from skillweave.runs.command_words import saved_words
+from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
+from skillweave.runs.numbered import make_numbered
 from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
 from skillweave.training.callback import Callback, TrainCallback, check_callback
@@ -54,7 +56,7 @@ def _may_train() -> None:
 def begin(
     declared: Hierarchy | Agent,
     content: dict[str, Any],
-    run_dir: str | Path,
+    run_dir: str | Path | None,
     quiet: bool,
     track: Sequence[str],
     evolve: Evolve,
@@ -62,26 +64,44 @@ def begin(
     start_from: StartFrom = None,
     note: str = "",
     callback: Callback | None = None,
+    *,
+    resume: bool = False,
 ) -> Run:
-    """Check everything, begin a run of this manifest, and train it; ``note`` is printed first."""
+    """Check everything, begin a run of this manifest, and train it; ``note`` is printed first.
+
+    With ``resume``, continue what is in ``run_dir`` instead, if there is something.
+    """
     _may_train()
     check_callback(callback)
-    run_dir = as_path(run_dir, "run_dir")
-    spaces = _plan(declared, content, evolve, cluster)
-    learnt, told = starts(declared, content, start_from, spaces)
-    note = " ".join(filter(None, (note, told, _kept_by_populations(content))))
+    run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
+    if not isinstance(resume, bool):
+        raise SkillweaveError(f"resume is {short(resume)}; it must be True or False")
+    if resume and run_dir is None:
+        raise SkillweaveError(
+            'resume=True continues a run, so name its directory: train("runs/a", resume=True)'
+        )
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
-    make_trackers(track, None)  # a missing extra is said before anything is written
-    if cluster is not None:
-        cluster.check()
-    run = RunDirectory.create(
-        run_dir,
-        content | {"recipe": declared.recipe, "track": track},
-        partial(keep_starts, learnt=learnt),
-    )
-    return go_on(declared, run, quiet, evolve, cluster, note, callback)
+    spaces = _plan(declared, content, evolve, cluster)
+    with called_by(caller_of(declared)), ExitStack() as stack:
+        if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
+            own, told = prepared(declared, content, run, evolve, track)
+            stack.callback(run.close)
+            return go_on(own, run, quiet, evolve, cluster, told, callback)
+        learnt, told = starts(declared, content, start_from, spaces)
+        note = " ".join(filter(None, (note, told, _kept_by_populations(content))))
+        make_trackers(track, None)  # a missing extra is said before anything is written
+        if cluster is not None:
+            cluster.check()
+        content = content | {"recipe": declared.recipe, "track": track}
+        if run_dir is None:
+            run_dir = make_numbered(_run_name(declared, content))
+            note = "; ".join(filter(None, (f"run: {run_dir}", note)))
+            stack.callback(_remove_if_empty, run_dir)
+        run = RunDirectory.create(run_dir, content, partial(keep_starts, learnt=learnt), hold=True)
+        stack.callback(run.close)
+        return go_on(declared, run, quiet, evolve, cluster, note, callback)
 
 
 def _kept_by_populations(content: dict[str, Any]) -> str:
@@ -90,6 +110,25 @@ def _kept_by_populations(content: dict[str, Any]) -> str:
     if content["keep"] != "best" or not names:
         return ""
     return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
+
+
+def caller_of(declared: Hierarchy | Agent) -> Caller:
+    """Return what messages call a declaration."""
+    return "hierarchy" if isinstance(declared, Declaration) else "agent"
+
+
+def _run_name(declared: Hierarchy | Agent, content: Mapping[str, Any]) -> str:
+    """Return what a numbered directory is named after: recipe, hierarchy, or environment."""
+    flat = isinstance(declared, Declaration) and content["kind"] == "agent"
+    name = "" if declared.recipe is None else Path(declared.recipe).stem
+    if not name and isinstance(declared, Declaration) and declared.name != Declaration.name:
+        name = declared.name
+    return (name or declared.spec.name) + ("-flat" if flat else "")
+
+
+def _remove_if_empty(path: Path) -> None:
+    with suppress(OSError):
+        path.rmdir()
 
 
 def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
@@ -114,7 +153,8 @@ def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDir
         return None
     run, content = RunDirectory.open(run_dir), copy.deepcopy(content)
     _plan(declared, content, None, None)
-    if run.manifest.get("id") != identity(content):
+    grown = any(stage.get("continued") for stage in run.manifest["stages"])
+    if grown or run.manifest.get("id") != identity(content):
         raise SkillweaveError(
             f"{run_dir} holds a run of other settings (or of another recipe, budget or version); "
             "choose another directory"
@@ -162,6 +202,7 @@ def go_on(
         _may_train()
     must_be_own(run.path)
     with ExitStack() as stack:
+        stack.enter_context(called_by(caller_of(declared)))
         stack.callback(run.close)
         run.begin()
         progress = stack.enter_context(Progress(quiet=quiet))
@@ -179,8 +220,7 @@ def go_on(
         try:
             policy = training.train(declared, run, listeners, learner)
         except KeyboardInterrupt:
-            again = f"resume({str(run.path)!r})"
-            raise Interrupted(f"{saved_words(run)}; go on with: {again}") from None
+            raise Interrupted(f"{saved_words(run)}. Continue: {resume_words(run)}") from None
     return Run(declared_of(declared, run), run.path, policy)
 
 

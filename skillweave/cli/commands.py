@@ -42,7 +42,10 @@ class Train(OnRay):
     recipe: Positional[str] = tyro.MISSING
     """A shipped recipe (skillweave list), or a Python file that defines a Hierarchy."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """A new directory for the run; default: runs/NAME-sSEED, numbered if taken."""
+    """A new directory for the run; default: the next number of runs/NAME-N."""
+    resume: bool = False
+    """Continue the run in --out if it has learnt something, else begin. Steps that have grown
+    (--set steps=N, --scale) train a finished run for longer."""
     seed: int = 0
     """The root of every random stream."""
     flat: bool = False

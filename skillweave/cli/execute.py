@@ -12,7 +12,7 @@ from skillweave.cli.demo import demo
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.run_lines import run_lines
 from skillweave.cli.sweep import sweep
-from skillweave.cli.targets import declared_by_run, target
+from skillweave.cli.targets import load_run, target
 from skillweave.cli.telling import save_score, tell
 from skillweave.cli.training import resume, train
 from skillweave.compat.agilerl_files import convert
@@ -133,7 +133,7 @@ def _report(command: commands.Report) -> None:
     recipe = command.recipe or (told if told in recipes.names() else None)
     if run.finished:
         try:
-            trained = declared_by_run(command.run, recipe).load(command.run)
+            trained = load_run(command.run, recipe)
         except SkillweaveError as error:
             if command.recipe is not None:
                 raise
@@ -196,7 +196,7 @@ def _info(command: commands.Info) -> None:
 
 
 def _weights(command: commands.Weights) -> None:
-    trained = declared_by_run(command.run, command.recipe).load(command.run)
+    trained = load_run(command.run, command.recipe)
     path = trained.save_weights(command.out)
     tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
 

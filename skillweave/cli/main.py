@@ -39,13 +39,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "skillweave --version prints the version.",
         args=given,
     )
+    from skillweave.runs.command_words import called_by
     from skillweave.tracebacks import all_frames_wanted
     from skillweave.types import SkillweaveError
 
     try:
         from skillweave.cli import execute
 
-        return execute.run(command)
+        with called_by("command line"):
+            return execute.run(command)
     except SkillweaveError as error:
         if command.traceback or all_frames_wanted():
             traceback.print_exception(error)

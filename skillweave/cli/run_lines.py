@@ -32,6 +32,8 @@ def run_lines(
         for name, start in p.get("starts", {}).items():
             run = "" if start["run"] is None else f" {start['run']}"
             lines.append(f"    {name} starts from run{run}, after {start['steps']:,} steps there")
+        if continued := p.get("continued"):
+            lines.append(f"    continued after {', '.join(f'{k:,}' for k in continued)} steps")
         if reached := p.get("reached"):
             lines.append(
                 f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "

@@ -9,7 +9,7 @@ from typing import Any
 from skillweave.api.hub import pull_run, push_run
 from skillweave.cli import commands
 from skillweave.cli.targets import free
-from skillweave.runs.command_words import command_words
+from skillweave.cli.telling import run_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import check_name, hub
 
@@ -28,8 +28,7 @@ def pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
     _no_bars()
     name = check_name(command.name).partition("/")[2]
     path = pull_run(command.name, command.out or free(Path("runs") / name), command.revision)
-    watch = command_words("evaluate|render|report", RunDirectory.open(path))
-    return {"path": str(path)}, f"run     {path}  ({watch})"
+    return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
 
 
 def _no_bars() -> None:

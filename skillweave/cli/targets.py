@@ -6,10 +6,10 @@ from pathlib import Path
 
 from skillweave import recipes
 from skillweave.api import Agent, Hierarchy, Run
-from skillweave.api.declared import declared_by, declared_in
+from skillweave.api.declared import ASK, declared_in
+from skillweave.api.loading import load_from
 from skillweave.cli import commands
 from skillweave.hierarchy.weights import open_weights
-from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
 
@@ -23,7 +23,7 @@ def target(command: commands.Watched | commands.Export) -> Run:
     if command.pretrained:
         return Hierarchy.pretrained(command.target)
     if path.is_dir():
-        return declared_by_run(path, command.recipe).load(path)
+        return load_run(path, command.recipe)
     if path.suffix == ".safetensors":
         header = open_weights(path)[1]
         if header.get("kind") == "agent" and "env" in header:
@@ -36,11 +36,9 @@ def target(command: commands.Watched | commands.Export) -> Run:
     raise SkillweaveError(f"{command.target} is neither a run nor a weights file{hint}")
 
 
-def declared_by_run(
-    path: Path, recipe: str | None, needs: str = "needs_recipe"
-) -> Hierarchy | Agent:
-    """What the run at ``path`` was trained from; see ``declared_by``."""
-    return declared_by(RunDirectory.open(path), recipe, needs)
+def load_run(path: Path, recipe: str | None) -> Run:
+    """Load the finished run at ``path``, with the code of a ``recipe`` if one is given."""
+    return load_from(path, recipe=recipe, ask=ASK)
 
 
 def free(path: Path) -> Path:

@@ -8,6 +8,7 @@ from typing import Any
 
 from skillweave.api import Run
 from skillweave.cli import commands
+from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
@@ -25,3 +26,10 @@ def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bo
         save_evaluation(RunDirectory.open(trained.path), score, seed, deterministic)
     except SkillweaveError as error:
         print(f"the evaluation is not kept in the run: {error}", file=sys.stderr)
+
+
+def run_words(run: RunDirectory) -> list[str]:
+    """Return where a finished run lies, and commands that show it, as lines."""
+    names = ("evaluate", "render", "report")
+    commands = [command_words(name, run) for name in names]
+    return [f"run     {run.path}", "next    " + "\n        ".join(commands)]

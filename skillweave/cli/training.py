@@ -9,14 +9,13 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave.api import Hierarchy, Run
+from skillweave.api.declared import declared_by
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
-from skillweave.cli.targets import declared_by_run, free
-from skillweave.cli.telling import save_score, tell
+from skillweave.cli.telling import run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.evolution.config import Evolution
-from skillweave.runs.command_words import command_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
@@ -30,8 +29,10 @@ def train(command: commands.Train) -> None:
     if command.versus_flat and not command.evaluate:
         raise SkillweaveError("--versus-flat compares scores: let --evaluate be at least 1")
     flat_out = command.out and command.out.with_name(f"{command.out.name}-flat")
-    if command.versus_flat and flat_out and flat_out.exists():
+    if command.versus_flat and flat_out and flat_out.exists() and not command.resume:
         raise SkillweaveError(f"{flat_out} is there already: the flat agent would be written there")
+    if command.resume and command.out is None:
+        raise SkillweaveError("--resume continues a run: name its directory, --out DIR")
     hierarchy = recipes.load(command.recipe)
     apply_overrides(hierarchy, command.set)
     hierarchy.scale(command.scale)
@@ -52,12 +53,13 @@ def train(command: commands.Train) -> None:
 
 def resume(command: commands.Resume) -> None:
     """Finish a run that was stopped."""
-    declared = declared_by_run(command.run, command.recipe, "resume_needs_recipe")
+    run = RunDirectory.open(command.run)
+    declared = declared_by(run, command.recipe, "resume_needs_recipe")
     cluster = None if command.ray is None else Ray(address=command.ray or None)
     try:
         trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
-    except KeyboardInterrupt:
-        raise _interrupted(command.run, command.ray) from None
+    except KeyboardInterrupt as error:
+        raise _interrupted(error, command.ray) from None
     result, lines = _told(command, trained)
     tell(command, result, "\n".join(lines))
 
@@ -71,12 +73,11 @@ def _trained(
     baseline: bool = False,
 ) -> Run:
     """Train one of both; a ``baseline`` that is to be compared learns from nothing."""
-    name = Path(command.recipe).stem + ("-flat" if flat else "")
-    path = out or free(Path("runs") / f"{name}-s{command.seed}")
     try:
         cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(
-            path,
+            out,
+            resume=command.resume,
             seed=command.seed,
             flat=flat,
             quiet=command.quiet,
@@ -87,8 +88,8 @@ def _trained(
             keep=command.keep,
             log_info=command.log_info or None,
         )
-    except KeyboardInterrupt:
-        raise _interrupted(path, command.ray) from None
+    except KeyboardInterrupt as error:
+        raise _interrupted(error, command.ray) from None
 
 
 def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
@@ -152,16 +153,12 @@ def _told(
         film = trained.render(trained.path / f"{manifest['kind']}.gif", quiet=command.quiet)
         result["film"] = film
         lines.append(f"film    {film['path']}")
-    watch = command_words("evaluate|render|report", RunDirectory.open(trained.path))
-    lines.append(f"run     {trained.path}  ({watch})")
+    lines += run_words(RunDirectory.open(trained.path))
     return result, lines
 
 
-def _interrupted(path: Path, ray: str | None) -> KeyboardInterrupt:
-    """The same interrupt, with what is saved and how to go on."""
-    if not (path / "run.json").exists():
+def _interrupted(error: KeyboardInterrupt, ray: str | None) -> KeyboardInterrupt:
+    """Return the same interrupt, with ``--ray`` in the command that continues."""
+    if not str(error):
         return KeyboardInterrupt("nothing was trained yet")
-    run = RunDirectory.open(path)
-    again = command_words("resume", run)
-    again += "" if ray is None else f" --ray {ray}".rstrip()
-    return KeyboardInterrupt(f"{saved_words(run)}; go on with: {again}")
+    return KeyboardInterrupt(str(error) + ("" if ray is None else f" --ray {ray}".rstrip()))

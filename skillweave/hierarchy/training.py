@@ -20,7 +20,7 @@ from skillweave.hierarchy.schedule import own_stages, stages_of
 from skillweave.hierarchy.select_best import select_best, settled
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
-from skillweave.runs.command_words import command_words
+from skillweave.runs.command_words import resume_words
 from skillweave.runs.copies import keep_policy, recorded_policy
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
@@ -137,7 +137,7 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     if run.unjudged:
         raise SkillweaveError(
             f"{run.path}: all is learnt, but which of the hierarchies that it could end with is "
-            f"the best was not judged yet; {command_words('resume', run)}"
+            f"the best was not judged yet; {resume_words(run)}"
         )
     absent = [s.name for s in declaration.skills if not can_act(s, found)]
     if absent:

@@ -77,6 +77,28 @@ class Checkpoints:
                 return read_header(path)
         return {}
 
+    def any(self) -> bool:
+        """Return whether there is one."""
+        return any(map(os.path.lexists, self._files))
+
+    def keep(self, path: Path) -> None:
+        """Move the latest to ``path``, if there is one, and remove the others.
+
+        Raises:
+            SkillweaveError: it cannot be moved, or the others cannot be removed.
+        """
+        if self._files[1].exists():
+            move(self._files[1], path)
+        self.drop()
+
+    def drop_previous(self) -> bool:
+        """Remove the one before the latest, if there is a latest; return whether it was there."""
+        _, latest, before = self._files
+        there = latest.exists() and before.exists()
+        if there:
+            remove(before)
+        return there
+
     def drop(self) -> None:
         """Remove them: their stage is done, and ``run.json`` says so."""
         for path in self._files:

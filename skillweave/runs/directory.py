@@ -9,8 +9,9 @@ checkpoint.safetensors       the stage under way, at its latest clean cut (and t
 policies/<stage>.safetensors finished stages
 states/<who>.safetensors      what learns on in a later stage, until that is done
 starts/<who>.safetensors      what learners begin with, from another run, until their stage is done
+final/<stage>.safetensors    what finished stages continue from for more steps
 policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights
-.lock                        empty; locked by the process that trains the run
+.lock                        locked by the process that trains the run; its number and machine
 
 ``manifest`` says what these hold.
 """
@@ -20,6 +21,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,28 +29,36 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy, state_from
-from skillweave.reading import shown
+from skillweave.reading import fit, shown
 from skillweave.runs.checkpoints import Checkpoints
-from skillweave.runs.command_words import command_words
+from skillweave.runs.command_words import resume_words, saved_words
 from skillweave.runs.files import (
     TEMPORARY,
     check_unchanged,
     make_directory,
     read_signed,
+    read_tensors,
     remove,
     write_json,
     write_tensors,
 )
 from skillweave.runs.jsonl import JsonLines
 from skillweave.runs.kept import to_be_judged
+from skillweave.runs.lock import NAME as LOCK
 from skillweave.runs.lock import Lock
 from skillweave.runs.manifest import Checkpoint, MetricsLine, identity, read_manifest, versions
 from skillweave.runs.population_schema import LineageLine
+from skillweave.runs.replacing import check_ours, check_replaceable, clear
 from skillweave.types import SkillweaveError, unprefixed
 
 S = TypeVar("S")
 First = Callable[["RunDirectory"], None]
 """Writes what a new run needs from its beginning."""
+
+
+FINAL = "final"
+"""The folder of final states."""
+LINES = ("metrics_bytes", "lineage_bytes")
 
 
 def file_name(path: str) -> str:
@@ -61,8 +71,8 @@ class RunDirectory:
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
         self.path, self.manifest = path, manifest
-        self._metrics = JsonLines(path / "metrics.jsonl", MetricsLine)
-        self.lineage = JsonLines(path / "lineage.jsonl", LineageLine)
+        self._metrics = JsonLines(path / "metrics.jsonl", MetricsLine, self._next_step)
+        self.lineage = JsonLines(path / "lineage.jsonl", LineageLine, self._next_step)
         self._checkpoints = Checkpoints(path)
         self._lock: Lock | None = None
         self.told_absent: set[str] = set()
@@ -70,32 +80,70 @@ class RunDirectory:
 
     @classmethod
     def create(
-        cls, path: str | Path, manifest: dict[str, Any], first: First | None = None
+        cls,
+        path: str | Path,
+        manifest: dict[str, Any],
+        first: First | None = None,
+        *,
+        hold: bool = False,
     ) -> RunDirectory:
-        """A new run; ``first`` writes what it needs before ``run.json`` is there.
+        """Write a new run, in place of one that has not learnt anything.
+
+        Args:
+            first: writes what the run needs before ``run.json`` is there.
+            hold: keep the run locked, to train it; ``close`` releases it.
 
         Raises:
-            SkillweaveError: the directory already holds a run, or other files.
+            SkillweaveError: the directory holds a run that has learnt something or that another
+                process trains, or other files.
         """
         path = Path(path)
-        if (path / "run.json").exists():
-            raise SkillweaveError(
-                f"{path} already holds a run, which is never overwritten; choose another "
-                f"directory, or go on with it: skillweave resume {path}"
-            )
-        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        if path.is_file():
             raise SkillweaveError(f"{path} exists and is not an empty directory; choose another")
+        made = not path.exists()
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SkillweaveError(f"could not make {path}: {error.strerror}") from error
-        created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-        content = {"versions": versions(), "created": created, "id": identity(manifest)}
-        run = cls(path, content | manifest)
-        if first is not None:
-            first(run)
-        run.save()
+        before = cls.open(path) if os.path.lexists(path / "run.json") else None
+        if before is not None:
+            check_replaceable(before)
+        check_ours(path, before)  # before the lock is written there
+        lock = Lock(path)
+        try:
+            if before is not None:
+                cls._clear_dead(path, lock)
+            created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+            content = {"versions": versions(), "created": created, "id": identity(manifest)}
+            run = cls(path, content | manifest)
+            run._lock = lock
+            if first is not None:
+                first(run)
+            run.save()
+        except BaseException:
+            if not (path / "run.json").exists():
+                remove(path / LOCK)
+            lock.release()
+            if made:
+                with suppress(OSError):
+                    path.rmdir()
+            raise
+        if not hold:
+            run.close()
         return run
+
+    @classmethod
+    def _clear_dead(cls, path: Path, lock: Lock) -> None:
+        """Remove a run that has not learnt anything; it is locked."""
+        if not lock.exclusive:
+            raise SkillweaveError(
+                f"{path} holds a run that has not learnt anything yet, and this system cannot say "
+                "whether a process uses it. Delete it if none does, or choose another directory"
+            )
+        run = cls.open(path)
+        check_replaceable(run)  # another process may have trained it until now
+        check_ours(path, run)
+        clear(path)
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
@@ -109,13 +157,16 @@ class RunDirectory:
             raise SkillweaveError(f"{path} holds no run: there is no {path / 'run.json'}")
         return cls(path, read_manifest(path))
 
-    def begin(self) -> None:
+    def begin(self, *, finished: bool = False) -> None:
         """Take the run for training: lock it, and clear away what a killed process left.
+
+        Args:
+            finished: also if it is finished, to train it for longer.
 
         Raises:
             SkillweaveError: another process trains it, or it cannot be written.
         """
-        if self.finished or self._lock is not None:
+        if self._lock is not None or (self.finished and not finished):
             return
         self._lock = Lock(self.path)
         try:
@@ -128,7 +179,8 @@ class RunDirectory:
 
     def _clear(self) -> None:
         """Remove half-written files, and checkpoints that nothing needs any more."""
-        for directory in (self.path, self.path / "policies", self.path / "starts"):
+        folders = ("policies", "starts", FINAL)
+        for directory in (self.path, *(self.path / name for name in folders)):
             for path in directory.glob(TEMPORARY):
                 remove(path)
         self._checkpoints.clear(
@@ -161,6 +213,13 @@ class RunDirectory:
         return done and not self.unjudged
 
     @property
+    def has_learnt(self) -> bool:
+        """Whether a new run in its place would lose something that was learnt."""
+        stages = self.manifest["stages"]
+        done = any(s["status"] == "done" or s.get("continued") for s in stages)
+        return done or self._checkpoints.any() or any(self.path.glob(f"{FINAL}/*.safetensors"))
+
+    @property
     def unjudged(self) -> bool:
         """Whether nobody has found out yet which hierarchy is the best that was learnt."""
         stages = self.manifest["stages"]
@@ -186,10 +245,34 @@ class RunDirectory:
         self.check()
         self._checkpoints.drop()
 
+    def keep_final(self, stage: str) -> None:
+        """Keep the latest checkpoint as what the stage continues from for more steps."""
+        self.check()
+        path = self.final_path(stage)
+        make_directory(path.parent)
+        self._checkpoints.keep(path)
+
+    def final_path(self, stage: str) -> Path:
+        """Return where the final state of a stage lies."""
+        return self.path / FINAL / f"{file_name(stage)}.safetensors"
+
+    def make_room(self) -> bool:
+        """Remove what a run can spare on a full disk; return whether there was something.
+
+        That is the checkpoint before the latest, and the final states of finished stages.
+        """
+        self.check()
+        spare = [p for p in self.path.glob(f"{FINAL}/*.safetensors") if p.is_file()]
+        for path in spare:
+            remove(path)
+        return self._checkpoints.drop_previous() or bool(spare)
+
     def load_checkpoint(
         self, kind: type[S] | None, stage: str, like: S | None = None, schema: Any = Checkpoint
     ) -> tuple[S | None, dict[str, Any], dict[str, Tensor]] | None:
         """State, header and extra of a stage's latest good clean cut; None: there is none yet.
+
+        Without a checkpoint it is the stage's final state, if it has one.
 
         Args:
             kind: of the state, a dataclass of tensors; None: there is none.
@@ -200,6 +283,7 @@ class RunDirectory:
             SkillweaveError: checkpoints of this stage exist, but none is good.
         """
         found = self._checkpoints.load(stage, schema, self.must_be_ours)
+        found = found or self._final(stage, schema)
         if found is None:
             return None
         tensors, header, path = found
@@ -212,6 +296,34 @@ class RunDirectory:
         if like is not None:
             return state_from(tensors, like, str(path)), header, extra
         return None if kind is None else kind(**tensors), header, extra
+
+    def _final(
+        self, stage: str, schema: Any
+    ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
+        """Tensors and header of a stage's final state, and its file; None: there is none."""
+        path = self.final_path(stage)
+        if not path.exists():
+            return None
+        tensors, header = read_tensors(path)
+        fit(schema, header, str(path))
+        if header["stage"] != stage:
+            raise SkillweaveError(f"{path} holds the state of stage {shown(header['stage'])}")
+        self.must_be_ours(header, path)
+        entry = self.stage(stage)
+        if header["steps"] == (entry.get("continued") or [None])[-1]:
+            # Since it was written, other stages have added lines, and evaluations were made.
+            header = {k: v for k, v in header.items() if k not in LINES}
+            header["evaluation_steps"] = entry.get("evaluation_steps", header["evaluation_steps"])
+        return tensors, header, path
+
+    def final_tensors(self, stage: str) -> list[str]:
+        """Return the names of the tensors of a stage's final state; none if there is no such state.
+
+        Raises:
+            SkillweaveError: the file is damaged, or belongs elsewhere.
+        """
+        found = self._final(stage, Checkpoint)
+        return [] if found is None else list(found[0])
 
     def save_policies(self, stage: str, policies: Mapping[str, AgentPolicy]) -> None:
         """Write who learnt in a finished stage; ``save`` then binds the files to the run."""
@@ -254,7 +366,8 @@ class RunDirectory:
         entry = self.stage(stage)
         if entry["status"] != "done":
             raise SkillweaveError(
-                f"{self.path}: the stage {stage!r} is not finished; {command_words('resume', self)}"
+                f"{self.path} is not finished: its stage {stage!r} is not done "
+                f"({saved_words(self)}). Continue it: {resume_words(self)}"
             )
         path = self.policy_path(stage, name)
         tensors, header, sha256 = read_signed(path)
@@ -285,6 +398,9 @@ class RunDirectory:
         """Drop the lines after those that ``line_bytes`` told: training writes them again."""
         self._metrics.rewind(at.get("metrics_bytes"))
         self.lineage.rewind(at.get("lineage_bytes"))
+
+    def _next_step(self) -> str:
+        return resume_words(self)
 
     def metrics(self) -> Iterator[dict[str, Any]]:
         """The lines of ``metrics.jsonl``; a half-written last line is left out."""

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from skillweave.messages import short, shortened
-from skillweave.runs.command_words import command_words
+from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import json_bytes
 from skillweave.runs.hub_errors import asking, status_of
@@ -80,7 +80,7 @@ def check_whole(run: RunDirectory) -> None:
         what = f"the stage {waiting[0]!r} is not done" if waiting else "it is not judged yet"
         raise SkillweaveError(
             f"{run.path} is not finished ({what}), and only finished runs can be shared. Go on "
-            f"with it: {command_words('resume', run)}"
+            f"with it: {resume_words(run)}"
         )
     for stage in run.manifest["stages"]:
         run.load_policies(stage["name"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,16 @@ from skillweave.types import SkillweaveError
 class JsonLines:
     """One file of JSON lines, created with the first line.
 
-    Each line that is read must fit ``schema`` (see ``reading.fit``); None: any object.
+    Args:
+        path: the file.
+        schema: what each line that is read must fit (see ``reading.fit``); None: any object.
+        next_step: returns what to type when a full disk has space again, for messages.
     """
 
-    def __init__(self, path: Path, schema: Any = None) -> None:
-        self.path, self._schema = path, schema
+    def __init__(
+        self, path: Path, schema: Any = None, next_step: Callable[[], str] | None = None
+    ) -> None:
+        self.path, self._schema, self._next_step = path, schema, next_step
         self._file: Any = None
 
     @property
@@ -44,8 +49,11 @@ class JsonLines:
             self.close()  # what could not be written must not be written later
             raise SkillweaveError(
                 f"could not write {self.path}: {error.strerror}. The checkpoint is intact; free "
-                f"space, then: skillweave resume {self.path.parent}"
+                f"space{self._next()}"
             ) from error
+
+    def _next(self) -> str:
+        return "" if self._next_step is None else f", then: {self._next_step()}"
 
     def rewind(self, size: int | None) -> None:
         """Remove all after ``size`` bytes: training will write it again.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import platform
+from contextlib import suppress
 from pathlib import Path
 
 from skillweave.types import SkillweaveError
@@ -13,7 +15,7 @@ except ImportError:  # Windows: nothing keeps two processes apart there
     fcntl = None  # type: ignore[assignment]
 
 NAME = ".lock"
-"""The file in the run that is locked; it is empty."""
+"""The file in the run that is locked; it holds the number of the process and its machine."""
 _held: set[int] = set()
 
 
@@ -27,6 +29,8 @@ class Lock:
             SkillweaveError: another process has it, or the directory cannot be written.
         """
         self._directory, self._path = directory, directory / NAME
+        self.exclusive = False
+        """The system keeps other processes away."""
         try:
             self._handle = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
@@ -37,13 +41,27 @@ class Lock:
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
+            owner = self._owner()
             self.release()
             raise SkillweaveError(
-                f"{directory} is being trained by another process (or by another run of this one); "
-                "wait until it ends, or stop it"
+                f"{directory} is being trained by {owner}; wait until it ends, or stop it"
             ) from error
         except OSError:  # a file system without locks
             return
+        self.exclusive = True
+        with suppress(OSError):  # it is for messages alone
+            os.ftruncate(self._handle, 0)
+            os.write(self._handle, f"{os.getpid()} {platform.node()}\n".encode())
+
+    def _owner(self) -> str:
+        """Return which process holds it, as far as the file says."""
+        number, _, machine = self._path.read_bytes()[:300].decode(errors="replace").partition(" ")
+        if not number.isdecimal():
+            return "another process"
+        if int(number) == os.getpid() and machine.strip() == platform.node():
+            return "another run of this process"
+        where = "" if machine.strip() == platform.node() else f" on {machine.strip()}"
+        return f"process {number}{where}"
 
     def check(self) -> None:
         """Raise a SkillweaveError where the run is not there any more."""

@@ -174,6 +174,8 @@ class StageEntry(TypedDict):
     """At its end, evaluate whether skills and selector should act greedily or sample."""
     kept: NotRequired[Kept]
     """What was found out at its end."""
+    continued: NotRequired[list[Count]]
+    """Steps after which the stage had ended, and was then given more."""
     starts: NotRequired[dict[NodePath, Start]]
     """By name, who begins with what it has learnt in another run."""
 

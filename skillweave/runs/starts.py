@@ -14,6 +14,7 @@ from typing import Any
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
     check_unchanged,
@@ -55,7 +56,7 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
     if run.unjudged and all(entry["status"] == "done" for entry in run.manifest["stages"]):
         raise SkillweaveError(
             f"start_from: {path} was stopped before its end, while what it learnt was compared "
-            f"with what was there before; finish it first: skillweave resume {path}"
+            f"with what was there before; finish it first: {resume_words(run)}"
         )
     for entry in run.manifest["stages"]:
         if entry["status"] != "done" or entry.get("kept", {}).get("kept") == "before":

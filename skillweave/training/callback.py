@@ -12,7 +12,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.messages import short
-from skillweave.runs.command_words import saved_words
+from skillweave.runs.command_words import resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.tracebacks import place
 from skillweave.types import SkillweaveError
@@ -95,8 +95,8 @@ class TrainCallback:
             error.add_note(
                 "The callback of train() raised this"
                 + (f" ({where})" if where else "")
-                + f", so training stopped. The run is {saved_words(self._run)}; go on with: "
-                f"resume({str(self._run.path)!r}, callback=...)"
+                + f", so training stopped. The run is {saved_words(self._run)}. Continue: "
+                f"{resume_words(self._run)}"
             )
             raise
         if isinstance(answer, bool | np.bool_) and not answer:

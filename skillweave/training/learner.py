@@ -67,11 +67,13 @@ class Learner(Protocol):
         """The environments of ``columns`` (k,) begin anew."""
         ...
 
-    def kept(self) -> dict[str, Tensor]:
+    def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
         """Return what going on exactly needs beside the states of the stacks.
 
-        The latest request is made and not yet answered; the parameters it acts by are a part of
-        this, as with overlap they are one update older than the states.
+        Args:
+            requested: the latest request is not yet answered; the parameters it acts by are a part
+                of this, as with overlap they are one update older than the states.
+            replay: with replay buffers, if the settings save them.
         """
         ...
 
@@ -131,16 +133,18 @@ class RolloutLearner:
     def cut(self, columns: Array) -> None:
         """Nothing to do: trajectories end with each experience."""
 
-    def kept(self) -> dict[str, Tensor]:
+    def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
         """Rows of which there are not enough yet, what a nat of divergence costs, who acts next."""
         coef = {} if self.anchor is None else {"anchor_coef": self.anchor.coef.cpu().clone()}
         params, _ = self._asked
-        return self._store.state() | coef | prefixed("acting", params.state())
+        acting = prefixed("acting", params.state()) if requested else {}
+        return self._store.state() | coef | acting
 
     def load(self, kept: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint kept."""
         algorithm = self._stack.algorithm
-        self._resumed = acting_of(self._stack, unprefixed("acting", kept))
+        acting = unprefixed("acting", kept)
+        self._resumed = acting_of(self._stack, acting) if acting else None
         self._store.load(kept, algorithm.observation_space, algorithm.codec)
         if self.anchor is not None:
             coef = kept["anchor_coef"]

@@ -311,3 +311,24 @@ def resume(
     learner.load(unprefixed("learner", saved))
     learner.cut(begun)
     return begun
+
+
+def begin_episodes(
+    learner: Learner,
+    collectors: Collectors,
+    saved: dict[str, Tensor],
+    at: Progress,
+    seeds: Seeds,
+) -> None:
+    """Continue a stage that had ended, in new episodes.
+
+    Args:
+        saved: the ``extra`` of its final state.
+        at: its steps.
+        seeds: the stage's; the new episodes differ from those at its start.
+    """
+    at.reported = at.steps
+    if kept := unprefixed("learner", saved):
+        learner.load(kept)
+        learner.cut(np.arange(collectors.num_envs))
+    collectors.start(seeds / "continued" / at.steps)

@@ -175,10 +175,11 @@ class ReplayLearner:
         if self._returns is not None:
             self._returns[columns] = 0.0
 
-    def kept(self) -> dict[str, Tensor]:
+    def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
         """What is counted, who acts next, and the store, if it is to be saved."""
-        store = prefixed("store", self.store.state()) if self.config.save_buffer else {}
-        acting = {str(i): params.state() for i, params in enumerate(self._acting)}
+        saved = replay and self.config.save_buffer
+        store = prefixed("store", self.store.state()) if saved else {}
+        acting = {str(i): p.state() for i, p in enumerate(self._acting) if requested}
         for i, state in acting.items():
             store |= prefixed(f"acting.{i}", state)
         return self.counts() | store

@@ -10,7 +10,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.messages import close_matches
 from skillweave.reading import shown
-from skillweave.runs.command_words import command_words
+from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import best_words
 from skillweave.runs.starts import drop_starts
@@ -25,6 +25,8 @@ ENOUGH = 20
 T = TypeVar("T")
 START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
 """Where a stage stands before its first update."""
+LARGEST_SPARE = 100 * 2**20
+"""Bytes of replay buffers that a finished stage keeps; one that keeps none fills a new one."""
 
 
 class Listener(Protocol):
@@ -77,6 +79,7 @@ class StageLog:
     ) -> None:
         self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), dict(at)
         self._callbacks = [x for x in listeners if isinstance(x, TrainCallback)]
+        self._has_final = False
         run.rewind(self.entry | self.at)
         self.entry.update(run.line_bytes() | self.entry, status="training")
         run.save()
@@ -164,6 +167,34 @@ class StageLog:
         self.at["metrics"] = self.at["metrics"] | best.metrics
         self.tell(best_words(self.entry["best"]))
 
+    def save_final(
+        self,
+        state: Any | None,
+        extra: Mapping[str, Tensor],
+        spare: Mapping[str, Tensor],
+        **more: Any,
+    ) -> None:
+        """Write the state from which the stage could continue for more steps.
+
+        Also all is learnt then, should writing the policies fail. A full disk does not stop the
+        stage: its policies are smaller.
+
+        Args:
+            spare: what may be left out: replay buffers. They are, if they are large.
+            more: for the header.
+        """
+        small = sum(x.numel() * x.element_size() for x in spare.values()) <= LARGEST_SPARE
+        for tensors in ({**extra, **spare}, extra) if spare and small else (extra,):
+            try:
+                self.save(state, tensors, **more)
+            except SkillweaveError as error:
+                problem = error
+            else:
+                self._has_final = True
+                return
+        self.run.check()
+        self.tell(f"it cannot be given more steps later, as its final state is not kept: {problem}")
+
     def reached(self, value: float) -> None:
         """The stage has reached its target and ends here."""
         self.entry["reached"] = {"steps": self.at["steps"], "value": value}
@@ -183,7 +214,9 @@ class StageLog:
         for name, state in states.items():
             if learns_again(self.run, entry["name"], name):
                 save_state(self.run, entry["name"], name, state)
-        self.run.save_policies(entry["name"], policies)
+        self._save_policies(policies)
+        if self._has_final:
+            self.run.keep_final(entry["name"])
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
         entry["evaluation_steps"] = at["evaluation_steps"]
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
@@ -203,6 +236,20 @@ class StageLog:
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 
+    def _save_policies(self, policies: Mapping[str, AgentPolicy]) -> None:
+        """Write who learnt; on a full disk in place of what is needed less."""
+        name = self.entry["name"]
+        try:
+            self.run.save_policies(name, policies)
+        except SkillweaveError:
+            if not self.run.make_room():
+                raise
+            self.run.save_policies(name, policies)
+            self.tell(
+                "the disk is full, so final states of stages before it were deleted to make room: "
+                "those stages cannot be given more steps later"
+            )
+
     def _succeeded(self) -> bool | None:
         """Whether any call of the skill was a success; None: nobody says so."""
         if self.entry["kind"] != "skill" or self.entry.get("evolution"):
@@ -213,7 +260,7 @@ class StageLog:
             raise SkillweaveError(
                 f"{self.run.path / 'metrics.jsonl'}: {self.entry['name']!r} has a share of calls "
                 f"that succeeded of {shown(wrong[0])}, which is no number; remove that line, then "
-                f"{command_words('resume', self.run)}"
+                f"{resume_words(self.run)}"
             )
         return max(told) > 0.0 if told else None
 

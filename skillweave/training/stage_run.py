@@ -48,6 +48,11 @@ class StageRun:
         return int(self.entry["budget"])
 
     @property
+    def continues(self) -> bool:
+        """Whether it had ended, and was then given more steps."""
+        return bool(self.entry.get("continued"))
+
+    @property
     def target(self) -> Target | None:
         """Where the stage may end early."""
         told = self.entry.get("target")

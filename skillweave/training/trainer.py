@@ -26,14 +26,14 @@ from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.interrupts import deferred
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, Stack, keep_to_guide
-from skillweave.training.loop import Progress, Saved, resume, train
+from skillweave.training.loop import Progress, Saved, begin_episodes, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import START, Listener, StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
-from skillweave.types import Array, Policy, SkillweaveError
+from skillweave.types import Array, Policy, SkillweaveError, prefixed, unprefixed
 
 
 class OneAgent:
@@ -73,7 +73,9 @@ class OneAgent:
         stage, scene = self.stage, self.stage.scene
         spaces = scene.observation_space, scene.action_space
         self.algorithm = make_algorithm(stage.config, *spaces)
-        self.start = start_of(stage.run, stage.name, stage.name, self.algorithm)
+        self.start = None
+        if not stage.continues:
+            self.start = start_of(stage.run, stage.name, stage.name, self.algorithm)
         return self._beginning()
 
     def _beginning(self) -> Any:
@@ -96,7 +98,7 @@ class OneAgent:
             goes_on_at=log.at["steps"],
         )  # fmt: skip
         keep_to_guide(found, stage.entry.get("guide_kl"))
-        if self.start is not None and isinstance(found, ReplayLearner):
+        if stage.name in stage.entry.get("starts", {}) and isinstance(found, ReplayLearner):
             found.act_from_the_start()
         return found
 
@@ -115,18 +117,26 @@ class OneAgent:
         (policy,) = self.policies().values()
         return episodes_of(policy, arena, seeds)
 
-    def save(self, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Write a checkpoint; ``extra`` is what else resuming needs."""
+    def saved(self, extra: dict[str, Tensor]) -> tuple[Any, dict[str, Tensor]]:
+        """Return the state, and what else a checkpoint holds beside ``extra``, with that."""
         (stack,) = self.learner.stacks
-        log.save(state_to(stack.state, "cpu"), extra | self.best_tensors(), **self.best_header())
+        return state_to(stack.state, "cpu"), extra | self.best_tensors()
 
     def best_tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint holds of the best weights."""
+        """Return what a checkpoint holds of the best weights."""
         return {} if self.best is None else self.best.tensors()
 
     def best_header(self) -> dict[str, Any]:
-        """What its header says of them."""
+        """Return what its header says of them."""
         return {} if self.best is None else self.best.header()
+
+    def _save_final(self, log: StageLog) -> None:
+        """Write what more steps continue from; environments begin new episodes then."""
+        whole = prefixed("learner", self.learner.kept(requested=False))
+        needed = prefixed("learner", self.learner.kept(requested=False, replay=False))
+        state, extra = self.saved(needed)
+        spare = {k: v for k, v in whole.items() if k not in needed}
+        log.save_final(state, extra, spare, **self.best_header())
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says."""
@@ -135,11 +145,12 @@ class OneAgent:
         self._steps_before = at.steps
         if self.best is not None:
             self.best.load(log.at, extra, self.states(), str(log.run.path))
-        # Where the budget is spent nothing is collected, and the last checkpoint has no episodes.
-        if extra and at.steps < self.stage.budget:
-            learner, collectors, episodes = self.learner, self.collectors, self.episodes
+        learner, collectors, episodes = self.learner, self.collectors, self.episodes
+        if unprefixed("collector", extra):
             ids = resumed(log, lambda: resume(learner, collectors, episodes, extra, at))
             log.tell_begun_anew(len(ids), self.collectors.num_envs)
+        elif at.steps:
+            resumed(log, lambda: begin_episodes(learner, collectors, extra, at, self.stage.seeds))
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Learn until the budget is spent or the target is reached."""
@@ -164,7 +175,7 @@ class OneAgent:
 
         def on_checkpoint(saved: Saved) -> None:
             log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
-            self.save(saved.extra, log)
+            log.save(*self.saved(saved.extra), **self.best_header())
             if log.stop_requested:
                 raise _Stopped
 
@@ -185,11 +196,12 @@ class OneAgent:
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             if isinstance(end, _Stopped):
                 log.stopped()
+                self._save_final(log)
             else:
                 assert target is not None
                 log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
         else:
-            self.save({}, log)  # all is learnt, should writing the policy fail
+            self._save_final(log)
             if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
                 log.tell_learnt_nothing()
         log.tell_absent(self.episodes.tally, over=True)

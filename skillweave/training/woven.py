@@ -127,7 +127,8 @@ class WovenAgents(OneAgent):
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
             stack = Stack(algorithm, state_to(fresh, device))
-            part = self._part(name, stack, log, learnt_before=before is not None)
+            learnt_before = before is not None or name in self.stage.entry.get("starts", {})
+            part = self._part(name, stack, log, learnt_before=learnt_before)
             if anchor is not None:
                 part.anchor = anchor  # type: ignore[attr-defined]
             keep_to_guide(part, self._guide_kl(name))
@@ -151,6 +152,8 @@ class WovenAgents(OneAgent):
         found = self.stage.policies.get(name)
         if isinstance(found, AgentPolicy):
             return found, self._steps_of(name)
+        if self.stage.continues:
+            return None  # all is in its final state
         return start_of(self.stage.run, self.stage.name, name, self.algorithms[name])
 
     def _as_before(
@@ -259,13 +262,13 @@ class WovenAgents(OneAgent):
         with torch_threads(1):
             return player.play(asked, seeds / "start", LONGEST_EPISODE)
 
-    def save(self, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Write a checkpoint: all states are in its extra tensors, too."""
+    def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
+        """Return all states among the extra tensors."""
         assert isinstance(self.learner, WovenLearner)
         states = {"counts": torch.tensor(list(self.learner.counts.values()))}
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
-        log.save(None, extra | states | self.best_tensors(), **self.best_header())
+        return None, extra | states | self.best_tensors()
 
 
 def _collector(

@@ -110,11 +110,11 @@ class WovenLearner:
         for part in self.parts.values():
             part.cut(columns)
 
-    def kept(self) -> dict[str, Tensor]:
+    def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
         """What going on exactly needs beside the states of the stacks, at a clean cut."""
         found: dict[str, Tensor] = {}
         for name, part in self.parts.items():
-            found |= prefixed(name, part.kept())
+            found |= prefixed(name, part.kept(requested=requested, replay=replay))
         return found
 
     def load(self, kept: dict[str, Tensor]) -> None:

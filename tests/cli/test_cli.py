@@ -224,7 +224,7 @@ def test_train_without_a_directory_takes_a_free_one_under_runs(
     common = ("--evaluate", 0, "--quiet", "--json", "--scale", 0.1)
     names = [call("train", trained.plain, *common).json["run"] for _ in range(2)]
     names.append(call("train", trained.plain, "--seed", 5, "--flat", *common).json["run"])
-    assert names == ["runs/plain-s0", "runs/plain-s0-2", "runs/plain-flat-s5"]
+    assert names == ["runs/plain-1", "runs/plain-2", "runs/plain-flat-1"]
     assert all((Path(name) / "run.json").exists() for name in names)
 
 
@@ -237,7 +237,7 @@ def test_train_into_an_existing_run_refuses_and_changes_nothing(
     answer = call("train", trained.plain, "-o", run, "--seed", 9)
     assert answer.code == 1
     assert answer.out == ""
-    assert f"error: {run} already holds a run" in answer.err
+    assert f"error: {run} holds a finished run" in answer.err
     assert f"skillweave resume {run}" in answer.err
     assert {p: p.read_bytes() for p in run.rglob("*.*")} == before
 

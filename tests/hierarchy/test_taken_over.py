@@ -111,7 +111,7 @@ def test_settings_that_differ_are_told_where_a_run_goes_on(
     capsys.readouterr()
     run = declare(**then).resume(tmp_path / "run")
     told = "".join(capsys.readouterr())
-    assert ("goes on with its own settings" in told) == bool(says)
+    assert ("continues with its own settings" in told) == bool(says)
     assert says in told
     assert run.info()["stages"][0]["algorithm"]["gamma"] == ON.gamma
     assert run.hierarchy.selection.call_cost == 0.0
@@ -193,15 +193,18 @@ def test_ctrl_c_says_how_far_it_is_saved_and_how_to_go_on(tmp_path, monkeypatch)
         interrupt_at_checkpoint(patched, 1)
         with pytest.raises(KeyboardInterrupt) as stop:
             declare().train(path, seed=3)
-    assert str(stop.value) == f"saved at 128 steps of left; go on with: resume({str(path)!r})"
+    line = f'hierarchy.train("{path}", seed=3, resume=True)'
+    assert str(stop.value) == f"saved at 128 steps of left. Continue: {line}"
 
     def stop_at_once(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("skillweave.training.stage_log.StageLog.tick", stop_at_once)
-    with pytest.raises(KeyboardInterrupt, match=r"^saved at 128 steps of left; go on"):
+    with pytest.raises(
+        KeyboardInterrupt, match=r"^saved at 128 steps of left\. Continue: hierarchy"
+    ):
         declare().resume(path)
-    with pytest.raises(KeyboardInterrupt, match=r"^saved at the start; go on"):
+    with pytest.raises(KeyboardInterrupt, match=r"^saved at the start\. Continue: hierarchy"):
         declare().train(tmp_path / "other")
 
 

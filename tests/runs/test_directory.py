@@ -114,10 +114,11 @@ def test_a_new_run_can_be_opened_and_says_what_made_it(run: RunDirectory) -> Non
 
 
 def test_an_existing_run_is_never_overwritten(run: RunDirectory) -> None:
+    save(run, 1)
     before = (run.path / "run.json").read_bytes()
-    with pytest.raises(SkillweaveError, match=r"already holds a run.*skillweave resume") as caught:
+    with pytest.raises(SkillweaveError, match=r"unfinished run, saved at 10 steps") as caught:
         RunDirectory.create(run.path, manifest() | {"seed": 8})
-    assert str(run.path) in str(caught.value)
+    assert f'hierarchy.train("{run.path}", seed=7, resume=True)' in str(caught.value)
     assert (run.path / "run.json").read_bytes() == before
 
 
@@ -201,7 +202,7 @@ def test_the_latest_checkpoint_counts_and_no_other_files_stay(run: RunDirectory)
     found = run.load_checkpoint(Learnt, "landing")
     assert found is not None
     assert_same(found[0], states[2])
-    names = {p.name for p in run.path.iterdir()}
+    names = {p.name for p in run.path.iterdir()} - {".lock"}
     assert names == {"run.json", "checkpoint.safetensors", "checkpoint.previous.safetensors"}
 
 
@@ -272,7 +273,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_two(
     found = run.load_checkpoint(Learnt, "landing")
     assert found is not None
     assert_same(found[0], kept)
-    names = {p.name for p in run.path.iterdir()}
+    names = {p.name for p in run.path.iterdir()} - {".lock"}
     assert names == {"run.json", "checkpoint.safetensors", "checkpoint.previous.safetensors"}
 
 
@@ -301,7 +302,7 @@ def test_a_finished_policy_comes_back_exactly(run: RunDirectory, policy: AgentPo
 
 
 def test_a_policy_of_an_unfinished_stage_says_how_to_finish_it(run: RunDirectory) -> None:
-    with pytest.raises(SkillweaveError, match="'landing' is not finished; skillweave resume"):
+    with pytest.raises(SkillweaveError, match=r"'landing' is not done .*resume=True\)"):
         run.load_policy("landing")
 
 
@@ -386,7 +387,7 @@ def test_metrics_on_a_full_disk_say_so_and_the_run_can_still_be_closed(tmp_path:
     (run.path / "metrics.jsonl").symlink_to("/dev/full")
     with pytest.raises(SkillweaveError, match="No space left") as caught:
         run.log({"update": 1})
-    assert "skillweave resume" in str(caught.value)
+    assert "resume=True)" in str(caught.value)
     run.close()
 
 
@@ -569,7 +570,9 @@ def test_a_checkpoint_with_a_damaged_header_falls_back_to_the_one_before(
 def test_two_may_not_train_a_run_at_once(run: RunDirectory) -> None:
     run.begin()
     second = RunDirectory.open(run.path)  # may be read
-    with pytest.raises(SkillweaveError, match="being trained by another process") as caught:
+    with pytest.raises(
+        SkillweaveError, match="being trained by another run of this process"
+    ) as caught:
         second.begin()
     assert str(run.path) in str(caught.value)
     run.close()
@@ -601,7 +604,7 @@ def test_a_process_that_is_killed_holds_the_run_no_longer(run: RunDirectory, wor
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
-        with pytest.raises(SkillweaveError, match="another process"):
+        with pytest.raises(SkillweaveError, match=f"trained by process {process.pid};"):
             run.begin()
         process.kill()
         process.wait()

@@ -6,7 +6,7 @@ from skillweave.types import SkillweaveError
 
 def test_lines_that_cannot_be_written_name_the_file_and_what_to_do(tmp_path):
     (tmp_path / "lineage.jsonl").mkdir()
-    with pytest.raises(SkillweaveError, match=r"could not write .*lineage\.jsonl.*resume"):
+    with pytest.raises(SkillweaveError, match=r"could not write .*lineage\.jsonl.*free space"):
         JsonLines(tmp_path / "lineage.jsonl").append([{"a": 1}])
 
 

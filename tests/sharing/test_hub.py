@@ -188,7 +188,7 @@ def test_an_unfinished_or_damaged_run_is_refused_before_the_hub_hears_of_it(
     directory = RunDirectory.open(run.path)
     directory.stage("selector")["status"] = "training"
     directory.save()
-    with pytest.raises(SkillweaveError, match=r"'selector' is not done.*skillweave resume"):
+    with pytest.raises(SkillweaveError, match=r"'selector' is not done.*resume=True"):
         run.push(NAME)
     assert hub.asked == []
 

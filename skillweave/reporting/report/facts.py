@@ -14,7 +14,7 @@ from skillweave.types import flat
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
     "steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers",
-    "succeeded", "compared", "greedy_judged", "stopped", "best",
+    "succeeded", "compared", "greedy_judged", "stopped", "best", "continued",
 }  # fmt: skip
 """Of a stage's entry what training wrote, or what follows from settings of the hierarchy."""
 
@@ -60,6 +60,8 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
     for entry in run.manifest["stages"]:
         final = (entry.get("final") or {}).get("return")
         notes = []
+        if continued := entry.get("continued"):
+            notes.append(f"continued after {', '.join(f'{k:,}' for k in continued)} steps")
         if reached := entry.get("reached"):
             notes.append(f"target reached after {reached['steps']:,} steps")
         if stopped := entry.get("stopped"):

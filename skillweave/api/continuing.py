@@ -1,0 +1,249 @@
+"""``train(..., resume=True)``: continue what is in a directory, perhaps for more steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from skillweave.api.adoption import adopted, check_run, differences
+from skillweave.evolution.plan import Evolve, plan
+from skillweave.hierarchy import training
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.runs.command_words import from_command_line, start_words
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import is_copy_of_hub
+from skillweave.training.stage import decides
+from skillweave.types import SkillweaveError
+
+if TYPE_CHECKING:
+    from skillweave.api import Agent, Hierarchy
+
+EVALUATIONS = "evaluation*.json"
+"""Saved evaluations of a run, which are of the policy before it continued."""
+
+
+def to_continue(path: Path) -> RunDirectory | None:
+    """Return the run in a directory, if there is something to continue."""
+    if not (path / "run.json").exists():
+        return None
+    run = RunDirectory.open(path)
+    return run if run.finished or run.has_learnt else None
+
+
+def prepared(
+    declared: Hierarchy | Agent,
+    content: dict[str, Any],
+    run: RunDirectory,
+    evolve: Evolve,
+    track: Sequence[str],
+) -> tuple[Hierarchy | Agent, str]:
+    """Return a declaration as a run has it, and what people should know; the run is locked.
+
+    Stages whose budgets have grown get the new ones.
+
+    Args:
+        content: the manifest of the declaration, as a new run would have it.
+
+    Raises:
+        SkillweaveError: the run is one of another declaration, or a stage cannot continue.
+    """
+    _check_same(declared, content, run)
+    own = adopted(declared, run) if isinstance(declared, Declaration) else declared
+    budgets = _budgets(own, content, run, evolve)
+    sentences = [] if declared.recorded else [differences(content, run, budgets=False)]
+    if tuple(track) != tuple(run.manifest.get("track", ())):
+        known = ", ".join(run.manifest.get("track", ())) or "none"
+        sentences.append(f"the run continues with its own trackers: {known}")
+    if not run.finished or max(_more(run.manifest["stages"], budgets).values()) > 0:
+        run.begin(finished=True)
+    try:
+        sentences += _grow(run, budgets)
+    except BaseException:
+        run.close()
+        raise
+    if run.finished and not any(entry.get("reached") for entry in run.manifest["stages"]):
+        more = "--set steps=N, or --scale" if from_command_line() else "more steps"
+        sentences.append(
+            f"{run.path} is finished, so nothing is trained; to train it for longer, give it {more}"
+        )
+    return own, "; ".join(filter(None, sentences))
+
+
+def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: RunDirectory) -> None:
+    """Raise a SkillweaveError where a run is one of another declaration."""
+    check_run(declared, run)
+    manifest = run.manifest
+    if content["kind"] != manifest["kind"]:
+        flat = "--flat" if from_command_line() else "flat=True"
+        one, other = f"a flat agent ({flat})", "a hierarchy"
+        if manifest["kind"] == "hierarchy":
+            one, other = other, one
+        raise SkillweaveError(
+            f"{run.path} is the run of {one}, but it was to continue as {other}; choose another "
+            "directory"
+        )
+    mine, theirs = declared.recipe, manifest.get("recipe")
+    if mine and theirs and Path(mine).name != Path(theirs).name:
+        raise SkillweaveError(
+            f"{run.path} is a run of the recipe {theirs}, not of {mine}; choose another directory"
+        )
+    if content["seed"] != manifest["seed"]:
+        raise SkillweaveError(
+            f"{run.path} was trained with seed {manifest['seed']}, not {content['seed']}; give "
+            "that seed, or choose another directory"
+        )
+
+
+def _budgets(
+    declared: Hierarchy | Agent, content: dict[str, Any], run: RunDirectory, evolve: Evolve
+) -> dict[str, int]:
+    """Return the budgets of a run's stages as they are declared now, where both have the stage."""
+    stages: list[dict[str, Any]] = content["stages"]
+    if run.manifest["kind"] == "hierarchy":
+        assert isinstance(declared, Declaration)
+        # As the run learns, apart or together: it may be declared otherwise now.
+        stages = training.manifest(declared, seed=content["seed"])["stages"]
+        names = {stage["name"] for stage in stages}
+        if not isinstance(evolve, Mapping) or set(evolve) <= names:
+            plan(stages, evolve)
+    theirs = {entry["name"]: entry for entry in run.manifest["stages"]}
+    found = {}
+    for stage in stages:
+        if (entry := theirs.get(stage["name"])) is not None:
+            members, known = _members(stage), _members(entry)
+            # A population's budget is that of all members.
+            found[stage["name"]] = stage["budget"] // members * known
+    return found
+
+
+def _members(entry: Mapping[str, Any]) -> int:
+    return int((entry.get("evolution") or {"population": 1})["population"])
+
+
+def _more(stages: Sequence[Mapping[str, Any]], budgets: Mapping[str, int]) -> dict[str, int]:
+    """Return by how much the budgets of stages are larger now."""
+    found: dict[str, int] = {}
+    for entry in stages:
+        heir = _heir(stages, entry)["name"]
+        declared = budgets.get(entry["name"], entry["budget"])
+        found[heir] = found.get(heir, 0) + declared - entry["budget"]
+    return found
+
+
+def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
+    """Give stages of a run more steps, and write that; sentences about it.
+
+    A stage whose learners learn again in a later one stays as it is: what it would learn now, that
+    stage would not know of. The later one gets its steps, too.
+    """
+    stages: list[dict[str, Any]] = run.manifest["stages"]
+    more = _more(stages, budgets)
+    finished, grown, sentences = run.finished, list[dict[str, Any]](), list[str]()
+    for entry in stages:
+        name, budget = entry["name"], entry["budget"]
+        wanted = budget + more.get(name, 0)
+        if wanted < budget:
+            sentences.append(f"{name} keeps its {budget:,} steps (declared now: {wanted:,})")
+        elif wanted > budget and entry.get("reached"):
+            sentences.append(f"{name} has reached its target, so it gets no more steps")
+        elif wanted > budget and entry["status"] == "done" and not finished:
+            sentences.append(f"{name} can be given more steps once the run is finished")
+        elif wanted > budget:
+            sentences.append(f"{name} continues: {budget:,} → {wanted:,} steps")
+            grown.append(entry)
+    for entry in grown:
+        _check_grows(run, entry, more[entry["name"]])
+    for entry in grown:
+        entry["budget"] += more[entry["name"]]
+        if entry["status"] == "done":
+            entry["status"] = "waiting"
+            entry["continued"] = [*entry.get("continued", []), entry["steps"]]
+            for key in MADE_AT_THE_END:
+                entry.pop(key, None)
+    if grown:
+        run.save()
+        for path in run.path.glob(EVALUATIONS):
+            path.unlink()
+    return sentences + _stale(stages, grown)
+
+
+MADE_AT_THE_END = (
+    "steps",
+    "seconds",
+    "steps_per_second",
+    "final",
+    "kept",
+    "succeeded",
+    "stopped",
+    "best",
+    "sha256",
+    "policies",
+    "metrics_bytes",
+    "lineage_bytes",
+)
+"""Of a stage's entry what training writes again when it has continued."""
+
+
+def _heir(stages: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the latest stage in which one learns who learns in this one."""
+    own = set(entry["learns"])
+    return next(other for other in reversed(stages) if own & set(other["learns"]))
+
+
+def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None:
+    """Raise a SkillweaveError where a stage cannot be given more steps."""
+    name = entry["name"]
+    new = f"Begin a new run with what it has learnt: {start_words(run)}"
+    if entry.get("evolution"):
+        raise SkillweaveError(
+            f"{run.path}: stage {name!r} is a population, which cannot be given more steps, as "
+            f"only its best member is kept. {new}"
+        )
+    if entry["status"] != "done":
+        return
+    if is_copy_of_hub(run.path) or not run.final_path(name).exists():
+        raise SkillweaveError(
+            f"{run.path} cannot be given more steps: it does not hold the final state of stage "
+            f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"
+        )
+    tensors, left = run.final_tensors(name), entry["budget"] + more - entry["steps"]
+    for learner, config in _algorithms(entry).items():
+        waits = config.get("learning_starts", 0)
+        place = "extra.learner." + (f"{learner}." if "together" in entry else "") + "store."
+        if left <= waits and not any(tensor.startswith(place) for tensor in tensors):
+            raise SkillweaveError(
+                f"{run.path}: {learner!r} would learn nothing in {left:,} more steps, as its "
+                f"replay buffer is not kept and the first {waits:,} (learning_starts) fill a new "
+                "one; give more steps"
+            )
+
+
+def _algorithms(entry: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the settings of a stage's learners, by name."""
+    first = entry["decides"] if "together" in entry else entry["name"]
+    beside: dict[str, dict[str, Any]] = entry.get("algorithms", {})
+    return ({first: entry["algorithm"]} if first in entry["learns"] else {}) | beside
+
+
+def _stale(stages: Sequence[Mapping[str, Any]], grown: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a sentence on each selector that stays as it is, while skills of it learn on."""
+    found = []
+    for at, entry in enumerate(stages):
+        node = entry["name"].rpartition("/")[0]
+        if entry["status"] != "done" or entry in grown or not decides(str(entry["decides"])):
+            continue
+        within = f"{node}/" if node else ""
+        skills = [
+            name
+            for other in stages[:at]
+            if other in grown
+            for name in other["learns"]
+            if name.startswith(within)
+        ]
+        if skills:
+            found.append(
+                f"{entry['name']} stays as it is, so it still chooses for {', '.join(skills)} as "
+                "they were; give it more steps, too"
+            )
+    return found

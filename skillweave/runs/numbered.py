@@ -1,0 +1,46 @@
+"""Numbered directories: where a run is written if the user names no directory."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from pathlib import Path
+
+from skillweave.types import SkillweaveError
+
+FOLDER = Path("runs")
+"""Where numbered directories are made, below the working directory."""
+LONGEST = 60
+"""Characters of a name."""
+
+
+def safe_name(text: str) -> str:
+    """Return ``text`` as the name of a folder: ``ALE/Pong-v5`` becomes ``ALE-Pong-v5``."""
+    name = re.sub(r"[^\w.-]+", "-", text, flags=re.ASCII)[:LONGEST].strip("-.")
+    return name or "run"
+
+
+def make_numbered(name: str) -> Path:
+    """Make the directory ``runs/<name>-<n>`` and return it; ``n`` is the next free number.
+
+    Two processes that call it at once get two directories.
+
+    Raises:
+        SkillweaveError: it cannot be made.
+    """
+    name = safe_name(name)
+    pattern = re.compile(rf"{re.escape(name)}-(\d+)")
+    try:
+        FOLDER.mkdir(exist_ok=True)
+        taken = (pattern.fullmatch(path.name) for path in FOLDER.iterdir())
+        number = max((int(found[1]) for found in taken if found), default=0) + 1
+        while True:
+            path = FOLDER / f"{name}-{number}"
+            with suppress(FileExistsError):
+                path.mkdir()
+                return path
+            number += 1
+    except OSError as error:
+        raise SkillweaveError(
+            f"could not make a directory in {FOLDER}: {error.strerror}"
+        ) from error

@@ -1,0 +1,548 @@
+"""``train(..., resume=True)``: begin, continue, and give a finished run more steps."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from small_runs import (
+    MEMORY,
+    OFF,
+    ON,
+    Balance,
+    Left,
+    Push,
+    Stopped,
+    assert_same,
+    interrupt_at_checkpoint,
+    lines,
+    policies,
+)
+
+import skillweave as sw
+from skillweave import (
+    SAC,
+    Agent,
+    EnvSpec,
+    Evolution,
+    Hierarchy,
+    Network,
+    Reflex,
+    Run,
+    SkillweaveError,
+)
+from skillweave.cli.main import main
+from skillweave.runs import files
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.files import read_tensors
+from skillweave.training import stage_log
+
+CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
+
+
+def declare(steps: int = 256, **settings: Any) -> Hierarchy:
+    own = {"algorithm": ON, "selector": ON, "learn": "apart"} | settings
+    return Hierarchy(CARTPOLE, [Left(), Balance()], steps=steps, **own)
+
+
+def nested(steps: int, **settings: Any) -> Hierarchy:
+    own = {"algorithm": ON, "selector": ON} | settings
+    inner = Hierarchy(CARTPOLE, [Left(), Push()], name="inner", **own)
+    return Hierarchy(CARTPOLE, [inner.as_skill("inner"), Balance()], steps=steps, **own)
+
+
+def agent(steps: int, algorithm: Any = ON) -> Agent:
+    return Agent(CARTPOLE, algorithm, steps)
+
+
+KINDS: dict[str, Callable[[int], Any]] = {
+    "an agent with PPO": agent,
+    "an agent with DQN": lambda steps: agent(steps, OFF),
+    "an agent with a memory": lambda steps: agent(steps, MEMORY),
+    "apart": declare,
+    "together": lambda steps: declare(steps, learn="together"),
+    "together with DQN": lambda steps: declare(steps, learn="together", algorithm=OFF),
+    "apart with DQN": lambda steps: declare(steps, algorithm=OFF),
+    "first apart": lambda steps: declare(steps, learn="apart, then together"),
+    "nested apart": lambda steps: nested(steps, learn="apart"),
+    "nested together": lambda steps: nested(steps, learn="together"),
+}
+QUICK = ("an agent with PPO", "an agent with DQN")
+
+
+def by_kind(name: str) -> Any:
+    return pytest.param(name, id=name, marks=[] if name in QUICK else [pytest.mark.slow])
+
+
+def stages(run: Run | Path) -> dict[str, dict[str, Any]]:
+    path = run.path if isinstance(run, Run) else run
+    return {s["name"]: s for s in RunDirectory.open(path).manifest["stages"]}
+
+
+def assert_metrics_rise(path: Path) -> None:
+    """Every stage's updates, steps and seconds rise from line to line, over all its trainings."""
+    rows = lines(path)
+    assert rows
+    for name in {row["stage"] for row in rows}:
+        own = [row for row in rows if row["stage"] == name]
+        for field in ("update", "steps"):
+            values = [row[field] for row in own]
+            assert values == sorted(set(values)), f"{field} of {name} does not rise"
+        assert [row["seconds"] for row in own] == sorted(row["seconds"] for row in own)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run"
+
+
+# More steps
+
+
+@pytest.mark.parametrize("kind", [by_kind(name) for name in KINDS])
+def test_a_finished_run_learns_on_for_more_steps(kind: str, path: Path) -> None:
+    declared = KINDS[kind]
+    first = declared(512).train(path, seed=3, quiet=True)
+    weights, before, told = policies(path), stages(path), lines(path)
+    run = declared(1_024).train(path, seed=3, resume=True, quiet=True)
+    assert run.path == first.path
+    after = stages(run)
+    grown = [name for name, entry in after.items() if entry.get("continued")]
+    assert grown
+    if kind == "first apart":
+        assert grown == ["together"], "what the others learn now it would not know of"
+    for name, entry in after.items():
+        assert entry["status"] == "done"
+        file = f"{name.replace('/', '.')}.safetensors"
+        if name in grown:
+            assert entry["continued"] == [before[name]["steps"]]
+            assert entry["steps"] >= entry["budget"] > before[name]["budget"]
+            assert entry["seconds"] > before[name]["seconds"]
+        else:
+            assert entry == before[name]
+            assert policies(path)[file] == weights[file]
+    assert any(policies(path)[name][1] != old[1] for name, old in weights.items())
+    assert sum(e["budget"] for e in after.values()) == 1_024
+    assert lines(path)[: len(told)] == told
+    assert len(lines(path)) > len(told)
+    assert_metrics_rise(path)
+    assert not list(path.glob("checkpoint*"))
+    assert run.evaluate(2, quiet=True) == declared(1_024).load(path).evaluate(2, quiet=True)
+    done = policies(path)
+    declared(1_024).train(path, seed=3, resume=True, quiet=True)
+    assert policies(path) == done, "the same call again trains nothing"
+
+
+def test_more_steps_continue_from_all_that_was_learnt(path: Path) -> None:
+    agent(256).train(path, quiet=True)
+    before = read_tensors(path / "final/agent.safetensors")[0]
+    agent(512).train(path, resume=True, quiet=True)
+    after = read_tensors(path / "final/agent.safetensors")[0]
+    counts = [k for k in before if k in ("obs_count", "adam_step", "steps", "updates")]
+    assert "obs_count" in counts
+    for name in counts:
+        assert float(after[name].max()) > float(before[name].max()), name
+    assert before.keys() == after.keys()
+
+
+def test_new_episodes_are_not_those_of_the_beginning(path: Path, tmp_path: Path) -> None:
+    agent(128).train(path, quiet=True)
+    agent(256).train(path, resume=True, quiet=True)
+    agent(256).train(tmp_path / "whole", quiet=True)
+    assert (
+        policies(path)["agent.safetensors"][1]
+        != policies(tmp_path / "whole")["agent.safetensors"][1]
+    )
+
+
+@pytest.mark.parametrize("kind", ["an agent with DQN", "apart"])
+@pytest.mark.slow
+def test_a_continued_run_that_is_stopped_ends_the_same(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(path: Path, steps: int) -> None:
+        KINDS[kind](steps).train(path, seed=3, resume=True, checkpoint_every=64, quiet=True)
+
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    for path in (whole, stopped):
+        train(path, 512)
+    train(whole, 1_024)
+    for number in (1, 3):
+        with monkeypatch.context() as patched:
+            interrupt_at_checkpoint(patched, number)
+            with pytest.raises(KeyboardInterrupt, match=r"saved at .*resume=True\)"):
+                train(stopped, 1_024)
+    train(stopped, 1_024)
+    assert_same(stopped, whole)
+
+
+def test_a_continuation_that_is_killed_at_once_continues(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(256).train(path, quiet=True)
+    with monkeypatch.context() as patched:
+        patched.setattr(stage_log.StageLog, "tick", lambda *_: (_ for _ in ()).throw(Stopped))
+        with pytest.raises(Stopped):
+            agent(512).train(path, resume=True, quiet=True)
+    with pytest.raises(SkillweaveError, match=r"unfinished run, saved at 256 steps of agent"):
+        agent(512).train(path, quiet=True)
+    run = agent(512).resume(path, quiet=True)
+    assert stages(run)["agent"]["steps"] == 512
+    assert_metrics_rise(path)
+
+
+def test_a_run_killed_right_before_it_is_done_ends_the_same(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(256, OFF).train(tmp_path / "whole", quiet=True)
+    keep = RunDirectory.keep_final
+
+    def killed(self: RunDirectory, stage: str) -> None:
+        keep(self, stage)
+        raise Stopped
+
+    with monkeypatch.context() as patched:
+        patched.setattr(RunDirectory, "keep_final", killed)
+        with pytest.raises(Stopped):
+            agent(256, OFF).train(path, quiet=True)
+    agent(256, OFF).train(path, resume=True, quiet=True)
+    assert_same(path, tmp_path / "whole")
+    agent(512, OFF).train(path, resume=True, quiet=True)
+    agent(512, OFF).train(tmp_path / "whole", resume=True, quiet=True)
+    assert_same(path, tmp_path / "whole")
+
+
+def test_an_evaluation_of_the_policy_before_is_removed(path: Path) -> None:
+    agent(128).train(path, quiet=True).evaluate(1, save=True, quiet=True)
+    assert "evaluation" in agent(128).load(path).info()
+    assert "evaluation" not in agent(256).train(path, resume=True, quiet=True).info()
+
+
+def test_a_skill_that_learns_on_alone_makes_its_selector_old_and_it_is_said(
+    path: Path, capfd
+) -> None:
+    def with_skill(steps: int) -> Hierarchy:
+        found = declare(512)
+        found.skill("left").steps = steps
+        return found
+
+    with_skill(128).train(path, quiet=True)
+    capfd.readouterr()
+    run = with_skill(256).train(path, resume=True)
+    assert [n for n, e in stages(run).items() if e.get("continued")] == ["left"]
+    told = capfd.readouterr().err
+    assert "left continues: 128 → 256 steps" in told
+    assert "selector stays as it is, so it still chooses for left as they were" in told
+
+
+def test_a_stage_that_reached_its_target_stays(path: Path, capfd) -> None:
+    def with_target(steps: int) -> Agent:
+        return Agent(CARTPOLE, ON, steps, target_return=1.0)
+
+    with_target(512).train(path, eval_every=64, eval_episodes=1, quiet=True)
+    done = policies(path)
+    with_target(1_024).train(path, eval_every=64, eval_episodes=1, resume=True)
+    assert "agent has reached its target, so it gets no more steps" in capfd.readouterr().err
+    assert policies(path) == done
+    assert not (path / "final").exists()
+
+
+# The replay buffer, and full disks
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_small_replay_buffer_is_kept(
+    path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool
+) -> None:
+    monkeypatch.setattr(stage_log, "LARGEST_SPARE", 2**20 if kept else 100)
+    agent(256, OFF).train(path, quiet=True)
+    names = RunDirectory.open(path).final_tensors("agent")
+    assert any(".store." in name for name in names) == kept
+    if not kept:
+        with pytest.raises(SkillweaveError, match="would learn nothing in 20 more steps"):
+            agent(276, OFF).train(path, resume=True, quiet=True)
+    before = policies(path)
+    run = agent(384, OFF).train(path, resume=True, quiet=True)
+    assert stages(run)["agent"]["steps"] == 384
+    assert policies(path) != before
+
+
+@pytest.mark.parametrize("allowed", [0, 8_000])
+def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capfd, allowed: int
+) -> None:
+    write = files.write_bytes
+
+    def full(target: Path, data: bytes, **how: Any) -> None:
+        if "checkpoint" in target.name and len(data) > allowed:
+            raise SkillweaveError(f"could not write {target}: No space left on device")
+        write(target, data, **how)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(files, "write_bytes", full)
+        run = agent(256, OFF).train(path)
+    assert run.evaluate(1, quiet=True).mean > 0
+    told = capfd.readouterr().err
+    names = RunDirectory.open(path).final_tensors("agent")
+    assert not any(".store." in name for name in names)
+    assert ("its final state is not kept" in told) == (not names)
+    if not names:
+        with pytest.raises(SkillweaveError, match=r"final state.*start_from="):
+            agent(512, OFF).train(path, resume=True, quiet=True)
+
+
+def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capfd
+) -> None:
+    write, failed = files.write_bytes, []
+
+    def full(target: Path, data: bytes, **how: Any) -> None:
+        if target.name == "selector.safetensors" and (path / "final/left.safetensors").exists():
+            failed.append(1)
+            raise SkillweaveError(f"could not write {target}: No space left on device")
+        write(target, data, **how)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(files, "write_bytes", full)
+        declare().train(path)
+    assert failed == [1]
+    assert "the disk is full, so final states" in capfd.readouterr().err
+    assert sorted(p.name for p in (path / "final").iterdir()) == ["selector.safetensors"]
+    assert RunDirectory.open(path).finished
+
+
+# What cannot be given more steps
+
+
+def test_a_copy_without_final_states_names_start_from(path: Path, tmp_path: Path) -> None:
+    agent(128).train(path, quiet=True)
+    shutil.rmtree(path / "final")
+    with pytest.raises(SkillweaveError, match="final state") as caught:
+        agent(256).train(path, resume=True, quiet=True)
+    line = f'agent.train(start_from="{path}")'
+    assert str(caught.value).endswith(line)
+    assert stages(path)["agent"]["budget"] == 128
+    agent(128).train(tmp_path / "new", start_from=path, quiet=True)
+
+
+def test_a_damaged_final_state_changes_nothing(path: Path) -> None:
+    agent(128).train(path, quiet=True)
+    file, before = path / "final/agent.safetensors", (path / "run.json").read_bytes()
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(SkillweaveError, match=r"final/agent\.safetensors is damaged"):
+        agent(256).train(path, resume=True, quiet=True)
+    assert (path / "run.json").read_bytes() == before
+    assert agent(128).load(path).evaluate(1, quiet=True)
+
+
+@pytest.mark.slow
+def test_a_population_is_refused(path: Path) -> None:
+    how = Evolution(population=2, generations=1, episodes=1)
+    declared = agent(128)
+    declared.train(path, evolve=how, quiet=True)
+    assert not (path / "final").exists()
+    for evolve in (how, None):
+        agent(128).train(path, evolve=evolve, resume=True, quiet=True)
+        with pytest.raises(SkillweaveError, match=r"is a population.*start_from="):
+            agent(256).train(path, evolve=evolve, resume=True, quiet=True)
+
+
+def test_a_stage_that_is_done_waits_for_the_end_of_its_run(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capfd
+) -> None:
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 2)
+        with pytest.raises(KeyboardInterrupt):
+            declare(256).train(path, checkpoint_every=100, quiet=True)
+    assert [e["status"] for e in stages(path).values()].count("done") == 1
+    run = declare(512).train(path, resume=True)
+    assert "left can be given more steps once the run is finished" in capfd.readouterr().err
+    budgets = {name: e["budget"] for name, e in stages(run).items()}
+    assert budgets == {"left": 64, "balance": 128, "selector": 256}
+    run = declare(512).train(path, resume=True, quiet=True)
+    assert {name: e["budget"] for name, e in stages(run).items()} == declare(512).budgets()
+
+
+# Begin, or continue
+
+
+def test_resume_begins_where_there_is_nothing(path: Path, tmp_path: Path) -> None:
+    declare().train(path, seed=3, resume=True, quiet=True)
+    declare().train(tmp_path / "plain", seed=3, quiet=True)
+    assert_same(path, tmp_path / "plain")
+    before = policies(path)
+    declare().train(path, seed=3, resume=True, quiet=True)
+    assert policies(path) == before
+
+
+def test_resume_continues_what_was_stopped(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    declare().train(tmp_path / "whole", checkpoint_every=64, quiet=True)
+    for number in (1, 2):
+        with monkeypatch.context() as patched:
+            interrupt_at_checkpoint(patched, number)
+            with pytest.raises(KeyboardInterrupt):
+                declare().train(path, resume=True, checkpoint_every=64, quiet=True)
+    declare().train(path, resume=True, quiet=True)
+    assert_same(path, tmp_path / "whole")
+
+
+def other_skill() -> Hierarchy:
+    return Hierarchy(CARTPOLE, [Left(), Push()], algorithm=ON, selector=ON, steps=256)
+
+
+def other_env() -> Hierarchy:
+    spec = replace(CARTPOLE, kwargs={"sutton_barto_reward": True})
+    return Hierarchy(spec, [Left(), Balance()], algorithm=ON, selector=ON, steps=256)
+
+
+def other_reflexes() -> Hierarchy:
+    def falls(obs: Any) -> Any:
+        return obs[:, 2] > 9.0
+
+    return declare(reflexes=[Reflex("falls", falls, 0)])
+
+
+def other_recipe() -> Hierarchy:
+    found = declare()
+    found.recipe = "other.py"
+    return found
+
+
+@pytest.mark.parametrize(
+    ("declared", "how", "says"),
+    [
+        (other_skill, {}, "was trained with the skills left, balance, but this hierarchy has"),
+        (other_env, {}, "was trained on CartPole-v1"),
+        (other_recipe, {}, "is a run of the recipe mine.py, not of other.py"),
+        (declare, {"seed": 4}, "was trained with seed 0, not 4"),
+        (declare, {"flat": True}, r"is the run of a hierarchy, .* as a flat agent \(flat=True\)"),
+        (lambda: agent(256), {}, "is the run of a hierarchy, not of a plain agent"),
+        (declare, {"resume": "yes"}, "resume is 'yes'; it must be True or False"),
+    ],
+)
+def test_a_run_of_another_declaration_is_a_sentence(
+    path: Path, declared: Callable[[], Any], how: dict[str, Any], says: str
+) -> None:
+    mine = declare()
+    mine.recipe = "mine.py"
+    mine.train(path, quiet=True)
+    before = (path / "run.json").read_bytes()
+    with pytest.raises(SkillweaveError, match=says):
+        declared().train(path, **{"resume": True, "quiet": True} | how)
+    assert (path / "run.json").read_bytes() == before
+
+
+def test_resume_needs_a_directory() -> None:
+    with pytest.raises(SkillweaveError, match="name its directory"):
+        declare().train(resume=True)
+
+
+def test_settings_that_differ_are_told(path: Path, capfd) -> None:
+    declare().train(path, quiet=True)
+    other = declare(algorithm=replace(ON, gamma=0.9))
+    other.recipe = "mine.py"  # told all the same, as this call says all settings
+    other.train(path, resume=True, eval_every=64, track=["tensorboard"])
+    told = capfd.readouterr().err
+    assert "left.algorithm.gamma is 0.995 (declared now: 0.9)" in told
+    assert "the run continues with its own trackers: none" in told
+    assert "is finished, so nothing is trained" in told
+    fewer = declare(128)
+    fewer.train(path, resume=True)
+    assert "selector keeps its 128 steps (declared now: 64)" in capfd.readouterr().err
+
+
+# Loading
+
+
+def test_a_run_that_acts_by_data_is_loaded_without_its_declaration(path: Path) -> None:
+    run = sw.train_agent("CartPole-v1", ON, 128, path, quiet=True)
+    found = sw.load(path)
+    assert isinstance(found.declaration, Agent)
+    assert found.evaluate(2, quiet=True) == run.evaluate(2, quiet=True)
+    spec = EnvSpec("CartPole-v1")
+    plain = Hierarchy(spec, [Left(), Push()], algorithm=ON, selector=ON, steps=128)
+    with pytest.raises(SkillweaveError, match="was declared in Python") as caught:
+        sw.load(plain.train(path.with_name("other"), quiet=True).path)
+    line = f'sw.load("{path.with_name("other")}", hierarchy)'
+    assert str(caught.value).endswith(line)
+    assert sw.load(path.with_name("other"), plain).hierarchy.skills
+
+
+def test_a_hierarchy_of_data_is_loaded_without_its_declaration(path: Path) -> None:
+    plain = Hierarchy("CartPole-v1", [Left()], algorithm=ON, selector=ON, steps=128)
+    run = plain.train(path, quiet=True)
+    found = sw.load(path)
+    assert [skill.name for skill in found.hierarchy.skills] == ["left"]
+    assert found.evaluate(2, quiet=True).returns == run.evaluate(2, quiet=True).returns
+    with pytest.raises(SkillweaveError, match="it must be the Hierarchy or Agent"):
+        sw.load(path, run)  # type: ignore[arg-type]
+    with pytest.raises(SkillweaveError, match="was trained with the skills"):
+        sw.load(path, declare())
+
+
+def test_code_that_a_run_names_is_not_executed(path: Path) -> None:
+    recipe, trap = path.with_name("trap.py"), path.with_name("sprung")
+    recipe.write_text(f"open({str(trap)!r}, 'w')")
+    declared = declare()
+    declared.recipe = str(recipe)
+    declared.train(path, quiet=True)
+    with pytest.raises(SkillweaveError, match=r"declared in .*trap\.py, and needs that code"):
+        sw.load(path)
+    assert not trap.exists()
+
+
+# The command line
+
+
+def test_the_command_line_begins_continues_and_gives_more_steps(
+    tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("plain.py").write_text(
+        "from skillweave import *\n"
+        "class Left(Skill):\n"
+        "    max_steps = 15\n"
+        "    def reward(self, step):\n"
+        "        return -step.next_obs[:, 0]\n"
+        "on = PPO(num_envs=4, n_steps=8, batch_size=16, network=Network((8,)))\n"
+        "env = EnvSpec('CartPole-v1', engine='sync', workers=1)\n"
+        "hierarchy = Hierarchy(env, [Left()], algorithm=on, selector=on, steps=128)\n"
+    )
+    train = ["train", "plain.py", "--out", "run", "--resume", "--evaluate", "0"]
+    assert main(train) == 0
+    before = policies(Path("run"))
+    assert main([*train, "--json"]) == 0
+    told = capsys.readouterr()
+    assert policies(Path("run")) == before
+    assert "run is finished, so nothing is trained; to train it for longer, give it " in told.err
+    assert main([*train, "--set", "steps=256", "--json"]) == 0
+    (entry,) = json.loads(capsys.readouterr().out)["stages"]
+    assert (entry["budget"], entry["continued"]) == (256, [128])
+    assert main(["info", "run"]) == 0
+    assert "continued after 128 steps" in capsys.readouterr().out
+    assert main([*train, "--seed", "4"]) == 1
+    assert "was trained with seed 0, not 4" in capsys.readouterr().err
+    assert main([*train, "--flat"]) == 1
+    assert "as a flat agent (--flat)" in capsys.readouterr().err
+    assert main(["train", "plain.py", "--resume"]) == 1
+    assert "--out DIR" in capsys.readouterr().err
+    shutil.rmtree("run/final")
+    assert main([*train, "--set", "steps=512"]) == 1
+    assert "skillweave train plain.py --start-from run" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_sac_learns_on(path: Path) -> None:
+    sac = SAC(num_envs=2, batch_size=16, learning_starts=20, network=Network((8,)))
+    for steps in (200, 300):
+        run = sw.train_agent("Pendulum-v1", sac, steps, path, resume=True, quiet=True)
+    assert stages(run)["agent"]["continued"] == [200]
+    assert torch.isfinite(torch.tensor(run.evaluate(1, quiet=True).mean))

@@ -1,0 +1,261 @@
+"""Directories of runs: numbered ones, ones that are replaced, and ones that are left alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from small_runs import ON, Left, StopAt, Stopped, interrupt_at_checkpoint, new_run
+
+import skillweave as sw
+from skillweave import Agent, EnvSpec, Hierarchy, SkillweaveError
+from skillweave.cli.main import main
+from skillweave.hierarchy import training
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.lock import Lock
+from skillweave.runs.numbered import make_numbered, safe_name
+
+CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
+RECIPE = """
+from skillweave import *
+
+class Left(Skill):
+    max_steps = 15
+
+    def reward(self, step):
+        return -step.next_obs[:, 0]
+
+on = PPO(num_envs=4, n_steps=8, batch_size=16, update_epochs=2, network=Network((8,)))
+env = EnvSpec("CartPole-v1", engine="sync", workers=1)
+hierarchy = Hierarchy(env, [Left()], algorithm=on, selector=on, steps=64)
+"""
+
+
+def declare(steps: int = 64, name: str = "hierarchy") -> Hierarchy:
+    return Hierarchy(CARTPOLE, [Left()], algorithm=ON, selector=ON, steps=steps, name=name)
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+# Numbered directories
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("CartPole-v1", "CartPole-v1"),
+        ("ALE/Pong-v5", "ALE-Pong-v5"),
+        ("my.module:Own-v0", "my.module-Own-v0"),
+        ("../up", "up"),
+        ("<lambda>", "lambda"),
+        ("...", "run"),
+    ],
+)
+def test_any_name_becomes_a_folder(text: str, name: str) -> None:
+    assert safe_name(text) == name
+
+
+def test_numbers_go_on_after_the_largest_and_other_files_do_not_count() -> None:
+    for name in ("a-2", "a-10", "a-b-20", "b-30", "a-x"):
+        (Path("runs") / name).mkdir(parents=True)
+    assert make_numbered("a") == Path("runs/a-11")
+    assert make_numbered("a") == Path("runs/a-12")
+    assert make_numbered("c") == Path("runs/c-1")
+
+
+def _several(_: int) -> list[str]:
+    return [str(make_numbered("same")) for _ in range(20)]
+
+
+def test_processes_that_start_at_once_get_directories_of_their_own() -> None:
+    with ProcessPoolExecutor(2) as pool:
+        found = [path for paths in pool.map(_several, range(2)) for path in paths]
+    assert len(set(found)) == 40
+
+
+def test_train_without_a_directory_makes_one_and_prints_it(capfd) -> None:
+    first = declare().train()
+    assert first.path == Path("runs/CartPole-v1-1")
+    assert "run: runs/CartPole-v1-1" in capfd.readouterr().err
+    assert declare(name="walker").train(quiet=True).path == Path("runs/walker-1")
+    assert declare().train(flat=True, quiet=True).path == Path("runs/CartPole-v1-flat-1")
+    assert sw.train_agent(CARTPOLE, ON, 64, quiet=True).path == Path("runs/CartPole-v1-2")
+    assert Agent(lambda: gym.make("CartPole-v1"), ON, 64).train(quiet=True).path == Path(
+        "runs/lambda-1"
+    )
+
+
+def test_a_declaration_that_is_wrong_leaves_no_directory() -> None:
+    with pytest.raises(SkillweaveError, match="nowhere holds no run"):
+        declare().train(start_from="nowhere")
+    assert not Path("runs").exists()
+
+
+# Runs that are replaced
+
+
+def dead_run(path: Path) -> None:
+    """A run that was stopped before its first checkpoint."""
+    run = new_run(declare(steps=2_000), path)
+    with pytest.raises(Stopped):
+        training.train(declare(), run, (StopAt(2),))
+    run.close()
+    assert (path / "metrics.jsonl").stat().st_size
+
+
+def test_a_run_that_has_learnt_nothing_is_replaced() -> None:
+    dead_run(Path("run"))
+    (Path("run") / ".policy.x.tmp").write_bytes(b"half")
+    before = RunDirectory.open("run").manifest["id"]
+    run = declare().train("run", seed=5, quiet=True)
+    assert run.info()["id"] != before
+    assert run.info()["seed"] == 5
+    assert not (run.path / ".policy.x.tmp").exists()
+    (first, *_) = (json.loads(x) for x in (run.path / "metrics.jsonl").read_text().splitlines())
+    assert first["update"] == 1
+
+
+def test_what_a_process_left_before_its_manifest_is_replaced() -> None:
+    Path("run").mkdir()
+    lock = Lock(Path("run"))
+    lock.release()
+    assert declare().train("run", quiet=True).path.is_dir()
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "policies/mine.onnx", "films/a.gif", "report.html"])
+def test_a_file_that_is_not_ours_keeps_all_as_it_is(name: str) -> None:
+    dead_run(Path("run"))
+    file = Path("run") / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("years of work")
+    before = {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()}
+    with pytest.raises(SkillweaveError, match=r"run holds .*nothing there is replaced"):
+        declare().train("run", quiet=True)
+    assert {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()} == before
+
+
+def test_links_are_not_followed() -> None:
+    dead_run(Path("run"))
+    Path("elsewhere").mkdir()
+    Path("elsewhere/weights.safetensors").write_text("years of work")
+    (Path("run") / "starts").symlink_to(Path("elsewhere").absolute())
+    with pytest.raises(SkillweaveError, match="run holds starts"):
+        declare().train("run", quiet=True)
+    assert Path("elsewhere/weights.safetensors").exists()
+
+
+@pytest.mark.parametrize("content", ["", "years of work"])
+def test_a_lock_of_another_program_is_left_alone(content: str) -> None:
+    Path("run").mkdir()
+    Path("run/other.lock").write_text(content)
+    with pytest.raises(SkillweaveError, match="not an empty directory"):
+        declare().train("run", quiet=True)
+    assert [p.name for p in Path("run").iterdir()] == ["other.lock"]
+
+
+HOLD = """
+import sys, time
+from skillweave.runs.directory import RunDirectory
+run = RunDirectory.open("run")
+run.begin()
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_living_process_keeps_its_run_and_is_named() -> None:
+    dead_run(Path("run"))
+    before = Path("run/run.json").read_bytes()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        for resume in (False, True):
+            with pytest.raises(SkillweaveError, match=f"trained by process {process.pid};"):
+                declare().train("run", resume=resume, quiet=True)
+        process.kill()
+    assert Path("run/run.json").read_bytes() == before
+    assert declare().train("run", quiet=True).path.is_dir()
+
+
+def test_a_system_without_locks_replaces_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    dead_run(Path("run"))
+    monkeypatch.setattr("skillweave.runs.lock.fcntl", None)
+    with pytest.raises(SkillweaveError, match="cannot say whether a process uses it"):
+        declare().train("run", quiet=True)
+
+
+# What is said of runs that are kept
+
+
+def test_a_resumable_run_is_kept_and_the_line_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt) as stop:
+            declare(640).train("my run", seed=3, checkpoint_every=64, quiet=True)
+    line = 'hierarchy.train("my run", seed=3, resume=True)'
+    assert str(stop.value).endswith(f"Continue: {line}")
+    with pytest.raises(SkillweaveError, match=re.escape(f"Continue it: {line}")):
+        declare(640).train("my run", quiet=True)
+    with pytest.raises(SkillweaveError, match=r"is not finished.*saved at 64 steps"):
+        sw.load("my run", declare())
+    assert eval(line, {"hierarchy": declare(640)}).info()["stages"][0]["status"] == "done"
+
+
+def test_a_finished_run_is_kept_and_the_lines_are_said() -> None:
+    sw.train_agent("CartPole-v1", ON, 64, "run", quiet=True)
+    with pytest.raises(SkillweaveError) as caught:
+        sw.train_agent("CartPole-v1", ON, 64, "run", quiet=True)
+    assert 'sw.load("run")' in str(caught.value)
+    assert 'train_agent(env, algorithm, steps, "run", resume=True)' in str(caught.value)
+    with pytest.raises(SkillweaveError, match=r'agent\.train\("run", resume=True\)'):
+        Agent("CartPole-v1", ON, 64).train("run", quiet=True)
+    declare().train("flat", flat=True, quiet=True)
+    with pytest.raises(SkillweaveError, match=r'hierarchy\.train\("flat", resume=True, flat=True'):
+        declare().train("flat", flat=True, quiet=True)
+
+
+# The command line
+
+
+def test_the_command_line_keeps_the_same_rule(capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("plain.py").write_text(RECIPE)
+    train = ["train", "plain.py", "--evaluate", "0", "--quiet"]
+    for number in (1, 2):
+        assert main(train) == 0
+        path = f"runs/plain-{number}"
+        out = capsys.readouterr().out
+        assert f"run     {path}\n" in out
+        for name in ("evaluate", "render", "report"):
+            assert f"skillweave {name} {path}\n" in out
+    assert main([*train, "--out", "runs/plain-1"]) == 1
+    assert "skillweave resume runs/plain-1 --recipe plain.py" in capsys.readouterr().err
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        more = ["--set", "steps=640", "--set", "train.checkpoint_every=64", "--out", "x"]
+        assert main([*train, *more]) == 130
+    assert "Continue: skillweave resume x --recipe plain.py\n" in capsys.readouterr().err
+    dead_run(Path("dead"))
+    assert main([*train, "--out", "dead"]) == 0
+
+
+def test_no_handle_stays_open_and_the_caller_is_forgotten() -> None:
+    opened = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
+    main(["train", "nowhere.py"])
+    declare().train("run", quiet=True)
+    for _ in range(2):
+        with pytest.raises(SkillweaveError, match=r"hierarchy\.train\("):
+            declare().train("run", quiet=True)
+    if opened:
+        assert len(os.listdir("/proc/self/fd")) <= opened + 1
