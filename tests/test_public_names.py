@@ -23,8 +23,6 @@ Skill SkillweaveError Step TD3 Together Tournament TrainDefaults TrainEvent Trun
 clip_grad_norm_ envpool evaluate from_function from_hub from_onnx from_sb3 from_torch gae load
 make_options_env mask_logits masked_mean normalise plot_curves register_algorithm register_encoder
 train_agent tree
-make_options_env mask_logits masked_mean normalise plot_curves register_algorithm register_encoder
-train_agent tree
 """
 
 

@@ -620,7 +620,6 @@ def test_a_fixed_action_of_a_reflex_is_checked_before_training(tmp_path):
         ({"seed": 1.5}, "seed is 1.5"),
         ({"seed": True}, "seed is True"),
         ({"run_dir": 5}, "run_dir is 5; it must be a path"),
-        ({"run_dir": None}, "run_dir is None"),
         ({"track": "wandb"}, "track is 'wandb'; it must be a list"),
         ({"track": 5}, "track is 5"),
         ({"evolve": 3}, r"evolve is 3; it must be an Evolution\(\)"),
