@@ -42,6 +42,7 @@ from skillweave.runs import files
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.training import stage_log
+from skillweave.training.periodic import PeriodicEvaluation
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
@@ -149,6 +150,38 @@ def test_more_steps_continue_from_all_that_was_learnt(path: Path) -> None:
     for name in counts:
         assert float(after[name].max()) > float(before[name].max()), name
     assert before.keys() == after.keys()
+
+
+def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
+    agent(512).train(path, quiet=True, callback=lambda event: event.steps < 200)
+    ended = stages(path)["agent"]
+    assert 200 <= ended["steps"] < 512
+    assert ended["stopped"] == {"steps": ended["steps"]}
+    agent(512).train(path, resume=True, quiet=True)
+    assert stages(path)["agent"] == ended, "it is finished"
+    agent(1_024).train(path, resume=True, quiet=True)
+    after = stages(path)["agent"]
+    assert after["steps"] >= 1_024
+    assert after["continued"] == [ended["steps"]]
+    assert "stopped" not in after
+    assert_metrics_rise(path)
+
+
+def test_the_best_weights_of_before_are_kept_if_none_are_better(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worse_and_worse(self: Any, since: int, steps: int, *_: Any, **how: Any) -> Any:
+        return {"eval_return": -float(steps)} if steps // 128 > since // 128 else {}
+
+    monkeypatch.setattr(PeriodicEvaluation, "due", worse_and_worse)
+    agent(512).train(path, quiet=True, keep="best", eval_every=128)
+    best, kept = stages(path)["agent"]["best"], policies(path)
+    assert best["steps"] < 256
+    last = read_tensors(path / "final/agent.safetensors")[0]["params"]
+    agent(1_024).train(path, resume=True, quiet=True)
+    assert stages(path)["agent"]["best"] == best
+    assert policies(path) == kept
+    assert not torch.equal(read_tensors(path / "final/agent.safetensors")[0]["params"], last)
 
 
 def test_new_episodes_are_not_those_of_the_beginning(path: Path, tmp_path: Path) -> None:
