@@ -35,6 +35,9 @@ from skillweave.training.stage_log import START, Listener, StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
 from skillweave.types import Array, Policy, SkillweaveError, prefixed, unprefixed
 
+EARLY = 0.25
+"""Share of a stage's budget after which it is said what has not begun."""
+
 
 class OneAgent:
     """A stage's learner where nothing evolves.
@@ -160,6 +163,8 @@ class OneAgent:
             log.tell_begun_anew(self.collectors.begun_anew, self.collectors.num_envs)
             self.collectors.begun_anew = 0
             log.tell_absent(self.episodes.tally, over=False)
+            if tick.since < EARLY * self.stage.budget <= tick.steps:
+                self.tell_early(tick.steps, log)
             # Where the best is kept, the last weights must have their chance.
             last = self.best is not None and tick.steps >= self.stage.budget
             found = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
@@ -214,6 +219,9 @@ class OneAgent:
         """Let all who learn have what they had at the best evaluation."""
         for stack, state in zip(self.learner.stacks, best.states.values(), strict=True):
             stack.state = state_to(state, stack.state.params.device)
+
+    def tell_early(self, steps: int, log: StageLog) -> None:
+        """Say what has gone wrong so far, while it can still be stopped; nothing for one agent."""
 
     def _learnt_nothing(self) -> bool:
         """Whether its weights are those that it began with."""

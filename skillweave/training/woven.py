@@ -237,6 +237,16 @@ class WovenAgents(OneAgent):
                 )
         return found
 
+    def tell_early(self, steps: int, log: StageLog) -> None:
+        """Name skills that were not called so far."""
+        assert isinstance(self.learner, WovenLearner)
+        for name, (rows, _) in self.learner.counts.items():
+            if not rows and not decides(name):
+                log.tell(
+                    f"skill {name!r} was not called in the first {steps:,} steps; it begins to "
+                    "learn once its initiation() is True where other skills end"
+                )
+
     def policies(self) -> dict[str, AgentPolicy]:
         """By name, who learns, as they are now."""
         stacks = zip(self.algorithms, self.learner.stacks, strict=True)
