@@ -397,6 +397,7 @@ def test_a_run_of_other_levels_is_refused(whole):
         declare(inside(selector=ready)).load(path)
 
 
+@pytest.mark.slow
 def test_a_hierarchy_of_a_run_can_be_a_skill_beside_one_that_is_trained(tmp_path, whole):
     run, _ = whole("apart")
     both = [run.as_skill("done"), inside()]

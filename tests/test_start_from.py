@@ -248,6 +248,7 @@ def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
     assert found[0] != settings(first.info())
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_start_goes_with_the_next_training(source, tmp_path, monkeypatch):
     """Killed between the end of a stage and the removal of what it began with."""
     run = begun(tmp_path / "run", source)

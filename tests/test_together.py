@@ -540,6 +540,7 @@ def test_what_is_asked_to_learn_together_at_last_does_not_evolve(tmp_path):
         hierarchy.train(tmp_path / "run", quiet=True, evolve=Evolution(population=2))
 
 
+@pytest.mark.slow
 def test_continuous_skills_of_several_algorithms_learn_together(tmp_path):
     class Slow(Skill):
         algorithm = SAC(

@@ -336,7 +336,7 @@ def values(algorithm: Any, state: Any, obs: Any) -> list[float]:
     return algorithm.value(state, torch.as_tensor(np.asarray(obs))[None])[0].tolist()
 
 
-@pytest.mark.fast_cases(3)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", [name for name in VALUED if name != "ddpg"])
 def test_a_time_limit_is_bootstrapped(name):
     algorithm, state = trained(acted_in(Allowance(8), name), name)
@@ -372,7 +372,7 @@ class LongCalls(Toy):
         return still, 3 * self.ones, self.never, self.never
 
 
-@pytest.mark.fast_cases(3)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", [name for name in VALUED if name != "ppo with lstm"])
 def test_the_value_of_calls_discounts_by_their_length(name):
     algorithm, state = trained(acted_in(LongCalls(8), name), name)
@@ -445,7 +445,7 @@ class Endless(Masked):
         return next_obs, reward, self.never, self.never
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dqn", "dqn of three steps", "sac of choices"])
 def test_a_forbidden_action_is_never_chosen_in_targets(name):
     # A line for each observation: what is never done keeps the value that it is given here.
@@ -557,6 +557,7 @@ def test_the_value_after_an_end_remembers_what_led_to_it():
     assert tr.last.sum() > 8
 
 
+@pytest.mark.slow
 def test_a_policy_remembers_until_it_starts_anew():
     algorithm, state, env = TABLE["ppo with lstm, vector, Discrete"].learn()
     policy, obs = AgentPolicy.of(algorithm, state), env.show(np.array([1, 1, 2]))

@@ -89,7 +89,7 @@ def on_device(algorithm: Any, mode: FakeTensorMode) -> Any:
     return state
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", ON)
 def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
     config, seen, space = ON[name]

@@ -124,6 +124,7 @@ def test_an_anchor_is_no_distance_from_the_policy_that_it_is_a_copy_of(space, ne
     torch.testing.assert_close(samples.anchor.reshape(1, T, B, -1), rollout.head)
 
 
+@pytest.mark.slow
 def test_an_anchor_keeps_a_policy_with_a_memory_near():
     algorithm, _ = made(network=GRU, update_epochs=8)
     moved = {}

@@ -112,6 +112,7 @@ def test_the_environment_moves_as_the_exact_process_says():
         assert (np.abs(found - right) <= 5.0 * np.sqrt(right * (1.0 - right) / n)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("goal", "which"), [(G1, "H"), (G2, "A+H")])
 def test_decisions_have_the_exact_multi_time_model(goal, which):
     """Means of Σ γᵏ rₖ and of γ^τ by successor, whose variances are known exactly, too."""

@@ -190,6 +190,7 @@ def test_steps_are_counted_as_they_were_made(done):
         assert r.budget <= r.steps < r.budget + 3 * rollout + 1
 
 
+@pytest.mark.slow
 def test_the_best_single_skill_goes_to_the_side_that_pays(done):
     found = {r.task: r for r in done.all("line") if r.agent == "always-right"}
     best = {r.task: r for r in done.all("line") if r.agent == "F4-best-skill"}

@@ -149,6 +149,7 @@ def test_a_split_population_goes_on_from_its_last_generation(whole, tmp_path, mo
     assert_same(tmp_path / "run", whole)
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("network", [Network((8, 6)), Network((8,), rnn=RNN("gru", 4))])
 def test_one_part_is_the_population_itself(network):
     config, scene = replace(SMALL, network=network), skill_scene(EnvSpec(Walk, engine="sync"))

@@ -122,7 +122,7 @@ def same(a: Any, b: Any) -> bool:
     return np.allclose(a, b, rtol=1e-4, atol=1e-5) if a.dtype.kind == "f" else bool((a == b).all())
 
 
-@pytest.mark.fast_cases(2)
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_a_plain_agent_acts_as_here(case: Any, tmp_path: Path) -> None:
     config, obs_space, action_space = case

@@ -319,7 +319,7 @@ def small(**how: Any) -> Hierarchy:
     return found
 
 
-@pytest.mark.fast_cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", ["apart", "together"])
 def test_a_stopped_run_ends_as_if_it_had_not_been_stopped(tmp_path, learn):
     small(learn=learn).train(tmp_path / "whole", seed=3, quiet=True)

@@ -91,6 +91,7 @@ def test_the_median_and_the_quartiles_of_the_seeds_are_drawn(folder: Path, tmp_p
     assert again.paths[1].read_bytes() == found.paths[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_other_bands_agents_metrics_and_names(folder: Path, tmp_path: Path) -> None:
     runs = {"ours": folder / "sweep", "flat": [folder / "flat"]}
     found = plot_curves(runs, tmp_path / "a", band="range")

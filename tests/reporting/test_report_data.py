@@ -227,6 +227,7 @@ def report(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]
     return found
 
 
+@pytest.mark.slow
 def test_an_unfinished_run_is_shown_as_far_as_it_is(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -230,6 +230,7 @@ def test_a_continuation_that_is_killed_at_once_continues(
     assert_metrics_rise(path)
 
 
+@pytest.mark.slow
 def test_a_run_killed_right_before_it_is_done_ends_the_same(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
