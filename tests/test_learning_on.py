@@ -9,7 +9,7 @@ from test_together import Other, declare
 
 from skillweave import SkillweaveError
 from skillweave.hierarchy import select_best, training
-from skillweave.training.stage_log import StageLog
+from skillweave.runs.directory import RunDirectory
 from skillweave.training.woven_learner import WovenLearner
 
 
@@ -22,18 +22,18 @@ def whole(tmp_path_factory):
     """An uninterrupted run, and the states that stages ended and began with."""
     ended, begun = {}, {}
     with pytest.MonkeyPatch.context() as patch:
-        save, init = StageLog.save, WovenLearner.__init__
+        save, init = RunDirectory.save_checkpoint, WovenLearner.__init__
 
-        def saved(self, state, *more, **named):
-            ended[self.entry["name"]] = state
-            save(self, state, *more, **named)
+        def saved(self, state, header, *more):
+            ended[header["stage"]] = state
+            save(self, state, header, *more)
 
         def made(self, parts, how, *more):
             for name, part in parts.items():
                 begun[name] = {k: v.clone() for k, v in vars(part.stacks[0].state).items()}
             init(self, parts, how, *more)
 
-        patch.setattr(StageLog, "save", saved)
+        patch.setattr(RunDirectory, "save_checkpoint", saved)
         patch.setattr(WovenLearner, "__init__", made)
         path = tmp_path_factory.mktemp("then") / "run"
         then().train(path, seed=3, quiet=True)

@@ -53,12 +53,15 @@ def command_words(name: str, run: Told) -> str:
     return words + (f" --recipe {shlex.quote(recipe)}" if own else "")
 
 
-def resume_words(run: Told) -> str:
-    """Return what continues a run: a command, or a line of Python, as the user works."""
+def resume_words(run: Told, *more: str) -> str:
+    """Return what continues a run: a command, or a line of Python, as the user works.
+
+    ``more``: further arguments, of Python.
+    """
     if from_command_line():
         return command_words("resume", run)
-    how = "" if not run.manifest.get("seed") else f"seed={run.manifest['seed']}, "
-    return _call(run, f"{python_string(run.path)}, {how}resume=True")
+    seed = [f"seed={run.manifest['seed']}"] if run.manifest.get("seed") else []
+    return _call(run, ", ".join([python_string(run.path), *seed, "resume=True", *more]))
 
 
 def start_words(run: Told) -> str:

@@ -234,11 +234,24 @@ class RunDirectory:
             state: a dataclass of tensors; None: all is in ``extra``.
             extra: what else resuming needs: environments, a replay buffer.
         """
+        self.check()
+        self._checkpoints.save(*self._as_checkpoint(state, header, extra))
+
+    def save_final(
+        self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
+    ) -> None:
+        """Write a stage's final state, which is no checkpoint; arguments as there."""
+        self.check()
+        path = self.final_path(header["stage"])
+        make_directory(path.parent)
+        write_tensors(path, *self._as_checkpoint(state, header, extra), make_directories=False)
+
+    def _as_checkpoint(
+        self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
-        header = self.place(header["stage"]) | header | self.line_bytes()
-        self.check()
-        self._checkpoints.save(tensors, header)
+        return tensors, self.place(header["stage"]) | header | self.line_bytes()
 
     def drop_checkpoints(self) -> None:
         """Remove the checkpoints of a stage that is done, and said to be so in ``run.json``."""
@@ -272,7 +285,8 @@ class RunDirectory:
     ) -> tuple[S | None, dict[str, Any], dict[str, Tensor]] | None:
         """State, header and extra of a stage's latest good clean cut; None: there is none yet.
 
-        Without a checkpoint it is the stage's final state, if it has one.
+        Without a checkpoint it is the final state of a stage that continues, or whose budget is
+        spent.
 
         Args:
             kind: of the state, a dataclass of tensors; None: there is none.
@@ -283,7 +297,10 @@ class RunDirectory:
             SkillweaveError: checkpoints of this stage exist, but none is good.
         """
         found = self._checkpoints.load(stage, schema, self.must_be_ours)
-        found = found or self._final(stage, schema)
+        if found is None and (final := self._final(stage, schema)) is not None:
+            entry = self.stage(stage)
+            if entry.get("continued") or final[1]["steps"] >= entry["budget"]:
+                found = final
         if found is None:
             return None
         tensors, header, path = found

@@ -96,7 +96,7 @@ class TrainCallback:
                 "The callback of train() raised this"
                 + (f" ({where})" if where else "")
                 + f", so training stopped. The run is {saved_words(self._run)}. Continue: "
-                f"{resume_words(self._run)}"
+                + resume_words(self._run, "callback=callback")
             )
             raise
         if isinstance(answer, bool | np.bool_) and not answer:

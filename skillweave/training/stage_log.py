@@ -132,9 +132,14 @@ class StageLog:
         What ``at`` says of updates and steps must be of this moment; its metrics are the latest
         that were reported.
         """
+        self.run.save_checkpoint(state, self._header(more), extra)
+        self._tell_checkpoint()
+
+    def _header(self, more: Mapping[str, Any]) -> dict[str, Any]:
         kept = ("update", "steps", "evaluation_steps", "seconds", "metrics")
-        header = {"stage": self.entry["name"]} | {k: self.at[k] for k in kept} | more
-        self.run.save_checkpoint(state, header, extra)
+        return {"stage": self.entry["name"]} | {k: self.at[k] for k in kept} | dict(more)
+
+    def _tell_checkpoint(self) -> None:
         for callback in self._callbacks:
             callback.checkpoint(self.entry["name"], self.at["steps"], self.at["metrics"])
 
@@ -172,28 +177,41 @@ class StageLog:
         state: Any | None,
         extra: Mapping[str, Tensor],
         spare: Mapping[str, Tensor],
-        **more: Any,
+        more: Mapping[str, Any],
+        *,
+        spent: bool,
     ) -> None:
         """Write the state from which the stage could continue for more steps.
 
-        Also all is learnt then, should writing the policies fail. A full disk does not stop the
-        stage: its policies are smaller.
+        A full disk does not stop the stage: its policies are smaller.
 
         Args:
+            extra: what continuing needs beside the state.
             spare: what may be left out: replay buffers. They are, if they are large.
-            more: for the header.
+            more: of the header.
+            spent: the budget is spent, so it is a checkpoint first: all is learnt, should writing
+                the policies fail. Else a run that is killed now comes here again from the
+                checkpoint before.
         """
+        header = self._header(more)
+        write = self.run.save_checkpoint if spent else self.run.save_final
         small = sum(x.numel() * x.element_size() for x in spare.values()) <= LARGEST_SPARE
         for tensors in ({**extra, **spare}, extra) if spare and small else (extra,):
             try:
-                self.save(state, tensors, **more)
+                write(state, header, tensors)
             except SkillweaveError as error:
                 problem = error
             else:
-                self._has_final = True
-                return
-        self.run.check()
-        self.tell(f"it cannot be given more steps later, as its final state is not kept: {problem}")
+                self._has_final = spent
+                break
+        else:
+            self.run.check()
+            self.tell(
+                f"it cannot be given more steps later, as its final state is not kept: {problem}"
+            )
+            return
+        if spent:
+            self._tell_checkpoint()
 
     def reached(self, value: float) -> None:
         """The stage has reached its target and ends here."""

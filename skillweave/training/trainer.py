@@ -133,13 +133,17 @@ class OneAgent:
         """Return what its header says of them."""
         return {} if self.best is None else self.best.header()
 
-    def _save_final(self, log: StageLog) -> None:
-        """Write what more steps continue from; environments begin new episodes then."""
+    def _save_final(self, log: StageLog, *, spent: bool) -> None:
+        """Write what more steps continue from; environments begin new episodes then.
+
+        Args:
+            spent: the budget is, so that the state is a checkpoint, too.
+        """
         whole = prefixed("learner", self.learner.kept(requested=False))
         needed = prefixed("learner", self.learner.kept(requested=False, replay=False))
         state, extra = self.saved(needed)
         spare = {k: v for k, v in whole.items() if k not in needed}
-        log.save_final(state, extra, spare, **self.best_header())
+        log.save_final(state, extra, spare, self.best_header(), spent=spent)
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Stand where a checkpoint says."""
@@ -201,12 +205,12 @@ class OneAgent:
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             if isinstance(end, _Stopped):
                 log.stopped()
-                self._save_final(log)
+                self._save_final(log, spent=False)
             else:
                 assert target is not None
                 log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
         else:
-            self._save_final(log)
+            self._save_final(log, spent=True)
             if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
                 log.tell_learnt_nothing()
         log.tell_absent(self.episodes.tally, over=True)

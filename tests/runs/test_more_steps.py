@@ -167,6 +167,50 @@ def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
     assert_metrics_rise(path)
 
 
+def test_a_callback_that_has_ended_a_stage_is_not_called_again(path: Path) -> None:
+    calls: list[sw.TrainEvent] = []
+
+    def stop(event: sw.TrainEvent) -> bool:
+        calls.append(event)
+        return event.steps < 200
+
+    agent(512).train(path, quiet=True, callback=stop)
+    assert [event.steps >= 200 for event in calls].count(True) == 1
+
+
+def test_an_error_of_a_callback_at_the_last_checkpoint_is_not_a_full_disk(path: Path) -> None:
+    def fail(event: sw.TrainEvent) -> None:
+        if event.kind == "checkpoint" and event.steps >= 256:
+            raise SkillweaveError("mine")
+
+    with pytest.raises(SkillweaveError, match="mine"):
+        agent(256).train(path, quiet=True, callback=fail)
+    assert stages(path)["agent"]["status"] == "training"
+    assert stages(agent(256).resume(path, quiet=True))["agent"]["status"] == "done"
+
+
+@pytest.mark.parametrize("every", [60, 100_000])
+def test_a_run_killed_right_after_its_callback_ended_it_comes_there_again(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
+) -> None:
+    def train(run: Path) -> None:
+        agent(512).train(
+            run, resume=True, checkpoint_every=every, quiet=True, callback=lambda e: e.steps < 200
+        )
+
+    def killed(*_: Any) -> None:
+        raise Stopped
+
+    train(tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        patched.setattr(RunDirectory, "save_policies", killed)
+        with pytest.raises(Stopped):
+            train(path)
+    train(path)
+    assert_same(path, tmp_path / "whole")
+    assert stages(path)["agent"]["steps"] == stages(tmp_path / "whole")["agent"]["steps"]
+
+
 def test_the_best_weights_of_before_are_kept_if_none_are_better(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -205,7 +205,7 @@ def test_an_exception_passes_through_and_leaves_a_run_to_resume(
     line = fail.__code__.co_firstlineno + 2
     assert f"{Path(__file__).name}, line {line}" in note
     assert "saved at 320 steps of agent" in note
-    assert note.endswith(f'Continue: agent.train("{path}", resume=True)')
+    assert f'agent.train("{path}", resume=True, callback=callback)' in note
     error.__notes__.clear()
     agent().resume(path, quiet=True)
     assert_same(path, tmp_path / "whole")
