@@ -49,6 +49,6 @@ class Leave(sw.Skill):
 hierarchy = sw.Hierarchy(KeyDoor, [GetKey(), OpenDoor(), Leave()], steps=120_000)
 
 if __name__ == "__main__":  # so that other programs can import this file without training
-    run = hierarchy.train("runs/key-door", seed=0)
+    run = hierarchy.train(seed=0)  # a new folder in runs/
     print(run.evaluate(100))
     run.render("key-door.gif")
