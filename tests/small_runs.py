@@ -22,6 +22,15 @@ OFF = DQN(
     num_envs=4, batch_size=16, learning_starts=20, buffer_size=2_000, train_freq=2, network=SMALL
 )
 MEMORY = PPO(num_envs=4, n_steps=8, batch_size=16, network=Network(hidden=(8,), rnn=RNN("gru", 6)))
+PLAIN_RECIPE = """from skillweave import *
+class Left(Skill):
+    max_steps = 15
+    def reward(self, step):
+        return -step.next_obs[:, 0]
+on = PPO(num_envs=4, n_steps=8, batch_size=16, network=Network((8,)))
+env = EnvSpec('CartPole-v1', engine='sync', workers=1)
+hierarchy = Hierarchy(env, [Left()], algorithm=on, selector=on, steps=STEPS)
+"""
 
 
 class Left(Skill):
@@ -154,6 +163,11 @@ def _stopped(hierarchy: Hierarchy, run: RunDirectory, tick: int) -> RunDirectory
     finally:
         run.close()
     return run
+
+
+def plain_recipe(steps: int) -> str:
+    """The text of a file that declares a small hierarchy of one skill."""
+    return PLAIN_RECIPE.replace("STEPS", str(steps))
 
 
 def reports_every(steps: int) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_runs import MEMORY, OFF, ON, Balance, Left, Push, assert_same
+from small_runs import MEMORY, OFF, ON, Balance, Left, Push, assert_same, plain_recipe
 
 from skillweave import (
     DQN,
@@ -302,16 +302,7 @@ def test_a_program_that_handles_ctrl_c_itself_keeps_its_handler() -> None:
 
 def test_ctrl_c_in_the_command_line_saves_and_names_the_command_to_go_on(tmp_path: Path) -> None:
     recipe, run = tmp_path / "recipe.py", tmp_path / "run"
-    recipe.write_text(
-        "from skillweave import *\n"
-        "class Left(Skill):\n"
-        "    max_steps = 15\n"
-        "    def reward(self, step):\n"
-        "        return -step.next_obs[:, 0]\n"
-        "on = PPO(num_envs=4, n_steps=8, batch_size=16, network=Network((8,)))\n"
-        "env = EnvSpec('CartPole-v1', engine='sync', workers=1)\n"
-        "hierarchy = Hierarchy(env, [Left()], algorithm=on, selector=on, steps=200_000)\n"
-    )
+    recipe.write_text(plain_recipe(200_000))
     command = [sys.executable, "-m", "skillweave", "train", str(recipe), "-o", str(run)]
     with subprocess.Popen(
         [*command, "--evaluate", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -141,7 +141,7 @@ def test_the_recipe_is_worth_interrupting(reference: Reference) -> None:
     assert {r["stage"] for r in found} == {"left", "balance", "selector"}
     for stage in ("left", "balance", "selector"):
         steps = [r["steps"] for r in found if r["stage"] == stage]
-        assert len({s // 75 for s in steps}) >= 4, "too few clean cuts"
+        assert len({s // 75 for s in steps}) >= 4, "too few checkpoints"
     one, two = [r["learning_rate"] for r in found if r["stage"] == "left"][:2]
     assert one != two
 
@@ -172,7 +172,7 @@ def test_a_run_stopped_again_and_again_ends_as_if_it_had_not_been(
     while True:
         run = RunDirectory.open(path)
         try:
-            # As many ticks as reach the next clean cut, but not the one after it.
+            # As many ticks as reach the next checkpoint, but not the one after it.
             training.train(recipes.load(str(recipe)), run, (StopAt(4),))
             break
         except Stopped:

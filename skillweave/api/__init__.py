@@ -247,7 +247,7 @@ class Hierarchy(Declaration):
 
         Raises:
             SkillweaveError: the declaration does not fit the environment, training diverged,
-                ``run_dir`` holds something else, or nobody can start from ``start_from``.
+                ``run_dir`` holds something else, or no learner can start from ``start_from``.
         """
         self.validate()
         seed = whole_number(seed, "seed", 0)
@@ -287,7 +287,7 @@ class Hierarchy(Declaration):
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
         The run's settings count, its steps too, and the code of this hierarchy: methods, functions,
-        conditions. Settings that differ are told, but for those of a population. To train for more
+        conditions. Settings that differ are named, but for those of a population. To train for more
         steps: ``train(run_dir, resume=True)``.
 
         ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a

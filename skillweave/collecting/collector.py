@@ -19,8 +19,8 @@ from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
 """The first columns of ``Collected.episodes``."""
-TOLD = 4
-"""How many these are; those of logged keys of ``info`` follow."""
+FIRST_INFO = 4
+"""The column of the first logged key of ``info``; those of the others follow."""
 
 
 @dataclass
@@ -84,7 +84,7 @@ class Collector:
         self._info_keys = set()
         experience = self._collect(request)
         experience.spent = self.engine.steps_made - before
-        episodes = np.concatenate([np.zeros((0, TOLD + len(self.log_info))), *self._ended])
+        episodes = np.concatenate([np.zeros((0, FIRST_INFO + len(self.log_info))), *self._ended])
         return Collected(experience, episodes, info_keys=frozenset(self._info_keys))
 
     def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
@@ -99,7 +99,7 @@ class Collector:
         """
         self.begun = False
         self.start(seeds)
-        found = np.full((self.num_envs, TOLD + len(self.log_info)), np.nan)
+        found = np.full((self.num_envs, FIRST_INFO + len(self.log_info)), np.nan)
         playing = np.ones(self.num_envs, bool)
         self._prepare(request)
         for _ in range(limit):
@@ -192,8 +192,8 @@ class Collector:
             success: (k,), whether they have succeeded.
             task: their return of the task is another one than that of who acts.
         """
-        told = np.full((len(ids), TOLD + len(self.log_info)), np.nan)
-        for column, key in enumerate(self.log_info, TOLD):
+        told = np.full((len(ids), FIRST_INFO + len(self.log_info)), np.nan)
+        for column, key in enumerate(self.log_info, FIRST_INFO):
             numbers = info_numbers(info, key, ids, self.num_envs)
             if numbers is None:
                 self._info_keys |= set(info_keys(info))

@@ -5,7 +5,7 @@ metrics.jsonl                a line for every update
 lineage.jsonl                a line for every member of every generation, where populations evolve
 evaluation.json              its score: the latest evaluation (``training/evaluation_file.py``)
 evaluation-sampled.json      the latest evaluation that sampled actions on request
-checkpoint.safetensors       the stage under way, at its latest clean cut (and the one before)
+checkpoint.safetensors       the stage under way, at its latest checkpoint (and the one before)
 policies/<stage>.safetensors finished stages
 states/<who>.safetensors      what learns on in a later stage, until that is done
 starts/<who>.safetensors      what learners begin with, from another run, until their stage is done
@@ -75,7 +75,7 @@ class RunDirectory:
         self.lineage = JsonLines(path / "lineage.jsonl", LineageLine, self._next_step)
         self._checkpoints = Checkpoints(path)
         self._lock: Lock | None = None
-        self.told_absent: set[str] = set()
+        self.reported_absent: set[str] = set()
         """Logged keys of ``info`` of which users know already that they do not occur."""
 
     @classmethod
@@ -228,7 +228,7 @@ class RunDirectory:
     def save_checkpoint(
         self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
     ) -> None:
-        """Write a stage's latest clean cut; the one before stays beside it.
+        """Write a stage's latest checkpoint; the one before stays beside it.
 
         Args:
             state: a dataclass of tensors; None: all is in ``extra``.
@@ -283,7 +283,7 @@ class RunDirectory:
     def load_checkpoint(
         self, kind: type[S] | None, stage: str, like: S | None = None, schema: Any = Checkpoint
     ) -> tuple[S | None, dict[str, Any], dict[str, Tensor]] | None:
-        """State, header and extra of a stage's latest good clean cut; None: there is none yet.
+        """State, header and extra of a stage's latest good checkpoint; None: there is none yet.
 
         Without a checkpoint it is the final state of a stage that continues, or whose budget is
         spent.

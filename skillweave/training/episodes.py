@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.collecting.collector import TOLD
+from skillweave.collecting.collector import FIRST_INFO
 from skillweave.types import Array, SkillweaveError
 
 WINDOW = 100  # episodes in the reported means
@@ -67,7 +67,7 @@ class Episodes:
             known = ended[:, column]
             window.extend(known[~np.isnan(known)].tolist())
         if self.tally.keys:
-            logged = {k: ended[:, column] for column, k in enumerate(self.tally.keys, TOLD)}
+            logged = {k: ended[:, column] for column, k in enumerate(self.tally.keys, FIRST_INFO)}
             found = {key for key, numbers in logged.items() if not np.isnan(numbers).all()}
             self.tally.add(InfoTally(self.tally.keys, len(ended), found, set(info_keys)))
 

@@ -220,7 +220,7 @@ def check_counts(kept: dict[str, Tensor], num_envs: int) -> None:
     made = kept["transitions"]
     if made.shape != (2,) or made.dtype != torch.float64:
         raise ValueError(f"the number of its transitions is {made.dtype} {tuple(made.shape)}")
-    # A clean cut is made after learning, so nothing was collected since.
+    # A checkpoint is made after learning, so nothing was collected since.
     learnt, now = made.tolist()
     if learnt != now or not 0.0 <= now < 2.0**53:
         raise ValueError(f"it has learnt from {learnt} of {now} transitions: they must be equal")

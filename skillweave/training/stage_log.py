@@ -151,8 +151,8 @@ class StageLog:
         """
         if not tally.absent or not tally.ended or (tally.ended < ENOUGH and not over):
             return
-        absent = [key for key in tally.absent if key not in self.run.told_absent]
-        self.run.told_absent |= set(absent)
+        absent = [key for key in tally.absent if key not in self.run.reported_absent]
+        self.run.reported_absent |= set(absent)
         others = sorted(tally.others - set(absent))
         there = f"its keys there were {', '.join(others)}" if others else "it was empty there"
         for key in absent:

@@ -111,7 +111,7 @@ class WovenLearner:
             part.cut(columns)
 
     def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
-        """What going on exactly needs beside the states of the stacks, at a clean cut."""
+        """Return what a checkpoint needs beside the states of the stacks."""
         found: dict[str, Tensor] = {}
         for name, part in self.parts.items():
             found |= prefixed(name, part.kept(requested=requested, replay=replay))

@@ -22,6 +22,7 @@ from small_runs import (
     assert_same,
     interrupt_at_checkpoint,
     lines,
+    plain_recipe,
     policies,
 )
 
@@ -584,16 +585,7 @@ def test_the_command_line_begins_continues_and_gives_more_steps(
     tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("plain.py").write_text(
-        "from skillweave import *\n"
-        "class Left(Skill):\n"
-        "    max_steps = 15\n"
-        "    def reward(self, step):\n"
-        "        return -step.next_obs[:, 0]\n"
-        "on = PPO(num_envs=4, n_steps=8, batch_size=16, network=Network((8,)))\n"
-        "env = EnvSpec('CartPole-v1', engine='sync', workers=1)\n"
-        "hierarchy = Hierarchy(env, [Left()], algorithm=on, selector=on, steps=128)\n"
-    )
+    Path("plain.py").write_text(plain_recipe(128))
     train = ["train", "plain.py", "--out", "run", "--resume", "--evaluate", "0"]
     assert main(train) == 0
     before = policies(Path("run"))

@@ -1,4 +1,4 @@
-"""The loop: what is collected and learnt when, what is told, and going on from a clean cut."""
+"""The loop: what is collected and learnt when, what is told, and going on from a checkpoint."""
 
 import os
 import signal
@@ -401,7 +401,7 @@ def test_what_a_lost_worker_did_not_repeat_is_cut_before_rows_of_it_are_kept():
     assert called == ["collect", "take"] * 3 + ["collect", [2, 5], "take"] + ["collect", "take"] * 2
 
 
-# Clean cuts
+# Checkpoints
 
 
 class Stop(Exception):
