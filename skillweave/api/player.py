@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.spaces.packing import parts
+from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
 
@@ -19,8 +17,7 @@ class Player:
     """A policy that acts in one environment and keeps its memory.
 
     ```python
-    import gymnasium as gym
-    import skillweave as sw
+        import skillweave as sw
 
     env = gym.make("CartPole-v1")
     policy = sw.from_function(
@@ -103,23 +100,9 @@ class Player:
         """One observation as a batch of one."""
         found = np.empty((1, *self._shape), self._dtype)
         try:
-            _put(self._space, found, obs)
+            put_observation(self._space, found, 0, obs)
         except (TypeError, ValueError, KeyError, IndexError) as error:
             raise SkillweaveError(
                 f"act() was given an observation that is none of {self._space}: {error}"
             ) from error
         return found
-
-
-def _put(space: gym.Space[Any], out: Array, obs: Any) -> None:
-    """Write an observation, or its parts, into an array of one row."""
-    inner = parts(space)
-    if inner is None:
-        given = np.asarray(obs)
-        if given.shape != out.shape[1:]:
-            raise ValueError(f"it has shape {given.shape}, not {out.shape[1:]}")
-        out[0] = given
-        return
-    keys = range(len(inner)) if isinstance(space, gym.spaces.Tuple) else inner
-    for (name, part), key in zip(inner.items(), keys, strict=True):
-        _put(part, out[name], obs[key])

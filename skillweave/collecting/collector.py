@@ -12,9 +12,10 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.columns import as_wide
 from skillweave.collecting.restored import check_numbers, opened
 from skillweave.envs.engine import Engine, checksums
-from skillweave.envs.infos import info_keys, info_numbers
+from skillweave.envs.infos import info_numbers
 from skillweave.experience import Experience
 from skillweave.seeding import Seeds
+from skillweave.skills.info_words import info_keys
 from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)

@@ -23,9 +23,8 @@ import numpy as np
 
 from skillweave.envs.checks import Watch
 from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks, info_rows
+from skillweave.envs.infos import ActionMasks
 from skillweave.envs.sync import SyncEnvs
-from skillweave.spaces import pack
 from skillweave.types import Array
 
 
@@ -98,8 +97,8 @@ class GymnasiumEngine:
         makers = [functools.partial(make, number=first + i) for i in range(num_envs)]
         self._envs = SyncEnvs(makers, name)
         self.num_envs, self.steps_made = num_envs, 0
-        self.observation_space: gym.Space[Any] = self._envs.single_observation_space
-        self.action_space: gym.Space[Any] = self._envs.single_action_space
+        self.observation_space: gym.Space[Any] = self._envs.observation_space
+        self.action_space: gym.Space[Any] = self._envs.action_space
         self._masks = ActionMasks(self.action_space, num_envs)
         self._watch = Watch(name, self.observation_space, num_envs, first)
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
@@ -174,18 +173,15 @@ class GymnasiumEngine:
     def _begin(self, ids: Array) -> Array:
         """Reset environments ``ids`` to their seeds."""
         obs, info = self._envs.begin(ids, self._seed[ids])
-        self._masks.see(info_rows(info, ids, self.num_envs), ids)
-        return self._watch.begun(pack(self.observation_space, obs), ids)
+        self._masks.see(info, ids)
+        return self._watch.begun(obs, ids)
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
         rows = self._all if ids is None else ids
         # A copy: environments get views of it, and may keep them.
         acted = np.array(action, self.action_space.dtype)
-        obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
-        if ids is not None:
-            info = info_rows(info, ids, self.num_envs)
+        next_obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
         self._masks.see(info, ids, terminated | truncated)
-        next_obs = pack(self.observation_space, obs)
         raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
         self._watch.stepped(raw, ids)
         raw.truncated = (truncated | self._watch.too_long(ids)) & ~terminated

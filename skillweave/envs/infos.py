@@ -2,15 +2,97 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from skillweave.messages import short
+from skillweave.skills.info_words import NUMBERS
 from skillweave.spaces import action_codec
 from skillweave.types import Array, SkillweaveError
+
+
+def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The infos of n environments as one, as Gymnasium's vectors have it.
+
+    Gymnasium casts the values of all environments to the type of the first, 0.5 to 0 for example.
+    Here an array has a type that holds all of them as they are.
+
+    Returns:
+        By key, an array over the n environments: of numbers; of arrays of one shape; else of
+        objects. Dicts are batched in turn. Where an environment does not give the key stands 0, or
+        None among objects, and the (n,) bool under ``_key`` is False.
+    """
+    if not any(infos):
+        return {}
+    n = len(infos)
+    columns: dict[str, tuple[list[int], list[Any]]] = {}
+    for row, info in enumerate(infos):
+        for key, value in info.items():
+            rows, values = columns.setdefault(key, ([], []))
+            rows.append(row)
+            values.append(value)
+    found: dict[str, Any] = {}
+    for key, (rows, values) in columns.items():
+        found[key] = _column(rows, values, n)
+        if (mask := f"_{key}") not in columns:
+            here = np.zeros(n, bool)
+            here[rows] = True
+            found[mask] = here
+    return found
+
+
+def _column(rows: list[int], values: list[Any], n: int) -> Any:
+    """What n environments give under one key, of which ``rows`` give something."""
+    kinds = set(map(type, values))
+    if kinds == {dict}:
+        inner: list[dict[str, Any]] = [{}] * n
+        for row, value in zip(rows, values, strict=True):
+            inner[row] = value
+        return batched_infos(inner)
+    array = None
+    if all(issubclass(kind, NUMBERS) for kind in kinds):
+        array = _numbers(values, mixed=len(kinds) > 1 or int in kinds)
+    elif all(issubclass(kind, np.ndarray) for kind in kinds):
+        array = _stacked(values)
+    if array is not None:
+        if len(rows) == n:
+            return array
+        column = np.zeros((n, *array.shape[1:]), array.dtype)
+        column[rows] = array
+        return column
+    objects = np.full(n, None, object)
+    for row, value in zip(rows, values, strict=True):
+        objects[row] = value
+    return objects
+
+
+def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
+    """Numbers as an array; None: no type holds all of them as they are."""
+    array = np.array(values)
+    if array.dtype.kind not in "biufc":
+        return None  # whole numbers that are too large
+    if mixed and array.dtype.kind == "f":
+        same = (a == v or v != v for a, v in zip(array.tolist(), values, strict=True))
+        return array if all(same) else None
+    return array
+
+
+def _stacked(values: list[Array]) -> Array | None:
+    """Arrays of one shape as one; None: no array holds all of them as they are."""
+    first = values[0]
+    if any(v.shape != first.shape for v in values):
+        return None
+    stacked = np.stack(values)
+    if any(v.dtype != stacked.dtype for v in values):
+        same = all(
+            np.array_equal(a, v, equal_nan=v.dtype.kind == "f")
+            for a, v in zip(stacked, values, strict=True)
+        )
+        return stacked if same else None
+    return stacked
 
 
 def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
@@ -139,11 +221,6 @@ def _no_number(key: str, what: str) -> SkillweaveError:
         f"log_info names {short(key)}, but info[{short(key)}] is {what} at the end of an episode; "
         "let the environment give a number there, or leave the key out of log_info"
     )
-
-
-def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the keys of a batched info, without Gymnasium's masks (``_key``)."""
-    return tuple(key for key in info if not (key.startswith("_") and key[1:] in info))
 
 
 def allowed_rows(mask: Array | None, rows: Array) -> Array | None:

@@ -97,16 +97,38 @@ def _infos(infos: Sequence[dict[str, Any]], counts: Sequence[int]) -> dict[str, 
     found: dict[str, Any] = {}
     for name in dict.fromkeys(name for info in infos for name in info):
         values = [info.get(name) for info in infos]
-        example = next(value for value in values if value is not None)
-        if isinstance(example, dict):
+        told = [value for value in values if value is not None]
+        if all(isinstance(value, dict) for value in told):
             found[name] = _infos([value or {} for value in values], counts)
-        elif isinstance(example, np.ndarray) and example.ndim:
-            rest, kind = example.shape[1:], example.dtype
-            nothing = None if kind.kind == "O" else np.zeros((), kind)
-            found[name] = np.concatenate(
-                [
-                    np.full((count, *rest), nothing, kind) if value is None else value
-                    for value, count in zip(values, counts, strict=True)
-                ]
-            )
+            continue
+        if not all(isinstance(value, np.ndarray) and value.ndim for value in told):
+            continue
+        shapes = {value.shape[1:] for value in told}
+        kinds = {value.dtype.kind for value in told}
+        whole = len(shapes) == 1 and "O" not in kinds
+        found[name] = np.concatenate(
+            [
+                _nothing(count, told[0], whole)
+                if value is None
+                else value
+                if whole
+                else _each(value)
+                for value, count in zip(values, counts, strict=True)
+            ]
+        )
     return found
+
+
+def _nothing(count: int, example: Array, whole: bool) -> Array:
+    """Rows of a part that tells nothing."""
+    if not whole:
+        return np.full(count, None, object)
+    return np.zeros((count, *example.shape[1:]), example.dtype)
+
+
+def _each(value: Array) -> Array:
+    """The rows of an array as objects."""
+    rows = np.full(len(value), None, object)
+    for row, one in enumerate(value):
+        rows[row] = one
+    return rows

@@ -7,20 +7,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.vector.utils import concatenate, create_empty_array
 
+from skillweave.envs.infos import batched_infos
+from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, SkillweaveError
 
-_FITS = {float: "fO", int: "iufO", bool: "biufO"}
-"""By the type of a number, the kinds of arrays that hold it as it is."""
 
-
-class SyncEnvs(SyncVectorEnv[Any, Any]):
-    """Gymnasium's vector of environments, some of which begin and act.
-
-    ``begin`` and ``act`` stand in place of the vector's ``reset`` and ``step``, which are of all
-    environments and know nothing of these.
+class SyncEnvs:
+    """N environments, of which some begin or act.
 
     Args:
         makers: each makes one of the N environments.
@@ -31,77 +25,84 @@ class SyncEnvs(SyncVectorEnv[Any, Any]):
     """
 
     def __init__(self, makers: Sequence[Callable[[], gym.Env[Any, Any]]], name: str) -> None:
+        self.envs: list[gym.Env[Any, Any]] = []
         try:
-            super().__init__(makers, autoreset_mode=AutoresetMode.DISABLED)
-        except RuntimeError as error:
-            raise SkillweaveError(f"{name}: its environments differ: {error}") from error
-        if len({id(env.unwrapped) for env in self.envs}) < len(makers):
-            raise SkillweaveError(
-                f"{name} gives the same environment each time; the function must make a new one"
-            )
-        self._over = np.zeros(self.num_envs, bool)  # whose episode has ended
-        self._discrete = isinstance(self.single_action_space, gym.spaces.Discrete)
+            for make in makers:
+                self.envs.append(make())
+            self._check_alike(name)
+        except BaseException:
+            self.close()
+            raise
+        self.observation_space = self.envs[0].observation_space
+        self.action_space = self.envs[0].action_space
+        self._dtype, self._shape = (
+            obs_dtype(self.observation_space),
+            obs_shape(self.observation_space),
+        )
+        self._parts = self._dtype.names is not None
+        self._over = np.zeros(len(self.envs), bool)  # whose episode has ended
+        self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
 
-    def begin(self, ids: Array, seeds: Array) -> tuple[Any, dict[str, Any]]:
-        """Reset environments ``ids`` (n,) to ``seeds`` (n,); n observations, and infos of all."""
-        obs: list[Any] = []
-        infos: dict[str, Any] = {}
-        for i, seed in zip(ids.tolist(), seeds, strict=True):
-            one, info = self.envs[i].reset(seed=int(seed))
-            obs.append(one)
-            infos = self._add_info(infos, info, i)
+    def begin(self, ids: Array, seeds: Array) -> tuple[Array, dict[str, Any]]:
+        """Reset environments ``ids`` (n,) to ``seeds`` (n,).
+
+        Returns:
+            Observations (n, *obs_shape), and the infos of these n.
+        """
+        obs = self._empty(len(ids))
+        infos: list[dict[str, Any]] = []
+        for row, (i, seed) in enumerate(zip(ids.tolist(), seeds, strict=True)):
+            seen, info = self.envs[i].reset(seed=int(seed))
+            put_observation(self.observation_space, obs, row, seen)
+            infos.append(info)
         self._over[ids] = False
-        return self._batch(obs), infos
+        return obs, batched_infos(infos)
 
-    def act(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+    def act(self, action: Array, ids: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Step environments ``ids`` (n,) by ``action`` (n, ...).
 
         The environments may keep what they are given: it must not change afterwards.
 
         Returns:
-            As a vector's ``step`` does, with n rows each, but infos of all environments.
+            As a vector's ``step`` does, with n rows each.
         """
         assert not self._over[ids].any(), "an episode that is over must be reset first"
         n = len(ids)
-        obs: list[Any] = []
-        infos: dict[str, Any] = {}
+        obs = self._empty(n)
+        infos: list[dict[str, Any]] = []
         reward, terminated, truncated = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
         # A row of a batch that has no axes is a number of numpy's, which a Box does not contain.
         each = action.tolist() if self._discrete else map(np.asarray, action)
         for row, (i, one) in enumerate(zip(ids.tolist(), each, strict=True)):
             seen, reward[row], terminated[row], truncated[row], info = self.envs[i].step(one)
-            obs.append(seen)
-            if info:
-                infos = self._add_info(infos, info, i)
+            # At once: several environments may have one buffer for what they show.
+            if self._parts:
+                put_observation(self.observation_space, obs, row, seen)
+            else:
+                obs[row] = seen
+            infos.append(info)
         self._over[ids] = terminated | truncated
-        return self._batch(obs), reward, terminated, truncated, infos
+        return obs, reward, terminated, truncated, batched_infos(infos)
 
-    def _add_info(
-        self, vector_infos: dict[str, Any], env_info: dict[str, Any], env_num: int
-    ) -> dict[str, Any]:
-        """Add one environment's info to a batch.
+    def close(self) -> None:
+        """Close all of them."""
+        for env in self.envs:
+            env.close()
 
-        Gymnasium takes the type of the first value of a key and casts all others to it, 0.5 to 0
-        for example. Here the array becomes wide enough for all.
-        """
-        for key, value in env_info.items():
-            array = vector_infos.get(key)
-            if array is None or not isinstance(array, np.ndarray):
-                continue
-            kind = array.dtype.kind
-            if kind in _FITS.get(type(value), "") or kind not in "biuf":
-                continue
-            if isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
-                if kind != "f" and isinstance(value, float | np.floating):
-                    vector_infos[key] = array.astype(np.float64)
-                elif kind == "b" and not isinstance(value, bool | np.bool_):
-                    vector_infos[key] = array.astype(np.int64)
-            elif not isinstance(value, np.ndarray | dict):
-                vector_infos[key] = array.astype(object)
-        return super()._add_info(vector_infos, env_info, env_num)
+    def _empty(self, n: int) -> Array:
+        # Zeros: bytes between the parts of an observation are written to files.
+        return np.zeros((n, *self._shape), self._dtype)
 
-    def _batch(self, obs: list[Any]) -> Any:
-        """Observations as one batch of the space's kind."""
-        space = self.single_observation_space
-        empty: Any = create_empty_array(space, len(obs), np.zeros)
-        return concatenate(space, obs, empty)
+    def _check_alike(self, name: str) -> None:
+        first = self.envs[0]
+        for number, env in enumerate(self.envs):
+            for kind in ("observation_space", "action_space"):
+                if getattr(env, kind) != getattr(first, kind):
+                    raise SkillweaveError(
+                        f"{name}: its environments differ: the {kind} of environment {number} is "
+                        f"{getattr(env, kind)}, that of environment 0 {getattr(first, kind)}"
+                    )
+        if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
+            raise SkillweaveError(
+                f"{name} gives the same environment each time; the function must make a new one"
+            )

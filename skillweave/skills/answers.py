@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.messages import short
+from skillweave.skills.info_words import NUMBERS, odd_key
 from skillweave.skills.outputs import as_array, at_step, called
 from skillweave.skills.probing import probe
 from skillweave.types import LARGEST_REWARD, Array, SkillweaveError, Step, read_only, wrong_reward
@@ -30,7 +31,10 @@ def answer(
     """
     if isinstance(about, np.ndarray):
         about = read_only(about)
-    value = called(function, about, f"{who}: {method}()", elapsed)
+    value = called(function, about, f"{who}: {method}()", elapsed, ids)
+    objects = isinstance(value, np.ndarray) and value.dtype == object
+    if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
+        raise SkillweaveError(f"{who}: {method}(){at_step(elapsed)}: {odd}")
     array = checked(value, n, dtype, who, method, elapsed, ids)
     probe(function, about, n, f"{who}: {method}()")
     return array
@@ -73,6 +77,8 @@ def checked(
             if array.dtype == bool
             else _flags(array, f"{who}: {method}()", at_step(elapsed), ids)
         )
+    if array.dtype == object and all(isinstance(value, NUMBERS) for value in array):
+        array = array.astype(np.float64)
     if array.dtype.kind not in "fiub":
         raise SkillweaveError(
             f"{who}: {method}() returned {_kind(array)}{at_step(elapsed)}, but rewards are real "

@@ -11,11 +11,14 @@ from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from skillweave.arguments import meant
 from skillweave.messages import short, told
+from skillweave.skills.info_words import keys_told, odd_key
 from skillweave.tracebacks import is_users
 from skillweave.types import Array, SkillweaveError, Step
 
 
-def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
+def called(
+    function: Any, argument: Any, who: str, elapsed: Any = None, ids: Array | None = None
+) -> Any:
     """The result of a function of the user.
 
     Raises:
@@ -28,15 +31,25 @@ def called(function: Any, argument: Any, who: str, elapsed: Any = None) -> Any:
     except Exception as error:
         about = getattr(argument, "shape", None)
         given = "" if about is None else f" for observations of shape {about}"
+        advice = _advice(error, function, argument, ids)
         raise SkillweaveError(
-            f"{who} raised {told(error)}{at_step(elapsed)}{given}{_advice(error, argument)}"
+            f"{who} raised {told(error)}{at_step(elapsed)}{given}{advice}"
         ) from error
 
 
-def _advice(error: Exception, argument: Any) -> str:
+def _advice(error: Exception, function: Any, argument: Any, ids: Array | None) -> str:
     """What to write instead, for the mistakes that are made most; else nothing."""
     text, step = str(error), isinstance(argument, Step)
     name = getattr(error, "name", None) if isinstance(error, AttributeError) else None
+    key = error.args[0] if isinstance(error, KeyError) and error.args else None
+    if step and isinstance(key, str) and key not in argument.info:
+        return f"; {keys_told(argument.info)}"
+    if (
+        step
+        and isinstance(error, TypeError | ValueError)
+        and (odd := odd_key(function, argument.info, ids))
+    ):
+        return f"; {odd}"
     if "read-only" in text:
         return "; what it is given cannot be changed: change a copy"
     if "truth value of an array" in text:

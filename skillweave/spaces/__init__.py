@@ -6,7 +6,7 @@ eat; ``ActionCodec`` turns what a policy head emits into what the environment ta
 
 from skillweave.spaces.action_codec import ActionCodec, action_codec
 from skillweave.spaces.observations import ObsCodec, obs_codec, to_tensor
-from skillweave.spaces.packing import obs_dtype, obs_shape, pack, unpack
+from skillweave.spaces.packing import obs_dtype, obs_shape, pack, put_observation, unpack
 from skillweave.spaces.saving import same_space, space_from_json, space_to_json
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "obs_dtype",
     "obs_shape",
     "pack",
+    "put_observation",
     "same_space",
     "space_from_json",
     "space_to_json",

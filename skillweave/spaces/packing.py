@@ -92,6 +92,27 @@ def pack(space: gym.Space[Any], batched: Any) -> Array:
     return packed
 
 
+def put_observation(space: gym.Space[Any], out: Array, row: int, obs: Any) -> None:
+    """Write one observation, as an environment gives it, into a row of a batch (n, *obs_shape).
+
+    Raises:
+        ValueError: it has another shape.
+        KeyError, TypeError, IndexError: a part is not there.
+    """
+    if isinstance(space, gym.spaces.Dict):
+        for key, part in space.spaces.items():
+            put_observation(part, out[key], row, obs[key])
+        return
+    if isinstance(space, gym.spaces.Tuple):
+        for i, part in enumerate(space.spaces):
+            put_observation(part, out[str(i)], row, obs[i])
+        return
+    given = np.asarray(obs)
+    if given.shape != out.shape[1:]:
+        raise ValueError(f"it has shape {given.shape}, not {out.shape[1:]}")
+    out[row] = given
+
+
 def unpack(space: gym.Space[Any], array: Array) -> Any:
     """The inverse of ``pack``: dicts and tuples of views; a plain array is returned as it is."""
     inner = parts(space)

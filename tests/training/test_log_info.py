@@ -26,12 +26,13 @@ from skillweave import (
     train_agent,
 )
 from skillweave.cli import main
-from skillweave.envs.infos import info_keys, info_numbers
+from skillweave.envs.infos import info_numbers
 from skillweave.envs.sync import SyncEnvs
 from skillweave.hierarchy import training
 from skillweave.reporting.report.curves import read_curves
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import identity, read_manifest
+from skillweave.skills.info_words import info_keys
 
 
 class Told(Ledger):

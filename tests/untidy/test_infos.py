@@ -1,0 +1,180 @@
+"""Infos of several environments: a skill reads exactly what each environment gave."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import skillweave as sw
+
+SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
+READ: list[int] = []
+"""Rows that a skill has read."""
+ABSENT = type  # the same in every copy
+"""Stands for a key that an environment does not give."""
+
+
+class Telling(gym.Env):
+    """Shows a number, and tells the value of that number in its info."""
+
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, values) -> None:
+        self.values = values
+        self.observation_space = gym.spaces.Box(0, len(values), (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.show(), {}
+
+    def show(self):
+        self.i = int(self.np_random.integers(len(self.values)))
+        return np.array([self.i], np.float32)
+
+    def step(self, action):
+        self.t += 1
+        obs, value = self.show(), self.values[self.i]
+        info = {} if value is ABSENT else {"told": value}
+        return obs, 0.0, False, self.t == 10, {"always": self.i} | info
+
+
+def telling(values) -> sw.EnvSpec:
+    return sw.EnvSpec(lambda: Telling(values), workers=1)
+
+
+def same(one, other) -> bool:
+    if isinstance(other, np.ndarray):
+        return np.shape(one) == other.shape and bool(np.all(np.asarray(one) == other))
+    return bool(one == other)
+
+
+class Reads(sw.Skill):
+    max_steps = 5
+
+    def __init__(self, values) -> None:
+        super().__init__()
+        self.values = values
+
+    def reward(self, step):
+        column = step.info.get("told")
+        here = step.info.get("_told")
+        for row, seen in enumerate(step.next_obs[:, 0]):
+            value = self.values[int(seen)]
+            if value is ABSENT:
+                assert here is None or not here[row]
+            else:
+                assert same(column[row], value), (column, value)
+                assert here[row]
+                READ.append(row)
+        np.testing.assert_array_equal(step.info["always"], step.next_obs[:, 0])
+        return np.zeros(len(step.obs))
+
+
+KINDS = {
+    "int, then float": [0, 0.5],
+    "bool, int, float": [True, 3, 0.25],
+    "small and wide types": [np.float32(0.5), 0.1, np.int8(3), np.uint8(200)],
+    "whole numbers beyond any type": [1, 2**70],
+    "whole numbers that a float cannot hold": [0.5, 2**53 + 1],
+    "a number or nothing": [1.5, None],
+    "a number or a text": [0, "goal"],
+    "only sometimes": [2.5, ABSENT],
+    "arrays": [np.array([1, 2]), np.array([0.5, 2.0])],
+    "arrays of several shapes": [np.array([1, 2]), np.array([1.0, 2.0, 3.0])],
+    "an array or a number": [np.array([1, 2]), 7],
+    "a list or a text": [[1, 2], "goal"],
+}
+
+
+@pytest.mark.parametrize("values", KINDS.values(), ids=KINDS)
+def test_each_environment_is_read_exactly(values, tmp_path):
+    spec = telling(values)
+    READ.clear()
+    agents = {"algorithm": SMALL, "selector": SMALL}
+    sw.Hierarchy(spec, [Reads(values)], steps=256, **agents).train(tmp_path / "run", quiet=True)
+    assert len(READ) > 50
+
+
+class Scores(sw.Skill):
+    max_steps = 5
+
+    def reward(self, step):
+        return step.info["told"]
+
+
+class Doubles(Scores):
+    def reward(self, step):
+        return 2 * step.info["told"]
+
+
+@pytest.mark.parametrize(
+    ("skill", "other"),
+    [(Scores(), None), (Scores(), "goal"), (Doubles(), None), (Doubles(), {"goal": 1})],
+)
+def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other, tmp_path):
+    spec = telling([1.5, other])
+    with pytest.raises(sw.SkillweaveError) as caught:
+        sw.Hierarchy(spec, [skill], steps=256, algorithm=SMALL, selector=SMALL).train(
+            tmp_path / "run", quiet=True
+        )
+    said = str(caught.value)
+    assert "info['told'] is " in said
+    assert f"{other!r} of environment" in said or "a dict of 'goal'" in said
+
+
+def test_a_key_that_nobody_gives_is_named(tmp_path):
+    spec = telling([ABSENT])
+    with pytest.raises(sw.SkillweaveError, match=r"no environment gave this key .*'always'"):
+        sw.Hierarchy(spec, [Scores()], steps=256, algorithm=SMALL, selector=SMALL).train(
+            tmp_path / "run", quiet=True
+        )
+
+
+class OneBuffer(gym.Env):
+    """All its instances show the same array, which each of them fills in its own step."""
+
+    shared = np.zeros(2, np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, parts: bool) -> None:
+        box = gym.spaces.Box(-1e6, 1e6, (2,), np.float32)
+        self.parts = parts
+        self.observation_space = (
+            gym.spaces.Dict(own=box, t=gym.spaces.Discrete(100)) if parts else box
+        )
+
+    def show(self):
+        self.shared[:] = self.number, self.t
+        return {"own": self.shared, "t": self.t} if self.parts else self.shared
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.number, self.t = int(self.np_random.integers(1000)), 0
+        return self.show(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.show(), 0.0, False, self.t == 7, {"number": self.number, "t": self.t}
+
+
+@pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
+def test_instances_may_share_one_buffer_for_observations(parts, tmp_path):
+    seen = []
+
+    class Watches(sw.Skill):
+        max_steps = 5
+
+        def reward(self, step):
+            own = step.next_obs["own"] if parts else step.next_obs
+            before = step.obs["own"] if parts else step.obs
+            np.testing.assert_array_equal(own[:, 0], step.info["number"])
+            np.testing.assert_array_equal(own[:, 1], step.info["t"])
+            np.testing.assert_array_equal(before[:, 1], step.info["t"] - 1)
+            seen.append(len(np.unique(own[:, 0])))
+            return np.zeros(len(step.obs))
+
+    spec = sw.EnvSpec(OneBuffer, kwargs={"parts": parts}, workers=1)
+    sw.Hierarchy(spec, [Watches()], steps=256, algorithm=SMALL, selector=SMALL).train(
+        tmp_path / "run", quiet=True
+    )
+    assert max(seen) > 1
