@@ -132,6 +132,7 @@ class ManyRooms:
 
     def __init__(self, goal: int, num_envs: int) -> None:
         self.goal, self.num_envs, self.steps_made = goal, num_envs, 0
+        self.time_limit = None
         doors = [h for h in HALLWAYS if h != goal]
         self.first = np.full(len(PLACES), 0.75 / (len(PLACES) - 1))
         self.first[goal] = 0.0

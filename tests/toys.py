@@ -108,7 +108,7 @@ class Toy:
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs
         self.obs: Array = np.empty(0)
-        self.steps_made = 0
+        self.steps_made, self.time_limit = 0, None
 
     def first(self, rows: Array) -> Array:
         """First observations of the environments ``rows``."""

@@ -70,7 +70,7 @@ class _FlatLearner(OneAgent):
         fresh, manifest = super().open(), self.stage.run.manifest
         self.evaluation = PeriodicEvaluation(
             skill_scene(self._flat.spec), self.stage.seeds,
-            manifest["eval_every"], manifest["eval_episodes"],
+            manifest["eval_every"], manifest["eval_episodes"], self.stage.config.num_envs,
         )  # fmt: skip
         self._open.callback(self.evaluation.close)
         return fresh

@@ -14,6 +14,7 @@ from skillweave.arguments import checked_names
 from skillweave.envs.make import EngineName
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.hierarchy.schedule import stages_of
 from skillweave.hierarchy.weights import write_weights
 from skillweave.messages import as_path, whole_number
 from skillweave.reporting.film import Film
@@ -72,6 +73,7 @@ class Run:
         seed: int = 0,
         deterministic: bool = True,
         skill: str | None = None,
+        num_envs: int | None = None,
         max_steps: int | None = None,
         save: bool = False,
         engine: EngineName = "sync",
@@ -86,6 +88,8 @@ class Run:
                 ``greedy_skills`` is about its skills.
             skill: score this skill alone, as if the selector always chose it. The hierarchy's
                 reflexes are in force, also where it was trained without them.
+            num_envs: environments that exist at once; None: at most as many as in training. It
+                does not change the result of a greedy policy.
             max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
             save: keep the result in the run's directory, where ``info`` finds it, instead of the
                 one before. A sampled one is kept beside the score, and does not replace it. Not
@@ -111,6 +115,7 @@ class Run:
                 episodes=episodes,
                 seed=seed,
                 deterministic=deterministic,
+                num_envs=self._training_envs() if num_envs is None else num_envs,
                 max_steps=max_steps,
                 watch=progress.watch,
                 engine=engine,
@@ -337,6 +342,14 @@ class Run:
             "evaluation_sampled": load_evaluation(run, deterministic=False),
         }
         return run.manifest | {k: v.to_json() for k, v in told.items() if v is not None}
+
+    def _training_envs(self) -> int | None:
+        """As many environments as stood side by side in training; None: nothing was trained."""
+        if self.path.is_dir():
+            return RunDirectory.open(self.path).num_envs
+        declared = self.declaration
+        stages = declared.stages() if isinstance(declared, PlainAgent) else stages_of(declared)
+        return max((stage.config.num_envs for stage in stages), default=None)
 
     def _policy(self, skill: str | None) -> Policy:
         if skill is None:

@@ -152,6 +152,8 @@ class Evaluate(Watched):
 
     episodes: int = 100
     """Whole episodes."""
+    num_envs: int | None = None
+    """Environments that exist at once; default: at most as many as in training."""
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,7 @@ def _evaluate(command: commands.Evaluate) -> None:
         seed=command.seed,
         deterministic=command.deterministic,
         skill=command.skill,
+        num_envs=command.num_envs,
         quiet=command.quiet,
     )
     result = {"target": command.target, "env": found.declaration.spec.name, "seed": command.seed}

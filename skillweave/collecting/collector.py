@@ -35,6 +35,8 @@ class Collected:
     """(k,) environments whose first row here does not follow from their last row before."""
     info_keys: frozenset[str] = frozenset()
     """Keys of ``info`` where episodes ended without a key that is logged."""
+    longest: int = 0
+    """Steps of the longest open episode, where no time limit is known."""
 
 
 class Collector:
@@ -86,7 +88,10 @@ class Collector:
         experience = self._collect(request)
         experience.spent = self.engine.steps_made - before
         episodes = np.concatenate([np.zeros((0, FIRST_INFO + len(self.log_info))), *self._ended])
-        return Collected(experience, episodes, info_keys=frozenset(self._info_keys))
+        limited = self.engine.time_limit is not None
+        longest = 0 if limited else int(self.kept["age"].max())
+        keys = frozenset(self._info_keys)
+        return Collected(experience, episodes, info_keys=keys, longest=longest)
 
     def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
         """Play one episode in each environment, from its start.
@@ -250,7 +255,9 @@ def side_by_side(parts: Sequence[Collected], members: int) -> Collected:
         return parts[0]
     joined = _joined([p.experience for p in parts], members)
     keys = frozenset[str]().union(*(p.info_keys for p in parts))
-    return Collected(joined, np.concatenate([p.episodes for p in parts]), info_keys=keys)
+    longest = max(p.longest for p in parts)
+    episodes = np.concatenate([p.episodes for p in parts])
+    return Collected(joined, episodes, info_keys=keys, longest=longest)
 
 
 def _joined(experiences: Sequence[Experience], members: int) -> Experience:

@@ -23,6 +23,7 @@ class SharedColumns:
     episodes: Array
     stands: Array | None
     info_keys: frozenset[str]
+    longest: int
 
     def read(self, memory: SharedMemory | None) -> tuple[SharedMemory, Collected]:
         """The memory, and the experience: views of it, good until the next request.
@@ -41,7 +42,9 @@ class SharedColumns:
             for k, (at, dtype, shape) in self.places.items()
         }
         experience = _experience(found, self.spent)
-        return memory, Collected(experience, self.episodes, self.stands, info_keys=self.info_keys)
+        return memory, Collected(
+            experience, self.episodes, self.stands, info_keys=self.info_keys, longest=self.longest
+        )
 
 
 def _experience(found: dict[str, Array], spent: int = 0) -> Experience:
@@ -90,7 +93,7 @@ class ColumnWriter:
             places[k] = (where[id(a)], a.dtype, a.shape)
         return SharedColumns(
             name, places, experience.spent, collected.episodes, collected.stands,
-            collected.info_keys,
+            collected.info_keys, collected.longest,
         )  # fmt: skip
 
 

@@ -24,8 +24,9 @@ from skillweave.types import (
 
 LONGEST_EPISODE = 100_000
 """Steps after which an engine truncates an episode that nothing else has ended."""
-LONGEST_FILM = 10_000
-"""The same of a video."""
+LONG_EPISODE = 10_000
+"""Steps of an episode without an end and without a limit that is known: an evaluation or a video
+ends it there, and training says so."""
 
 
 _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
@@ -139,11 +140,17 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
 
 def time_limit(env: gym.Env[Any, Any]) -> int | None:
     """Steps after which an environment truncates its episodes; None: nobody knows."""
+    frames = None if env.spec is None else env.spec.kwargs.get("max_num_frames_per_episode")
     while isinstance(env, gym.Wrapper):
         if isinstance(env, gym.wrappers.TimeLimit):
             return int(env._max_episode_steps)
         env = env.env
-    return None
+    return frames if isinstance(frames, int) and frames > 0 else None  # of Atari's games
+
+
+def longest_evaluation(limit: int | None) -> int:
+    """Steps after which an evaluation cuts an episode, where the environment has this limit."""
+    return min(limit or LONG_EPISODE, LONGEST_EPISODE)
 
 
 class Watch:

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.checks import Watch
+from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
 from skillweave.envs.sync import SyncEnvs
@@ -47,6 +47,8 @@ class Engine(Protocol):
     action_space: gym.Space[Any]
     steps_made: int
     """Steps that all environments have made together."""
+    time_limit: int | None
+    """Steps after which an environment itself truncates an episode; None: nobody knows."""
 
     def reset(self, seed: int) -> Array:
         """Start all anew from one seed; observations (N, *obs_shape)."""
@@ -99,6 +101,7 @@ class GymnasiumEngine:
         self.num_envs, self.steps_made = num_envs, 0
         self.observation_space: gym.Space[Any] = self._envs.observation_space
         self.action_space: gym.Space[Any] = self._envs.action_space
+        self.time_limit = time_limit(self._envs.envs[0])
         self._masks = ActionMasks(self.action_space, num_envs)
         self._watch = Watch(name, self.observation_space, num_envs, first)
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)

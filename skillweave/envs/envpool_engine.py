@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.checks import Watch
+from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.engine import RawStep
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
@@ -40,6 +40,7 @@ class EnvPoolEngine:
         self.num_envs, self.steps_made = num_envs, 0
         # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
         self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
+        self.time_limit = time_limit(spaces)
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
         self._all = np.arange(num_envs)
         self._root = 0

@@ -24,6 +24,7 @@ class JoinedEngines:
         self.num_envs = self._each * len(self.parts)
         self.observation_space = parts[0].observation_space
         self.action_space = parts[0].action_space
+        self.time_limit = parts[0].time_limit
 
     @property
     def steps_made(self) -> int:

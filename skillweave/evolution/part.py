@@ -22,7 +22,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.arena import returns_of
-from skillweave.training.episodes import Episodes, InfoTally, Tick
+from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.loop import Progress, train
 from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
@@ -165,7 +165,7 @@ class Part:
         return store_of(algorithm, count * self.places[0].num_envs, count, shared=True)
 
     @property
-    def tally(self) -> InfoTally:
+    def tally(self) -> EpisodeTally:
         """Which logged keys of ``info`` occurred."""
         return self.episodes.tally
 

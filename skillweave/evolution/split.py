@@ -24,7 +24,7 @@ from skillweave.collecting.where import MakeWorkers
 from skillweave.evolution.part import OnGenerationTick, Part
 from skillweave.evolution.stacks import Member
 from skillweave.seeding import Seeds
-from skillweave.training.episodes import InfoTally
+from skillweave.training.episodes import EpisodeTally
 from skillweave.training.scene import Scene
 from skillweave.types import Array
 
@@ -49,7 +49,7 @@ class Trained:
     states: list[dict[str, Array]]
     steps: list[int]
     ticks: list[tuple[int, dict[str, float]]]
-    tally: InfoTally
+    tally: EpisodeTally
     """Of all episodes at this part so far."""
 
 
@@ -82,7 +82,7 @@ class Parts:
         self._each = config.num_envs
         self.steps_elsewhere = 0
         """Environment steps of measuring fitness that were made in other processes."""
-        self.tally = InfoTally()
+        self.tally = EpisodeTally()
         """Which logged keys of ``info`` occurred."""
         make = partial(_stationed, scene, _alone(config), seeds, self._bounds, episodes)
         self._workers, self._closed = make_workers(make, parts, scene.name), False
@@ -98,7 +98,7 @@ class Parts:
         """Train members until each has ``until`` steps; ticks are told when all parts are done."""
         groups = self._divided(members)
         tasks = [Training(_sent(group), until, schedule_steps, seeds) for group in groups]
-        before, self.tally = 0, InfoTally()
+        before, self.tally = 0, EpisodeTally()
         for group, trained in zip(groups, self._workers.ask("train", tasks), strict=True):
             for steps, metrics in trained.ticks:
                 on_tick(before + steps, dict(metrics))

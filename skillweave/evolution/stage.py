@@ -114,6 +114,7 @@ class EvolvingPopulation:
             if interrupts.requested() and not self.over:
                 interrupts.stop()
         log.tell_absent(self.population.part.tally, over=True)
+        log.tell_endless(self.population.part.tally)
         return {self.stage.name: self._finish()}
 
     def states(self) -> dict[str, Any]:
@@ -160,6 +161,7 @@ class EvolvingPopulation:
         self._note(fitness)
         self.done += 1
         self.log.tell_absent(self.population.part.tally, over=False)
+        self.log.tell_endless(self.population.part.tally)
         if self.log.stop_requested:
             return  # no checkpoint: a run resumed from the one before comes here again
         if not self.over:

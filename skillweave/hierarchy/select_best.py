@@ -71,7 +71,7 @@ def select_best(
 
 def _episodes(entry: Mapping[str, Any]) -> int:
     """Return the number of episodes for each candidate: fewer where episodes are long."""
-    length = entry["final"].get("length") or 1.0
+    length = entry["final"].get("length") or entry["steps"] / entry["algorithm"]["num_envs"]
     return int(np.clip(round(SHARE * entry["steps"] / length), min(LEAST, MOST), MOST))
 
 
@@ -86,11 +86,24 @@ def _scores(
     """Return the evaluations of all candidates, by name."""
     entry = run.stage("/".join((*nodes, TOGETHER)))
     spec, seed = declaration.spec, SEEDS + int(run.manifest["seed"])
+    num_envs = entry["algorithm"]["num_envs"]
+    longest = None
+    if not entry["final"].get("length"):
+        # No episode has ended: nobody has learnt from longer ones than these.
+        longest = max(1, entry["steps"] // num_envs)
     learnt = _inside(after, nodes)
 
     def score(hierarchy: Declaration, policies: Policies) -> Evaluation:
         policy = assembled(hierarchy, policies)
-        return evaluate(policy, spec, episodes=episodes, seed=seed, engine=spec.engine)
+        return evaluate(
+            policy,
+            spec,
+            episodes=episodes,
+            seed=seed,
+            num_envs=num_envs,
+            max_steps=longest,
+            engine=spec.engine,
+        )
 
     def sampling(name: str) -> Evaluation:
         return score(with_sampling(declaration, *SAMPLING[name]), learnt)

@@ -25,6 +25,8 @@ RECENT = 10.0
 """Seconds of training over which the speed is taken."""
 PATIENCE = 1.0
 """Seconds that an evaluation may take before its progress is shown."""
+PLAIN_PATIENCE = 30.0
+"""The same of lines, where there is no terminal; and the least seconds between two of them."""
 IN_ALL = "in all"
 LOG = logging.getLogger("skillweave")
 LOG.addHandler(logging.NullHandler())
@@ -207,7 +209,8 @@ class Progress:
 class EpisodeProgress:
     """Shows how many episodes of an evaluation are over, where it takes longer than a second.
 
-    It goes away when the evaluation ends. Without a terminal or a notebook it shows nothing.
+    It goes away when the evaluation ends. Without a terminal or a notebook there are lines, the
+    first after half a minute.
 
     Args:
         episodes: how many are played.
@@ -223,6 +226,7 @@ class EpisodeProgress:
 
     def __enter__(self) -> Self:
         self._begun = self._shown = time.monotonic()
+        self._pause = PATIENCE
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -242,16 +246,21 @@ class EpisodeProgress:
         self._steps += steps
         self._over += over
         now = time.monotonic()
-        pause = PATIENCE if self._display is None else self._display.every
-        if now - self._shown < pause:
+        if now - self._shown < self._pause:
             return
         self._shown = now
         if not self._tried:
             self._tried, self._display = True, open_display(transient=True)
-        if self._display is None:
-            self._quiet = True
+            if self._display is None:
+                self._pause = PLAIN_PATIENCE
+                return
+            self._pause = self._display.every
+        if self._display is not None:
+            self._draw(now)
             return
-        self._draw(now)
+        told = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
+        print(f"{self._name}: {told}", file=sys.stderr, flush=True)
+        self._pause = max(PLAIN_PATIENCE, SPREAD * (now - self._begun))
 
     def _draw(self, now: float) -> None:
         assert self._display is not None

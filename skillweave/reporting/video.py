@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.checks import LONGEST_FILM
+from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.messages import told, whole_number
@@ -50,7 +50,7 @@ def render_policy(
 
     Args:
         seed: episode i starts from ``reset(seed=seed + i)``.
-        max_steps: of an episode; None: the environment's own limit, at most ``LONGEST_FILM``.
+        max_steps: of an episode; None: the environment's own limit, at most ``LONG_EPISODE``.
         label: from the policy's memory after ``act`` to who acted, and its colour.
         fps: steps shown per second; None: as many as the environment says, so in real time.
         every: one frame for so many steps, and one for the end of each episode.
@@ -67,7 +67,7 @@ def render_policy(
     """
     episodes, every = whole_number(episodes, "episodes", 1), whole_number(every, "every", 1)
     seed = whole_number(seed, "seed", 0)
-    limit = LONGEST_FILM if max_steps is None else whole_number(max_steps, "max_steps", 1)
+    limit = LONG_EPISODE if max_steps is None else whole_number(max_steps, "max_steps", 1)
     rng = rng or (Seeds(seed) / "render").numpy()
     env = env_spec.make(render_mode="rgb_array")
     # Observations, infos and masks are those of an evaluation.

@@ -77,6 +77,14 @@ class RunDirectory:
         self._lock: Lock | None = None
         self.reported_absent: set[str] = set()
         """Logged keys of ``info`` of which users know already that they do not occur."""
+        self.reported_endless = False
+        """Users know already that an episode seems to have no end."""
+
+    @property
+    def num_envs(self) -> int | None:
+        """Environments side by side in training, the most of all stages; None: no stages."""
+        stages = self.manifest["stages"]
+        return max((int(s["algorithm"]["num_envs"]) for s in stages), default=None)
 
     @classmethod
     def create(

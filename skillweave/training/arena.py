@@ -7,7 +7,7 @@ import numpy as np
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import RETURN, Collector
-from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.checks import longest_evaluation
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.types import Array
@@ -31,6 +31,7 @@ def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
     gamma = np.array([algorithm.config.gamma])
     request = Request(0, (params,), gamma, seeds / "act", greedy=True)
     with torch_threads(1):  # several wait for each other, for ever on a busy machine
-        found: Array = player.play(request, seeds / "start", LONGEST_EPISODE)
+        limit = longest_evaluation(arena.engine.time_limit)
+        found: Array = player.play(request, seeds / "start", limit)
     began: Array = ~np.isnan(found[:, RETURN])
     return found[began]

@@ -19,8 +19,8 @@ INFO = "info/"
 
 
 @dataclass
-class InfoTally:
-    """Which logged keys of ``info`` occurred where episodes ended."""
+class EpisodeTally:
+    """What was noticed of episodes: logged keys of ``info`` at their ends, and the longest."""
 
     keys: tuple[str, ...] = ()
     """Those that are logged."""
@@ -30,17 +30,20 @@ class InfoTally:
     """Logged keys with a number in any of them."""
     others: set[str] = field(default_factory=set)
     """All keys where a logged one was absent."""
+    longest: int = 0
+    """Steps of the longest episode without an end, where no time limit is known."""
 
     @property
     def absent(self) -> tuple[str, ...]:
         """Logged keys without a number so far."""
         return tuple(key for key in self.keys if key not in self.found)
 
-    def add(self, other: InfoTally) -> None:
+    def add(self, other: EpisodeTally) -> None:
         """Take the episodes of another tally into account, too."""
         self.keys, self.ended = other.keys, self.ended + other.ended
         self.found |= other.found
         self.others |= other.others
+        self.longest = max(self.longest, other.longest)
 
 
 class Episodes:
@@ -54,22 +57,26 @@ class Episodes:
         names = "return", "task_return", "length", "success", *(INFO + k for k in log_info)
         self._windows: dict[str, deque[float]] = {k: deque(maxlen=WINDOW) for k in names}
         """By the name of the metric, in the order of the columns of ``Collected.episodes``."""
-        self.tally = InfoTally(tuple(log_info))
+        self.tally = EpisodeTally(tuple(log_info))
 
-    def extend(self, ended: Array, info_keys: frozenset[str] = frozenset()) -> None:
+    def extend(
+        self, ended: Array, info_keys: frozenset[str] = frozenset(), longest: int = 0
+    ) -> None:
         """Take episodes into account.
 
         Args:
             ended: (K, 4 + I), as ``Collected.episodes``; NaN: not told.
             info_keys: as ``Collected.info_keys``.
+            longest: as ``Collected.longest``.
         """
         for column, window in enumerate(self._windows.values()):
             known = ended[:, column]
             window.extend(known[~np.isnan(known)].tolist())
+        self.tally.longest = max(self.tally.longest, longest)
         if self.tally.keys:
             logged = {k: ended[:, column] for column, k in enumerate(self.tally.keys, FIRST_INFO)}
             found = {key for key, numbers in logged.items() if not np.isnan(numbers).all()}
-            self.tally.add(InfoTally(self.tally.keys, len(ended), found, set(info_keys)))
+            self.tally.add(EpisodeTally(self.tally.keys, len(ended), found, set(info_keys)))
 
     def state(self) -> dict[str, Array]:
         """The latest episodes, to go on from."""

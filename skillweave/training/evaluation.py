@@ -5,6 +5,7 @@ Or in a pool, which is faster, and where all episodes begin from one seed.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from dataclasses import replace as replaced
@@ -14,7 +15,8 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.envs.checks import LONGEST_EPISODE, time_limit
+from skillweave.envs.checks import longest_evaluation, time_limit
+from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import told_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.messages import whole_number
@@ -30,6 +32,8 @@ from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
+USUAL_ENVS = 16
+"""Environments side by side in an evaluation, if nobody says how many."""
 POOL_SEEDS = 2**30
 """A pool has the first episode's seed, modulo this: EnvPool takes seeds below twice as much."""
 
@@ -146,7 +150,8 @@ class Evaluation:
             line += f", {self.success_rate:.0%} succeed"
         line += f", {j['length_mean']:.0f} steps an episode"
         if self.cut:
-            line += f"; {self.cut} never ended and were cut after {max(self.lengths):,} steps"
+            most = f"{max(self.lengths):,} steps (max_steps)"
+            line += f"; {self.cut} never ended and were cut after {most}"
         if self.skills:
             shares = ", ".join(f"{k} {v:.0%}" for k, v in j["skill_usage"].items())
             line += f"; skills: {shares}"
@@ -176,7 +181,7 @@ def evaluate(
     episodes: int = 100,
     seed: int = 0,
     deterministic: bool = True,
-    num_envs: int = 100,
+    num_envs: int | None = None,
     max_steps: int | None = None,
     watch: Callable[[Played], None] | None = None,
     engine: EngineName = "sync",
@@ -188,10 +193,11 @@ def evaluate(
         env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
         seed: picks the episodes; the same seed gives the same starts to every policy.
         deterministic: act greedily, else sample.
-        num_envs: environments side by side; does not change the result of a greedy policy. In a
-            pool there is one for each episode, so at most 65,536.
+        num_envs: environments side by side, as many as exist at once; does not change the result
+            of a greedy policy. None: ``USUAL_ENVS``. In a pool there is one for each episode, so
+            at most 65,536.
         max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
-            as many as the environment's own time limit, or ``LONGEST_EPISODE``.
+            as many as the environment's own time limit, or 10,000 where none is known.
         watch: is shown every step that is played.
         engine: "sync": Gymnasium's own environments; "envpool": a pool of EnvPool's; "auto": a
             pool where there can be one. That is faster, and the episodes are other ones.
@@ -205,7 +211,7 @@ def evaluate(
     """
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
-    n = whole_number(num_envs, "num_envs", 1)
+    n = USUAL_ENVS if num_envs is None else whole_number(num_envs, "num_envs", 1)
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
     longest, threshold, pooled = _about(spec)
     envs = make_engine(spec, episodes if pooled else min(n, episodes))
@@ -217,15 +223,18 @@ def evaluate(
         seeds: Any = episode_seeds(seed, episodes)
         if pooled:  # its environments take no seeds of their own
             seeds = seeds[0] % POOL_SEEDS
-        else:
-            envs.reset(0)
+        starts = SeededEpisodes(envs, seeds, limit or longest)
+        first = starts.obs[:1].copy()
         moments = play(
             policy,
-            SeededEpisodes(envs, seeds, limit or longest),
+            starts,
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
-        return replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
+        found = replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
+        if not pooled and episodes > envs.num_envs:
+            _check_starts_again(envs, seeds[0], first, spec.name)
+        return found
     finally:
         envs.close()
 
@@ -235,9 +244,27 @@ def _about(spec: EnvSpec) -> tuple[int, float | None, bool]:
     env = spec.make()
     try:
         threshold = env.spec.reward_threshold if env.spec else None
-        return time_limit(env) or LONGEST_EPISODE, threshold, in_pool(spec, env)
+        return longest_evaluation(time_limit(env)), threshold, in_pool(spec, env)
     finally:
         env.close()
+
+
+def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> None:
+    """Warn if the seed of the first episode does not start it again in a used environment.
+
+    Args:
+        first: the observation (1, *obs_shape) that it began with.
+    """
+    again = envs.reset_some(np.zeros(1, np.int64), [seed])
+    if checksums(again)[0] != checksums(first)[0]:
+        warnings.warn(
+            f"{name}: reset(seed={seed}) starts another episode than it did in the same "
+            "environment before. Scores depend on how many episodes an environment has played "
+            "already, and so on num_envs. Let reset() forget what was, and draw from "
+            "self.np_random alone; or give each episode an environment of its own: "
+            "num_envs=episodes",
+            stacklevel=3,
+        )
 
 
 def episode_seeds(seed: int, episodes: int) -> list[int]:

@@ -191,7 +191,7 @@ class _Loop:
         before, at.steps = at.steps, at.steps + collected.experience.spent
         update, at.update = at.update, at.update + 1
         over = at.steps >= budget
-        self.episodes.extend(collected.episodes, collected.info_keys)
+        self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
         if len(collected.begun_anew):
             learner.cut(collected.begun_anew)
         learner.take(collected.experience)

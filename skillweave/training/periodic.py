@@ -10,17 +10,40 @@ from skillweave.collecting.collector import RETURN, SUCCESS, Collector
 from skillweave.seeding import Seeds
 from skillweave.training.learner import crossed
 from skillweave.training.scene import Scene
-from skillweave.types import Array
+from skillweave.types import Array, SkillweaveError
 
 
 class PeriodicEvaluation:
-    """Plays ``episodes`` episodes every so many steps of training; always the same starts."""
+    """Plays ``episodes`` episodes every so many steps of training; always the same starts.
 
-    def __init__(self, scene: Scene, seeds: Seeds, every: int | None, episodes: int) -> None:
-        self._scene, self._episodes = scene, episodes
+    Args:
+        every: steps; None: never.
+        num_envs: of training; there are no more here.
+
+    Raises:
+        SkillweaveError: no more environments can be made beside those of training.
+    """
+
+    def __init__(
+        self, scene: Scene, seeds: Seeds, every: int | None, episodes: int, num_envs: int
+    ) -> None:
+        self._episodes = episodes
         self._seeds, self._every = seeds / "probe", every
-        self._arena: Collector | None = None
         self._counted = 0
+        self._arena: Collector | None = None
+        if every is not None:
+            self._arena = self._made(scene, min(episodes, num_envs))
+
+    @staticmethod
+    def _made(scene: Scene, num_envs: int) -> Collector:
+        try:
+            return scene.collector(num_envs, None)
+        except SkillweaveError as error:
+            raise SkillweaveError(
+                f"{error}. Evaluations during training (eval_every) need {num_envs} more "
+                "beside the environments of training: leave eval_every out, and evaluate the "
+                "finished run"
+            ) from error
 
     def due(
         self,
@@ -41,13 +64,20 @@ class PeriodicEvaluation:
         """
         if self._every is None or not (also or crossed(self._every, since, steps)):
             return {}
-        self._arena = self._arena or self._scene.collector(self._episodes, None)
-        told = play(self._arena, self._seeds)
+        assert self._arena is not None
+        told = self._played(self._arena, play)
         returns, success = told[:, RETURN], told[:, SUCCESS]
         found = {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
         if np.isnan(success).all():
             return found
         return found | {"eval_success": float((success == 1.0).mean())}
+
+    def _played(self, arena: Collector, play: Callable[[Collector, Seeds], Array]) -> Array:
+        """All episodes, (n, 4 + I): one in each environment, and again until they are enough."""
+        told = [play(arena, self._seeds)]
+        rounds = -(-self._episodes // arena.num_envs)
+        told += [play(arena, self._seeds / "round" / i) for i in range(1, rounds)]
+        return np.concatenate(told)[: self._episodes]
 
     def spent(self) -> int:
         """Environment steps made since this was last asked."""

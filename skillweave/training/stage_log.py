@@ -8,6 +8,7 @@ from typing import Any, Protocol, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
 from skillweave.messages import close_matches
 from skillweave.reading import shown
 from skillweave.runs.command_words import resume_words
@@ -16,7 +17,7 @@ from skillweave.runs.kept import best_words
 from skillweave.runs.starts import drop_starts
 from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.training.callback import TrainCallback
-from skillweave.training.episodes import InfoTally
+from skillweave.training.episodes import EpisodeTally
 from skillweave.training.keep_best import KeepBest
 from skillweave.types import SkillweaveError
 
@@ -143,7 +144,7 @@ class StageLog:
         for callback in self._callbacks:
             callback.checkpoint(self.entry["name"], self.at["steps"], self.at["metrics"])
 
-    def tell_absent(self, tally: InfoTally, *, over: bool) -> None:
+    def tell_absent(self, tally: EpisodeTally, *, over: bool) -> None:
         """Say once in a run which logged keys of ``info`` never occurred.
 
         Args:
@@ -160,6 +161,19 @@ class StageLog:
                 f"none of {tally.ended} episodes ended with a number in info[{key!r}] (log_info); "
                 f"{there}.{close_matches(key, others)}"
             )
+
+    def tell_endless(self, tally: EpisodeTally) -> None:
+        """Say once in a run that an episode has gone on for ``LONG_EPISODE`` steps."""
+        if tally.longest < LONG_EPISODE or self.run.reported_endless:
+            return
+        self.run.reported_endless = True
+        self.tell(
+            f"an episode has run {tally.longest:,} steps without an end, and no time limit is "
+            "known: it is truncated only after "
+            f"{LONGEST_EPISODE:,} steps, and evaluations cut theirs after {LONG_EPISODE:,}. If it "
+            "should end sooner, or be evaluated for longer, give the environment a limit: "
+            "EnvSpec(..., wrappers=(lambda env: gymnasium.wrappers.TimeLimit(env, 1000),))"
+        )
 
     def stopped(self) -> None:
         """The stage ends here, as a callback has asked for."""

@@ -59,14 +59,14 @@ class OneAgent:
         stage, config, scene = self.stage, self.stage.config, self.stage.scene
         manifest = stage.run.manifest
         every, episodes = manifest.get("eval_every"), manifest.get("eval_episodes", 0)
-        self.evaluation = PeriodicEvaluation(scene, stage.seeds, every, episodes)
-        self._open.callback(self.evaluation.close)
         fresh = self.make_agents()
         workers = int(stage.entry.get("workers", 1))
         self.collectors = self._make_collectors(
             self.maker(), config.num_envs, workers, 1, scene.name
         )
         self._open.callback(self.collectors.close)
+        self.evaluation = PeriodicEvaluation(scene, stage.seeds, every, episodes, config.num_envs)
+        self._open.callback(self.evaluation.close)
         self.episodes = Episodes(scene.log_info)
         self.best = stage.best
         return fresh
@@ -167,6 +167,7 @@ class OneAgent:
             log.tell_begun_anew(self.collectors.begun_anew, self.collectors.num_envs)
             self.collectors.begun_anew = 0
             log.tell_absent(self.episodes.tally, over=False)
+            log.tell_endless(self.episodes.tally)
             if tick.since < EARLY * self.stage.budget <= tick.steps:
                 self.tell_early(tick.steps, log)
             # Where the best is kept, the last weights must have their chance.
@@ -214,6 +215,7 @@ class OneAgent:
             if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
                 log.tell_learnt_nothing()
         log.tell_absent(self.episodes.tally, over=True)
+        log.tell_endless(self.episodes.tally)
         if self.best is not None and self.best.metrics:
             self._end_with(self.best)
             log.kept_best(self.best)

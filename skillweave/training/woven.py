@@ -18,7 +18,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
 from skillweave.collecting.woven import WovenCollector
-from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
 from skillweave.experience import Anchor
@@ -270,7 +270,8 @@ class WovenAgents(OneAgent):
         ready = Request(0, (), np.ones(1), seeds / self.first, greedy=True)
         asked = replace(requests.pop(self.first, ready), parts=tuple(requests.values()))
         with torch_threads(1):
-            return player.play(asked, seeds / "start", LONGEST_EPISODE)
+            limit = longest_evaluation(arena.engine.time_limit)
+            return player.play(asked, seeds / "start", limit)
 
     def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
         """Return all states among the extra tensors."""

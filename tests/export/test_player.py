@@ -32,9 +32,10 @@ torch.set_num_threads(1)
 )
 def test_a_player_gets_the_returns_of_an_evaluation(make: Any) -> None:
     policy = make()
-    found = evaluate(policy, EnvSpec(LongWalk), episodes=4, num_envs=2)
-    env, player, returns = LongWalk(), Player(policy), []
+    found = evaluate(policy, EnvSpec(LongWalk), episodes=4, num_envs=4)
+    player, returns = Player(policy), []
     for i in range(4):
+        env = LongWalk()  # it shows the number of its episode
         obs, info = env.reset(seed=1_000_000 + i)
         player.reset()
         reward, total, over = 0.0, 0.0, False

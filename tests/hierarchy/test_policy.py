@@ -1,6 +1,7 @@
 """HierarchyPolicy acts as OptionsEnv does, and remembers each environment for itself."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -355,7 +356,7 @@ def alone(skill: Skill, others: tuple, **more) -> Run:
     """A run of a hierarchy in which a selector never chooses ``skill``, which comes last."""
     declared = Hierarchy(Walk, [*others, skill], **plainly(more))
     skills = declared.skill_set([s.policy for s in declared.skills])
-    return Run(declared, None, HierarchyPolicy(Chooser(len(skills.skills)), skills))
+    return Run(declared, Path("nowhere"), HierarchyPolicy(Chooser(len(skills.skills)), skills))
 
 
 def always(skill: Skill, **more) -> HierarchyPolicy:
@@ -372,10 +373,10 @@ def test_a_skill_alone_acts_as_under_a_selector_that_chooses_no_other(kind):
     skill = alone(Left(), ()).as_skill("inner") if kind == "nested" else kind()
     if kind == "nested":
         type(skill).policy = inner
-    found = alone(skill, (Left(), Right()), **more).evaluate(20, skill=skill.name)
-    wanted = evaluate(always(skill, **more), EnvSpec(Walk), episodes=20)
+    found = alone(skill, (Left(), Right()), **more).evaluate(20, skill=skill.name, num_envs=20)
+    wanted = evaluate(always(skill, **more), EnvSpec(Walk), episodes=20, num_envs=20)
     assert (found.returns, found.lengths) == (wanted.returns, wanted.lengths)
-    bare = evaluate(skill.policy, EnvSpec(Walk), episodes=20)
+    bare = evaluate(skill.policy, EnvSpec(Walk), episodes=20, num_envs=20)
     assert found.returns != bare.returns, "the reflex never acted"
     assert bool(found.skill_steps) == (kind == "nested")
 

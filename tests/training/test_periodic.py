@@ -22,10 +22,10 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.envs import checks
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
-from skillweave.training import arena
 from skillweave.training.arena import episodes_of, returns_of
 from skillweave.training.periodic import PeriodicEvaluation
 
@@ -73,12 +73,12 @@ def test_an_episode_that_never_ends_counts_as_it_stands_at_the_limit(monkeypatch
             obs, reward, terminated, truncated = super().play(action)
             return np.minimum(obs, 5), reward, terminated & (np.arange(2) == 0), truncated
 
-    monkeypatch.setattr(arena, "LONGEST_EPISODE", 8)
+    monkeypatch.setattr(checks, "LONG_EPISODE", 8)
     assert played(Forever(2)) == [5.0, 8.0]
 
 
 def test_the_limit_counts_environment_steps_not_decisions(monkeypatch):
-    monkeypatch.setattr(arena, "LONGEST_EPISODE", 25)
+    monkeypatch.setattr(checks, "LONG_EPISODE", 25)
     assert played(Calls(1, (False, True))) == [9.0]  # calls of 10 steps, of which each pays 3
 
 
@@ -95,14 +95,14 @@ def test_an_evaluation_is_made_once_in_every_so_many_steps():
     def play(arena: Any, seeds: Seeds) -> Any:
         return episodes_of(policy, arena, seeds)
 
-    evaluation = PeriodicEvaluation(scene, Seeds(0), 100, 3)
+    evaluation = PeriodicEvaluation(scene, Seeds(0), 100, 3, 8)
     ticks = (250, 260, 299, 300, 350, 520, 599, 601)
     pairs = itertools.pairwise(ticks)
     assert [t for since, t in pairs if evaluation.due(since, t, play)] == [300, 520, 601]
     assert evaluation.spent() == 3 * 3 * 5
     assert evaluation.due(601, 700, play) == {"eval_return": 5.0, "eval_return_min": 5.0}
     assert (evaluation.spent(), evaluation.spent()) == (15, 0)
-    never = PeriodicEvaluation(scene, Seeds(0), None, 3)
+    never = PeriodicEvaluation(scene, Seeds(0), None, 3, 8)
     assert never.due(0, 10**6, play) == {}
 
 

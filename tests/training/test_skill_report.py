@@ -31,6 +31,8 @@ from skillweave.training.evaluation import FIRST_SEED
 from skillweave.training.skill_report import SkillReport
 from skillweave.training.skill_text import skill_table
 
+# A walk shows the number of its episode.
+pytestmark = pytest.mark.filterwarnings("ignore:.*starts another episode")
 NONE = {"own": 0, "limit": 0, "interrupted": 0, "episode": 0}
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from skillweave.envs.checks import LONGEST_FILM
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.messages import whole_number
@@ -82,18 +81,20 @@ def play_episodes(
     filmed: int,
     seed: int,
     deterministic: bool,
+    num_envs: int | None,
     quiet: bool = True,
 ) -> Played:
     """Play episodes with seeds that training never used, and film some of them."""
     log = CallLog(policy, episode_seeds(seed, episodes))
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "num_envs": num_envs}
+    how["deterministic"] = deterministic
     with EpisodeProgress(episodes, quiet=quiet, name="report") as progress:
 
         def watch(played: PlayedStep) -> None:
             log.add(played)
             progress.watch(played)
 
-        score = evaluate(policy, spec, watch=watch, max_steps=LONGEST_FILM, **how)
+        score = evaluate(policy, spec, watch=watch, **how)
     film, missing = None, []
     if filmed:
         try:
@@ -161,7 +162,9 @@ def write_report(
     played = None
     if policy is not None and spec is not None:
         try:
-            played = play_episodes(policy, spec, episodes, filmed, seed, deterministic, quiet)
+            played = play_episodes(
+                policy, spec, episodes, filmed, seed, deterministic, run.num_envs, quiet
+            )
             missing += played.missing
         except SkillweaveError as error:
             missing.append(f"There are no episodes and no film: {_sentence(error)}")
