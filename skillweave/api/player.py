@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.arguments import checked_names
+from skillweave.envs.infos import MASK, observes_mask
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
@@ -67,8 +68,9 @@ class Player:
         Args:
             obs: what the environment's ``reset`` or ``step`` returned.
             reward: what came with it; needed only where a skill's ``termination`` reads it.
-            info: the same.
-            mask: (A,) the actions that the environment allows; None: all.
+            info: the same; an ``action_mask`` in it is used where ``mask`` is left out.
+            mask: (A,) the actions that the environment allows, ``env.action_masks()`` for example.
+                None: what ``info`` says, or the part ``action_mask`` of the observation; else all.
 
         Raises:
             SkillweaveError: the observation is none of the policy's; the message says what is.
@@ -78,6 +80,10 @@ class Player:
             self._elapsed += 1
             step = self._step(seen, reward, info or {})
             self.memory = self.policy.observe(self.memory, step)
+        if mask is None:
+            mask = (info or {}).get(MASK)
+        if mask is None and observes_mask(self._space, self.policy.action_space):
+            mask = seen[MASK].reshape(-1)
         allowed = None if mask is None else np.asarray(mask, bool)[None]
         action, self.memory = self.policy.act(
             self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng

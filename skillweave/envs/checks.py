@@ -6,12 +6,14 @@ numbers of all of them at once, which costs a few microseconds a step, whatever 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.infos import DISCRETE, MASK, observes_mask
 from skillweave.messages import short, told
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import (
@@ -28,7 +30,13 @@ LONG_EPISODE = 10_000
 """Steps of an episode without an end and without a limit that is known: an evaluation or a video
 ends it there, and training says so."""
 
-
+LIKE_MASKS = (
+    "action_masks", "legal_actions", "legal_moves", "valid_actions", "available_actions",
+    "avail_actions", "valid_action_mask", "legal_action_mask", "valid_moves",
+)  # fmt: skip
+"""Keys under which people keep masks elsewhere."""
+LIKE_METHODS = ("get_action_mask", "valid_action_mask", "get_avail_actions", "legal_actions")
+"""Methods by which environments tell them."""
 _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
 
 
@@ -58,6 +66,13 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
                     f"{name}: {kind} is {short(found)}; it must be a space of Gymnasium's"
                 )
         self._fits = _fits(env.observation_space)
+        for wrapper in _wrappers(env):
+            _refuse_changing(wrapper, name)
+        has_masks = env.has_wrapper_attr("action_masks")
+        masks = env.get_wrapper_attr("action_masks") if has_masks else None
+        self._looked = number != 0  # the first of several speaks for all
+        self._masks = masks if callable(masks) else None
+        """As sb3-contrib's MaskablePPO asks environments for masks."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Start anew."""
@@ -74,7 +89,10 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if not self._fits(obs):
             raise self._misfit(obs)
         self._check_info(info)
-        return obs, info
+        if not self._looked:
+            self._looked = True
+            self._look_for_masks(info)
+        return obs, info if self._masks is None else self._with_mask(info)
 
     def step(self, action: Any) -> Any:
         """Act."""
@@ -103,7 +121,40 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             truncated = self._flag(truncated, "truncated")
         if type(info) is not dict:
             self._check_info(info)
+        if self._masks is not None:
+            info = self._with_mask(info)
         return obs, reward, terminated, truncated, info
+
+    def _look_for_masks(self, info: dict[str, Any]) -> None:
+        """Warn where something else than a mask that is used looks like one."""
+        space, actions = self.env.observation_space, self.env.action_space
+        if not isinstance(actions, DISCRETE) or self._masks is not None or MASK in info:
+            return
+        if observes_mask(space, actions):
+            return
+        shown = space.spaces if isinstance(space, gym.spaces.Dict) else {}
+        names = (MASK, *LIKE_MASKS)
+        found = [f"info[{n!r}]" for n in names if n in info]
+        found += [f"the observation's {n!r}" for n in names if n in shown]
+        found += [f"the method {n}()" for n in LIKE_METHODS if self.env.has_wrapper_attr(n)]
+        if found:
+            warnings.warn(
+                f"{self._name}: {found[0]} looks like an action mask, but is not used as one: "
+                f"every action counts as allowed. Give info['{MASK}'] in reset() and step(), or a "
+                f"method action_masks(): a number for each choice of {actions}, 0 where it is "
+                "forbidden",
+                stacklevel=2,
+            )
+
+    def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
+        """The info with what ``action_masks()`` says, unless it has a mask of its own."""
+        if MASK in info:
+            return info
+        assert self._masks is not None
+        try:
+            return {**info, MASK: np.array(self._masks())}
+        except Exception as error:
+            raise self._wrong(f"action_masks() raised {told(error)}") from error
 
     def _number_of(self, reward: Any) -> float:
         try:
@@ -136,6 +187,35 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
     def _wrong(self, what: str) -> SkillweaveError:
         where = f"environment {self._number}, " if self._number is not None else ""
         return SkillweaveError(f"{self._name}: {where}step {self._elapsed} of its episode: {what}")
+
+
+def _wrappers(env: gym.Env[Any, Any]) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
+    """The wrappers of an environment, outermost first."""
+    while isinstance(env, gym.Wrapper):
+        yield env
+        env = env.env
+
+
+_INSTEAD = {
+    "NormalizeObservation": "algorithms normalise observations themselves (normalize_obs=True) and "
+    "save the statistics with the policy",
+    "NormalizeReward": "algorithms scale rewards themselves (normalize_returns=True of PPO, "
+    "normalize_rewards=True of DQN, TD3 and SAC), and scores stay in the environment's own unit",
+}
+"""By the wrapper of Gymnasium's that changes while it is used, what does the same here."""
+
+
+def _refuse_changing(wrapper: gym.Wrapper[Any, Any, Any, Any], name: str) -> None:
+    """Raise a SkillweaveError where a wrapper has statistics that go on changing."""
+    for kind, instead in _INSTEAD.items():
+        changing = getattr(wrapper, "update_running_mean", True)
+        if isinstance(wrapper, getattr(gym.wrappers, kind)) and changing:
+            raise SkillweaveError(
+                f"{name}: the wrapper {type(wrapper).__name__} changes while it is used, "
+                "differently in each environment, and what it has learnt is not saved with a "
+                f"policy. Leave it out: {instead}. (With statistics of your own, set its "
+                "update_running_mean = False)"
+            )
 
 
 def time_limit(env: gym.Env[Any, Any]) -> int | None:

@@ -102,7 +102,9 @@ class GymnasiumEngine:
         self.observation_space: gym.Space[Any] = self._envs.observation_space
         self.action_space: gym.Space[Any] = self._envs.action_space
         self.time_limit = time_limit(self._envs.envs[0])
-        self._masks = ActionMasks(self.action_space, num_envs)
+        self._masks = ActionMasks(
+            self.action_space, num_envs, observation_space=self.observation_space
+        )
         self._watch = Watch(name, self.observation_space, num_envs, first)
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._all = np.arange(num_envs)
@@ -176,7 +178,7 @@ class GymnasiumEngine:
     def _begin(self, ids: Array) -> Array:
         """Reset environments ``ids`` to their seeds."""
         obs, info = self._envs.begin(ids, self._seed[ids])
-        self._masks.see(info, ids)
+        self._masks.see(info, ids, obs=obs)
         return self._watch.begun(obs, ids)
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
@@ -184,7 +186,7 @@ class GymnasiumEngine:
         # A copy: environments get views of it, and may keep them.
         acted = np.array(action, self.action_space.dtype)
         next_obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
-        self._masks.see(info, ids, terminated | truncated)
+        self._masks.see(info, ids, terminated | truncated, next_obs)
         raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
         self._watch.stepped(raw, ids)
         raw.truncated = (truncated | self._watch.too_long(ids)) & ~terminated

@@ -110,34 +110,69 @@ def _rows(value: Any, rows: Array, n: int) -> Any:
     return value[rows] if batched else value
 
 
+DISCRETE = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
+"""Spaces of actions that masks are for."""
+MASK = "action_mask"
+"""The key of infos, and of observations, under which masks are."""
+
+
+def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> bool:
+    """Whether observations have a part that says which actions are allowed."""
+    if not isinstance(observation_space, gym.spaces.Dict) or MASK not in observation_space.spaces:
+        return False
+    if not isinstance(space, DISCRETE):
+        return False
+    shape = observation_space.spaces[MASK].shape or ()
+    return int(np.prod(shape)) == sum(action_codec(space).parts)
+
+
 class ActionMasks:
-    """The actions that N environments allow now, as their infos tell.
+    """The actions that N environments allow now, as their infos or observations tell.
 
     Gymnasium's convention: ``info["action_mask"]`` of ``reset`` and ``step`` has a number for each
     choice, 0 where it is forbidden. For several choices at once (MultiDiscrete, MultiBinary) the
-    numbers stand one choice after another. Where an info has no mask, everything is allowed. A Box
-    has no choices, so its masks are ignored.
+    numbers stand one choice after another. What ``action_masks()`` says is there already
+    (``CheckedEnv``). Else a Dict's part ``action_mask`` is the mask, as PettingZoo and RLlib have
+    it. Without any, everything is allowed. A Box has no choices, so its masks are ignored.
+
+    Args:
+        space: of actions.
+        observation_space: where masks may be.
     """
 
-    def __init__(self, space: gym.Space[Any], num_envs: int, now: Array | None = None) -> None:
+    def __init__(
+        self,
+        space: gym.Space[Any],
+        num_envs: int,
+        now: Array | None = None,
+        observation_space: gym.Space[Any] | None = None,
+    ) -> None:
         self._space, self._num_envs = space, num_envs
-        discrete = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
-        self._parts = action_codec(space).parts if isinstance(space, discrete) else ()
+        self._observed = observation_space is not None and observes_mask(observation_space, space)
+        self._parts = action_codec(space).parts if isinstance(space, DISCRETE) else ()
         self.now = now
         """(N, A) bool; None: no environment has ever told. Never changed in place."""
 
     def see(
-        self, info: Mapping[str, Any], ids: Array | None = None, ended: Array | None = None
+        self,
+        info: Mapping[str, Any],
+        ids: Array | None = None,
+        ended: Array | None = None,
+        obs: Array | None = None,
     ) -> None:
         """Take in the info of environments ``ids`` (n,), rows in their order; None: of all.
 
-        ``ended`` (n,) bool says where the episode is over: nothing needs to be allowed there.
+        Args:
+            ended: (n,) bool, where the episode is over: nothing needs to be allowed there.
+            obs: (n, *obs_shape), what they show.
 
         Raises:
             SkillweaveError: a mask has another shape, or allows nothing; the message names the
                 environment.
         """
         told = info.get("action_mask")
+        if told is None and self._observed and obs is not None:
+            told = obs[MASK].reshape(len(obs), -1)
         if not self._parts or (told is None and self.now is None):
             return
         ids = np.arange(self._num_envs) if ids is None else ids
@@ -152,7 +187,7 @@ class ActionMasks:
         if not (free | over).all():
             raise SkillweaveError(
                 f"environment {ids[np.flatnonzero(~free & ~over)[0]]} allows no action, though its "
-                "episode goes on: info['action_mask'] is 0 everywhere; allow at least one action"
+                "episode goes on: its action_mask is 0 everywhere; allow at least one action"
             )
         mask[~free] = True
         now = np.ones((self._num_envs, size), bool) if self.now is None else self.now.copy()
@@ -163,7 +198,7 @@ class ActionMasks:
         mask = np.asarray(told)
         if mask.shape != shape or mask.dtype.kind not in "iubf":
             raise SkillweaveError(
-                f"info['action_mask'] of the environments is of {mask.dtype} and shape "
+                f"the action_mask of the environments is of {mask.dtype} and shape "
                 f"{mask.shape}, but numbers of shape {shape} were expected: one for each choice of "
                 f"{self._space}, 0 where it is forbidden"
             )

@@ -48,6 +48,10 @@ class Runner:
             self.latest = self.before | {"next_obs": self.obs, "info": told}
             self.latest["reward"] = np.array([reward], np.float32)
             self.root.observe(self.elapsed, False)
+        if mask is None:
+            mask = (info or {}).get("action_mask")
+        if mask is None and self.told["observed_mask"]:
+            mask = np.ravel(obs["action_mask"])
         action = self.root.act(None if mask is None else np.array(mask, bool)[None])
         self.before = {"obs": self.obs, "action": np.array([action])}
         return action

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.infos import observes_mask
 from skillweave.export.graphs import leaves_of
 from skillweave.export.states import States
 from skillweave.runs.files import write_bytes
@@ -63,6 +64,7 @@ def write_export(path: Path, policy: Policy, env: str) -> Export:
         "shape": list(obs_shape(space)),
         "inputs": _inputs(space),
         "action": _action_to_json(policy.action_space),
+        "observed_mask": observes_mask(space, policy.action_space),
         "policy": found,
     }
     text = json.dumps(told, indent=1, allow_nan=False)

@@ -1,0 +1,122 @@
+"""Action masks where people keep them: in info, in the observation, in ``action_masks()``."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import skillweave as sw
+from skillweave.export.runner import Runner
+
+SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
+ILLEGAL: list[int] = []
+"""Forbidden actions that were taken."""
+
+
+class Slots(gym.Env):
+    """Each step a few of six slots are free; whoever takes another is written down."""
+
+    def __init__(self, where: str, several: bool = False) -> None:
+        self.where, self.several = where, several
+        self.action_space = gym.spaces.MultiDiscrete([6, 6]) if several else gym.spaces.Discrete(6)
+        self.size = 12 if several else 6
+        board = gym.spaces.Box(0, 1, (self.size,), np.int8)
+        if where == "observation":
+            self.observation_space = gym.spaces.Dict(action_mask=board, observation=board)
+        else:
+            self.observation_space = board
+        if where == "method":
+            self.action_masks = lambda: self.free.astype(bool)
+        if where == "another method":
+            self.get_action_mask = lambda: self.free.astype(bool)
+
+    def deal(self):
+        self.free = np.zeros(self.size, np.int8)
+        for first in range(0, self.size, 6):
+            self.free[first + self.np_random.choice(6, 2, replace=False)] = 1
+        info = {}
+        if self.where == "info":
+            info["action_mask"] = self.free.copy()
+        if self.where == "another key":
+            info["legal_actions"] = np.flatnonzero(self.free)
+        board = np.zeros(self.size, np.int8)
+        if self.where == "observation":
+            return {"observation": board, "action_mask": self.free.copy()}, info
+        return board, info
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.deal()
+
+    def step(self, action):
+        self.t += 1
+        chosen = np.atleast_1d(action) + np.arange(0, self.size, 6)
+        ILLEGAL.extend(int(a) for a in chosen if not self.free[a])
+        obs, info = self.deal()
+        return obs, 1.0, False, self.t == 10, info
+
+
+class Any(sw.Skill):
+    max_steps = 3
+
+    def reward(self, step):
+        return np.ones(len(step.reward))
+
+
+def spec(where, several=False) -> sw.EnvSpec:
+    return sw.EnvSpec(lambda: Slots(where, several), workers=1)
+
+
+@pytest.mark.parametrize("several", [False, True], ids=["discrete", "multidiscrete"])
+@pytest.mark.parametrize("where", ["info", "observation", "method"])
+def test_a_mask_is_used_wherever_it_is(where, several, tmp_path):
+    ILLEGAL.clear()
+    hierarchy = sw.Hierarchy(
+        spec(where, several), [Any()], steps=256, algorithm=SMALL, selector=SMALL
+    )
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    run.evaluate(5, deterministic=False)
+    env, player = Slots(where, several), run.player(deterministic=False)
+    obs, info = env.reset(seed=1)
+    player.reset()
+    for _ in range(20):
+        if where == "method":
+            action = player.act(obs, mask=env.action_masks())
+        else:
+            action = player.act(obs, info=info)
+        obs, *_, info = env.step(action)
+    assert not ILLEGAL
+
+
+def test_an_export_reads_the_mask_of_the_observation(tmp_path):
+    pytest.importorskip("onnx", reason="onnx is not installed")
+    run = sw.train_agent(spec("observation"), SMALL, 256, tmp_path / "run", quiet=True)
+    export = run.export(tmp_path / "export")
+    runner = Runner(export.path)
+    env = Slots("observation")
+    ILLEGAL.clear()
+    obs, _ = env.reset(seed=3)
+    for _ in range(20):
+        obs, *_ = env.step(runner.act(obs))
+    assert not ILLEGAL
+
+
+@pytest.mark.parametrize(
+    ("where", "says"),
+    [("another key", r"info\['legal_actions'\]"), ("another method", r"get_action_mask\(\)")],
+)
+def test_what_looks_like_a_mask_and_is_not_used_is_said_once(where, says, tmp_path):
+    with pytest.warns(UserWarning, match=f"{says} looks like an action mask") as said:
+        sw.train_agent(spec(where), SMALL, 256, tmp_path / "run", quiet=True)
+    assert len(said) == 1
+
+
+def test_a_method_that_fails_is_named(tmp_path):
+    class Broken(Slots):
+        def action_masks(self):
+            raise ValueError("no board")
+
+    with pytest.raises(sw.SkillweaveError, match=r"action_masks\(\) raised ValueError: no board"):
+        sw.train_agent(
+            sw.EnvSpec(lambda: Broken("none"), workers=1), SMALL, 256, tmp_path / "run", quiet=True
+        )
