@@ -64,11 +64,6 @@ def read_only(array: Array) -> Array:
     return view
 
 
-def finite(array: Array) -> bool:
-    """Whether all numbers are; of small arrays it takes half the time of ``isfinite().all()``."""
-    return b"\0" not in np.isfinite(array).tobytes()
-
-
 LARGEST_REWARD = 1e15
 """The largest size of a reward: what learners square, sums of rewards, fits into float32."""
 

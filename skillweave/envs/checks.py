@@ -20,12 +20,15 @@ from skillweave.types import (
     LARGEST_REWARD,
     Array,
     SkillweaveError,
-    finite,
     wrong_reward,
 )
 
 LONGEST_EPISODE = 100_000
 """Steps after which an engine truncates an episode that nothing else has ended."""
+LARGEST_SEEN = float(np.finfo(np.float32).max)
+"""The largest size of a number in an observation: networks compute in float32."""
+COARSE = 2.0**24
+"""Size from which float32 does not tell whole numbers apart."""
 LONG_EPISODE = 10_000
 """Steps of an episode without an end and without a limit that is known: an evaluation or a video
 ends it there, and training says so."""
@@ -247,6 +250,7 @@ class Watch:
         self._name, self._num_envs, self._first = name, num_envs, first
         self._places = tuple(_real(obs_dtype(space)))
         self._elapsed = np.zeros(num_envs, np.int64)
+        self._told_coarse = first != 0  # the first of several speaks for all
 
     def begun(self, obs: Array, ids: Array | None = None) -> Array:
         """The first observations of environments ``ids`` (None: all), unchanged.
@@ -284,21 +288,44 @@ class Watch:
             part = obs
             for name in place:
                 part = part[name]
-            if not finite(part):
-                raise self._not_finite(part, place, ids)
+            if part.dtype.itemsize <= 4:
+                fits = np.isfinite(part)
+            else:
+                size = np.abs(part)
+                fits = size <= LARGEST_SEEN
+                if not self._told_coarse and size.max(initial=0.0) > COARSE:
+                    self._told_coarse = True
+                    self._tell_coarse(float(size.max()), place)
+            if b"\0" in fits.tobytes():  # for small arrays half the time of all()
+                raise self._out_of_range(part, place, ids)
 
-    def _not_finite(
+    def _out_of_range(
         self, part: Array, place: tuple[str, ...], ids: Array | None
     ) -> SkillweaveError:
-        bad = ~np.isfinite(part).reshape(len(part), -1)
+        bad = ~(np.abs(part) <= LARGEST_SEEN).reshape(len(part), -1)
         row = int(np.flatnonzero(bad.any(axis=1))[0])
-        count, size = int(bad[row].sum()), bad.shape[1]
-        first = part[row].reshape(-1)[bad[row]][0]
-        which = f" ({'.'.join(place)})" if place else ""
+        wrong = part[row].reshape(-1)[bad[row]]
+        what = "are not finite"
+        if np.isfinite(wrong).all():
+            what = f"are larger than {LARGEST_SEEN:.3g}, too large for networks (float32)"
         return self._wrong(
-            row, ids, f"its observation{which} has {count} of {size} numbers that are not finite, "
-            f"the first is {first}. No agent can learn from that: mend the environment, or wrap it"
-        )  # fmt: skip
+            row,
+            ids,
+            f"its observation{_named(place)} has {len(wrong)} of {bad.shape[1]} numbers that "
+            f"{what}, the first is {wrong[0]}. No agent can learn from that: mend the environment, "
+            "or wrap it",
+        )
+
+    def _tell_coarse(self, size: float, place: tuple[str, ...]) -> None:
+        """Warn of float64 numbers that networks cannot tell apart."""
+        step = float(np.spacing(np.float32(min(size, LARGEST_SEEN))))
+        warnings.warn(
+            f"{self._name}: its observation{_named(place)} has a number as large as {size:,.0f}, "
+            f"in float64. Networks compute in float32, where numbers of this size are {step:g} "
+            "apart: smaller changes cannot be seen. Let the environment subtract what is always "
+            "there, or give it in other units",
+            stacklevel=2,
+        )
 
     def _wrong(self, row: int, ids: Array | None, what: str) -> SkillweaveError:
         number = row if ids is None else int(ids[row])
@@ -306,6 +333,10 @@ class Watch:
         return SkillweaveError(
             f"{self._name}: environment {number + self._first}, step {step} of its episode: {what}"
         )
+
+
+def _named(place: tuple[str, ...]) -> str:
+    return f" ({'.'.join(place)})" if place else ""
 
 
 def _real(dtype: np.dtype[Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

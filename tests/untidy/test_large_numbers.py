@@ -1,0 +1,53 @@
+"""Observations in float64 whose numbers networks, which compute in float32, cannot take."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import skillweave as sw
+
+SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
+
+
+class Clock(gym.Env):
+    """Shows how late it is, as numbers of some size."""
+
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, first: float, dtype, parts: bool) -> None:
+        box = gym.spaces.Box(-np.inf, np.inf, (2,), dtype)
+        self.observation_space = gym.spaces.Dict(own=box) if parts else box
+        self.first, self.dtype, self.parts = first, dtype, parts
+
+    def show(self):
+        obs = np.array([self.first + self.t, self.t], self.dtype)
+        return {"own": obs} if self.parts else obs
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.show(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.show(), 1.0, False, self.t == 9, {}
+
+
+def train(first, dtype, parts, path):
+    spec = sw.EnvSpec(lambda: Clock(first, dtype, parts), workers=1)
+    return sw.train_agent(spec, SMALL, 256, path, quiet=True)
+
+
+@pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
+@pytest.mark.filterwarnings("ignore:.*in float64")
+def test_numbers_beyond_float32_are_refused(parts, tmp_path):
+    with pytest.raises(sw.SkillweaveError, match=r"1 of 2 numbers.*larger than 3.4e\+38.*float32"):
+        train(1e300, np.float64, parts, tmp_path / "run")
+
+
+@pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
+def test_numbers_that_float32_cannot_tell_apart_are_said_once(parts, tmp_path):
+    seconds = 1.7e9  # since 1970
+    with pytest.warns(UserWarning, match=r"1,700,000,\d\d\d, in float64.* 128 apart") as said:
+        train(seconds, np.float64, parts, tmp_path / "run")
+    assert len(said) == 1
