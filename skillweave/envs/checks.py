@@ -288,16 +288,14 @@ class Watch:
             part = obs
             for name in place:
                 part = part[name]
-            if part.dtype.itemsize <= 4:
-                fits = np.isfinite(part)
-            else:
-                size = np.abs(part)
-                fits = size <= LARGEST_SEEN
-                if not self._told_coarse and size.max(initial=0.0) > COARSE:
-                    self._told_coarse = True
-                    self._tell_coarse(float(size.max()), place)
+            coarse = part.dtype.itemsize > 4
+            size = np.abs(part) if coarse else part
+            fits = size <= LARGEST_SEEN if coarse else np.isfinite(part)
             if b"\0" in fits.tobytes():  # for small arrays half the time of all()
                 raise self._out_of_range(part, place, ids)
+            if coarse and not self._told_coarse and size.max(initial=0.0) > COARSE:
+                self._told_coarse = True
+                self._tell_coarse(float(size.max()), place)
 
     def _out_of_range(
         self, part: Array, place: tuple[str, ...], ids: Array | None
@@ -318,7 +316,7 @@ class Watch:
 
     def _tell_coarse(self, size: float, place: tuple[str, ...]) -> None:
         """Warn of float64 numbers that networks cannot tell apart."""
-        step = float(np.spacing(np.float32(min(size, LARGEST_SEEN))))
+        step = float(np.spacing(np.float32(size / 2)) * 2)
         warnings.warn(
             f"{self._name}: its observation{_named(place)} has a number as large as {size:,.0f}, "
             f"in float64. Networks compute in float32, where numbers of this size are {step:g} "
