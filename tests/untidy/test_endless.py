@@ -1,0 +1,95 @@
+"""Environments that never say that an episode is over."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import skillweave as sw
+from skillweave.envs import checks
+from skillweave.training import stage_log
+
+SMALL = sw.PPO(num_envs=2, n_steps=32, batch_size=32, update_epochs=1, network=sw.Network((8,)))
+
+
+class Endless(gym.Env):
+    observation_space = gym.spaces.Box(-50, 50, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    own_limit = None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(1, np.float32), 1.0, False, self.t == self.own_limit, {}
+
+
+class Limited(Endless):
+    own_limit = 50
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    for module in (checks, stage_log):
+        monkeypatch.setattr(module, "LONG_EPISODE", 100)
+
+
+def said(capsys) -> int:
+    return capsys.readouterr().err.count("steps without an end")
+
+
+class Go(sw.Skill):
+    max_steps = 8
+
+    def reward(self, step):
+        return step.reward
+
+
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_it_is_said_once_in_a_run(learn, workers, tmp_path, capsys):
+    spec = sw.EnvSpec(Endless, workers=workers)
+    how = {"algorithm": SMALL, "selector": SMALL, "learn": learn}
+    sw.Hierarchy(spec, [Go()], steps=400 * (1 + (learn == "apart")), **how).train(tmp_path / "run")
+    assert said(capsys) == 1
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        sw.EnvSpec(Limited, workers=1),
+        sw.EnvSpec(Endless, wrappers=(lambda e: gym.wrappers.TimeLimit(e, 300),), workers=1),
+    ],
+    ids=["its own", "a longer one of a wrapper"],
+)
+def test_a_limit_of_any_kind_counts(spec, tmp_path, capsys):
+    sw.train_agent(spec, SMALL, 1200, tmp_path / "run")
+    assert said(capsys) == 0
+
+
+def test_evaluations_have_a_limit_of_their_own(tmp_path):
+    run = sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 128, tmp_path / "run", quiet=True)
+    found = run.evaluate(3)
+    assert (found.lengths, found.cut) == ((100,) * 3, 3)
+    assert "3 never ended and were cut after 100 steps (max_steps)" in str(found)
+    assert run.evaluate(2, max_steps=130).lengths == (130, 130)
+
+
+def test_a_longer_limit_that_is_known_is_kept(tmp_path):
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
+    spec = sw.EnvSpec(Endless, wrappers=(lambda e: gym.wrappers.TimeLimit(e, 300),))
+    assert sw.evaluate(policy, spec, episodes=2).lengths == (300, 300)
+
+
+@pytest.mark.slow
+def test_evaluations_during_training_and_after_it_end(tmp_path):
+    """Choosing between greedy and sampling plays no episode longer than those of training."""
+    how = {"algorithm": SMALL, "selector": SMALL, "learn": "together"}
+    hierarchy = sw.Hierarchy(sw.EnvSpec(Endless, workers=1), [Go()], steps=640, **how)
+    run = hierarchy.train(tmp_path / "run", eval_every=320, eval_episodes=2, quiet=True)
+    (stage,) = run.info()["stages"]
+    assert stage["final"]["eval_return"] == 100.0
+    assert stage["evaluation_steps"] <= 3 * 200 + 4 * 20 * 640 // SMALL.num_envs
