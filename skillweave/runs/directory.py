@@ -79,6 +79,8 @@ class RunDirectory:
         """Logged keys of ``info`` of which users know already that they do not occur."""
         self.reported_endless = False
         """Users know already that an episode seems to have no end."""
+        self.reported_slow = False
+        """Users know already that evaluations take longer than training."""
 
     @property
     def num_envs(self) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -30,6 +31,9 @@ class PeriodicEvaluation:
         self._episodes = episodes
         self._seeds, self._every = seeds / "probe", every
         self._counted = 0
+        self._ended = time.monotonic()
+        self.took, self.after = 0.0, 0.0
+        """Seconds of the latest evaluation, and of the training before it."""
         self._arena: Collector | None = None
         if every is not None:
             self._arena = self._made(scene, min(episodes, num_envs))
@@ -65,7 +69,10 @@ class PeriodicEvaluation:
         if self._every is None or not (also or crossed(self._every, since, steps)):
             return {}
         assert self._arena is not None
+        began = time.monotonic()
         told = self._played(self._arena, play)
+        self.after, self._ended = began - self._ended, time.monotonic()
+        self.took = self._ended - began
         returns, success = told[:, RETURN], told[:, SUCCESS]
         found = {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
         if np.isnan(success).all():

@@ -23,6 +23,8 @@ from skillweave.types import SkillweaveError
 
 ENOUGH = 20
 """Episodes after which a logged key of ``info`` that never occurred is reported."""
+SLOW_SECONDS = 10.0
+"""Seconds of an evaluation that are worth a word, if training takes less."""
 T = TypeVar("T")
 START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
 """Where a stage stands before its first update."""
@@ -173,6 +175,21 @@ class StageLog:
             f"{LONGEST_EPISODE:,} steps, and evaluations cut theirs after {LONG_EPISODE:,}. If it "
             "should end sooner, or be evaluated for longer, give the environment a limit: "
             "EnvSpec(..., wrappers=(lambda env: gymnasium.wrappers.TimeLimit(env, 1000),))"
+        )
+
+    def tell_slow(self, took: float, after: float) -> None:
+        """Say once in a run that evaluations take longer than training.
+
+        Args:
+            took: seconds of an evaluation.
+            after: of training before it.
+        """
+        if took < max(SLOW_SECONDS, after) or self.run.reported_slow:
+            return
+        self.run.reported_slow = True
+        self.tell(
+            f"evaluating took {took:.0f} s, and the training before it {after:.0f} s: a larger "
+            "eval_every, or a smaller eval_episodes, would make the run faster"
         )
 
     def stopped(self) -> None:

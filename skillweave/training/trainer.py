@@ -174,6 +174,8 @@ class OneAgent:
             last = self.best is not None and tick.steps >= self.stage.budget
             found = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
             log.at["evaluation_steps"] += self.evaluation.spent()
+            if found:
+                log.tell_slow(self.evaluation.took, self.evaluation.after)
             if self.best is not None:
                 self.best.see(found, tick.steps, self.states)
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)

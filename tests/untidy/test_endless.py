@@ -84,6 +84,13 @@ def test_a_longer_limit_that_is_known_is_kept(tmp_path):
     assert sw.evaluate(policy, spec, episodes=2).lengths == (300, 300)
 
 
+def test_evaluations_that_take_longer_than_training_are_said_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(stage_log, "SLOW_SECONDS", 0.0)
+    spec = sw.EnvSpec(Endless, workers=1)
+    sw.train_agent(spec, SMALL, 256, tmp_path / "run", eval_every=64, eval_episodes=20)
+    assert capsys.readouterr().err.count("a larger eval_every") == 1
+
+
 @pytest.mark.slow
 def test_evaluations_during_training_and_after_it_end(tmp_path):
     """Choosing between greedy and sampling plays no episode longer than those of training."""

@@ -88,6 +88,7 @@ def test_a_mask_is_used_wherever_it_is(where, several, tmp_path):
     assert not ILLEGAL
 
 
+@pytest.mark.slow
 def test_an_export_reads_the_mask_of_the_observation(tmp_path):
     pytest.importorskip("onnx", reason="onnx is not installed")
     run = sw.train_agent(spec("observation"), SMALL, 256, tmp_path / "run", quiet=True)
