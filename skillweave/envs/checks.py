@@ -38,8 +38,10 @@ LIKE_MASKS = (
     "avail_actions", "valid_action_mask", "legal_action_mask", "valid_moves",
 )  # fmt: skip
 """Keys under which people keep masks elsewhere."""
-LIKE_METHODS = ("get_action_mask", "valid_action_mask", "get_avail_actions", "legal_actions")
-"""Methods by which environments tell them."""
+LIKE_METHODS = (
+    "action_masks", "get_action_mask", "valid_action_mask", "get_avail_actions", "legal_actions",
+)  # fmt: skip
+"""Attributes by which environments tell them; ``action_masks`` that is no method is one."""
 _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
 
 
@@ -139,7 +141,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         names = (MASK, *LIKE_MASKS)
         found = [f"info[{n!r}]" for n in names if n in info]
         found += [f"the observation's {n!r}" for n in names if n in shown]
-        found += [f"the method {n}()" for n in LIKE_METHODS if self.env.has_wrapper_attr(n)]
+        found += [f"its {n}" for n in LIKE_METHODS if self.env.has_wrapper_attr(n)]
         if found:
             warnings.warn(
                 f"{self._name}: {found[0]} looks like an action mask, but is not used as one: "

@@ -213,6 +213,11 @@ def told_success(info: Mapping[str, Any], n: int) -> Array | None:
         (n,) float64, NaN where an environment says nothing; None: none of them does.
     """
     told = np.asarray(info.get("success"))
+    if told.shape == (n,) and told.dtype == object:  # None, say, until it is known
+        known = [isinstance(value, NUMBERS) for value in told]
+        if not any(known):
+            return None
+        return np.array([v != 0 if k else np.nan for v, k in zip(told, known, strict=True)], float)
     if told.shape != (n,) or told.dtype.kind not in "biuf":
         return None
     here = np.asarray(info.get("_success", np.ones(n, bool)))

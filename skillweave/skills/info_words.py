@@ -14,8 +14,9 @@ NUMBERS = bool | int | float | np.number | np.bool_
 
 
 def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the keys of a batched info, without Gymnasium's masks (``_key``)."""
-    return tuple(key for key in info if not (str(key).startswith("_") and key[1:] in info))
+    """Return the keys of a batched info that are text, without Gymnasium's masks (``_key``)."""
+    texts = (key for key in info if isinstance(key, str))
+    return tuple(key for key in texts if not (key.startswith("_") and key[1:] in info))
 
 
 def keys_told(info: Mapping[str, Any]) -> str:

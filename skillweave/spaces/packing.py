@@ -69,7 +69,13 @@ def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
     if inner is None:
         kinds = gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
         if isinstance(space, gym.spaces.Box | gym.spaces.Discrete | kinds):
-            return np.dtype(space.dtype)
+            dtype = np.dtype(space.dtype)
+            if dtype.kind == "f" and dtype.itemsize > 8:
+                raise SkillweaveError(
+                    f"observation space {short(space)} is of {dtype}, which PyTorch does not have: "
+                    "wrappers=(lambda env: gymnasium.wrappers.DtypeObservation(env, np.float64),)"
+                )
+            return dtype
         raise SkillweaveError(
             f"observation space {space} is not supported; supported are: {OBSERVATIONS}. "
             "A gymnasium wrapper (FlattenObservation, say) can turn other spaces into these."

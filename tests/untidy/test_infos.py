@@ -130,6 +130,28 @@ def test_a_key_that_nobody_gives_is_named(tmp_path):
         )
 
 
+def test_a_success_that_is_not_known_yet_is_no_failure(tmp_path):
+    class Late(Telling):
+        """Says None until the last step, when some have succeeded."""
+
+        def __init__(self):
+            super().__init__([0, 1])
+
+        def reset(self, *, seed=None, options=None):
+            found = super().reset(seed=seed)
+            self.length = int(self.np_random.integers(3, 9))
+            return found
+
+        def step(self, action):
+            obs, *_ = super().step(action)
+            over = self.t == self.length
+            return obs, 1.0, over, False, {"success": self.length > 5 if over else None}
+
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
+    found = sw.evaluate(policy, Late, episodes=20, num_envs=5)
+    assert found.success_rate == np.mean(np.array(found.lengths) > 5)
+
+
 class OneBuffer(gym.Env):
     """All its instances show the same array, which each of them fills in its own step."""
 
