@@ -230,7 +230,9 @@ class Run:
         Raises:
             SkillweaveError: a part cannot be exported; the message says which, and what to do.
         """
-        return write_export(as_path(path, "path"), self.policy, self.declaration.spec.name)
+        path = as_path(path, "path")
+        must_be_own(path)
+        return write_export(path, self.policy, self.declaration.spec.name)
 
     @checked_names
     def report(
@@ -284,6 +286,7 @@ class Run:
             The path.
         """
         path = as_path(path, "path")
+        must_be_own(path.parent)
         write_weights(path, self.declaration, self.policy)
         return path
 

@@ -44,6 +44,7 @@ from skillweave.runs.files import (
 )
 from skillweave.runs.jsonl import JsonLines
 from skillweave.runs.kept import to_be_judged
+from skillweave.runs.links import check_no_links
 from skillweave.runs.lock import NAME as LOCK
 from skillweave.runs.lock import Lock
 from skillweave.runs.manifest import Checkpoint, MetricsLine, identity, read_manifest, versions
@@ -107,6 +108,7 @@ class RunDirectory:
             raise SkillweaveError(f"could not make {path}: {error.strerror}") from error
         before = cls.open(path) if os.path.lexists(path / "run.json") else None
         if before is not None:
+            check_no_links(path)
             check_replaceable(before)
         check_ours(path, before)  # before the lock is written there
         lock = Lock(path)
@@ -164,10 +166,11 @@ class RunDirectory:
             finished: also if it is finished, to train it for longer.
 
         Raises:
-            SkillweaveError: another process trains it, or it cannot be written.
+            SkillweaveError: another process trains it, it cannot be written, or it holds links.
         """
         if self._lock is not None or (self.finished and not finished):
             return
+        check_no_links(self.path)
         self._lock = Lock(self.path)
         try:
             # Another process may have gone on with it.

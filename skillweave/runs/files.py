@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +23,7 @@ SCHEMA = 1
 """Version of everything written here; readers refuse newer ones."""
 TEMPORARY = ".*.tmp"
 """What files are named while they are written; only a killed process leaves some behind."""
+_BINARY = getattr(os, "O_BINARY", 0)  # of Windows
 LARGEST_JSON = 16 * 2**20
 """Bytes of a JSON file."""
 
@@ -37,12 +38,13 @@ def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> No
     try:
         if make_directories:
             path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(".tmp", f".{path.name}.", path.parent)
+        temporary = str(path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp")
+        # The system gives it the mode that the umask leaves.
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
         _sync(path.parent)
     except BaseException as error:
