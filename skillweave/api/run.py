@@ -24,6 +24,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.trackers import track_film
 from skillweave.skills import Skill
+from skillweave.terminal import printable
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
 from skillweave.training.plain_agent import PlainAgent
@@ -47,7 +48,7 @@ class Run:
         self._player: Player | None = None
 
     def __repr__(self) -> str:
-        return f"<Run {self.path}: {str(self.declaration).strip('<>')}>"
+        return printable(f"<Run {self.path}: {str(self.declaration).strip('<>')}>")
 
     def _repr_html_(self) -> str:
         """Return a table of what it is, and of its stages, for notebooks."""

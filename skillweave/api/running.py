@@ -29,6 +29,7 @@ from skillweave.runs.manifest import identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
+from skillweave.terminal import steady_streams
 from skillweave.training.callback import Callback, TrainCallback, check_callback
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.training.stage_log import Listener
@@ -84,7 +85,7 @@ def begin(
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
     spaces = _plan(declared, content, evolve, cluster)
-    with called_by(caller_of(declared)), ExitStack() as stack:
+    with steady_streams(), called_by(caller_of(declared)), ExitStack() as stack:
         if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
             own, told = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
@@ -201,7 +202,7 @@ def go_on(
     if not run.finished:
         _may_train()
     must_be_own(run.path)
-    with ExitStack() as stack:
+    with steady_streams(), ExitStack() as stack:
         stack.enter_context(called_by(caller_of(declared)))
         stack.callback(run.close)
         run.begin()

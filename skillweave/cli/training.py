@@ -13,7 +13,7 @@ from skillweave.api.declared import declared_by
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
-from skillweave.cli.telling import run_words, save_score, tell
+from skillweave.cli.telling import put, run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.evolution.config import Evolution
 from skillweave.runs.directory import RunDirectory
@@ -43,7 +43,7 @@ def train(command: commands.Train) -> None:
     result, lines = _told(command, trained, command.render)
     if command.versus_flat:
         if not command.json:  # now: the flat agent takes as long again
-            print("\n".join(lines), flush=True)
+            put("\n".join(lines))
         flat = _trained(command, hierarchy, True, flat_out, baseline=True)
         result["flat"], more = _told(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])

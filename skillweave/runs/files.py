@@ -120,9 +120,28 @@ def write_json(path: Path, data: Mapping[str, Any], *, make_directories: bool = 
 
 def json_bytes(path: Path, data: Mapping[str, Any]) -> bytes:
     """What ``write_json`` writes."""
-    plain = json.loads(_json(path, {"schema": SCHEMA, **data}))
+    plain = _whole(json.loads(_json(path, {"schema": SCHEMA, **data})))
     text = _json(path, plain | {"sha256": _json_digest(plain)}, indent=2)
     return text.encode() + b"\n"
+
+
+def _whole(data: Any) -> Any:
+    """Return JSON whose texts are of whole characters.
+
+    In a locale that does not know all characters, Python has halves of some in the names of files.
+    """
+    if isinstance(data, str):
+        return data if data.isascii() else _whole_text(data)
+    if isinstance(data, dict):
+        return {_whole(k): _whole(v) for k, v in data.items()}
+    return [_whole(x) for x in data] if isinstance(data, list) else data
+
+
+def _whole_text(text: str) -> str:
+    try:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:
+        return text.encode("utf-8", "backslashreplace").decode()
 
 
 def read_json(
