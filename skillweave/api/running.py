@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
@@ -21,6 +21,7 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import copied, every_hierarchy
 from skillweave.messages import as_path, short
+from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
@@ -85,7 +86,7 @@ def begin(
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
     spaces = _plan(declared, content, evolve, cluster)
-    with steady_streams(), called_by(caller_of(declared)), ExitStack() as stack:
+    with _surroundings(), called_by(caller_of(declared)), ExitStack() as stack:
         if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
             own, told = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
@@ -188,6 +189,13 @@ def _plan(
     return observation_space, action_space
 
 
+@contextmanager
+def _surroundings() -> Iterator[None]:
+    """Train in surroundings that the user has made for other things."""
+    with steady_streams(), normal_tensors():
+        yield
+
+
 def go_on(
     declared: Hierarchy | Agent,
     run: RunDirectory,
@@ -202,7 +210,7 @@ def go_on(
     if not run.finished:
         _may_train()
     must_be_own(run.path)
-    with steady_streams(), ExitStack() as stack:
+    with _surroundings(), ExitStack() as stack:
         stack.enter_context(called_by(caller_of(declared)))
         stack.callback(run.close)
         run.begin()

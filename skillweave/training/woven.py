@@ -22,7 +22,7 @@ from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
 from skillweave.experience import Anchor
-from skillweave.ops.device import resolve_device
+from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.starts import start_of
 from skillweave.runs.states import load_state
@@ -184,7 +184,11 @@ class WovenAgents(OneAgent):
             return None
         params = algorithm.acting_params(state, device=device)
         # Who seldom succeeded has little to lose, and much to learn.
-        return Anchor(params, torch.ones(1, device=device), self.together.reference_kl / rate)
+        return Anchor(
+            params,
+            torch.ones(1, dtype=torch.float32, device=device),
+            self.together.reference_kl / rate,
+        )
 
     def _part(self, name: str, stack: Stack, log: StageLog, *, learnt_before: bool) -> Learner:
         """The learner of the selector, or of a skill."""
@@ -275,7 +279,7 @@ class WovenAgents(OneAgent):
     def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
         """Return all states among the extra tensors."""
         assert isinstance(self.learner, WovenLearner)
-        states = {"counts": torch.tensor(list(self.learner.counts.values()))}
+        states = {"counts": torch.tensor(list(self.learner.counts.values()), **INT)}
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
         return None, extra | states | self.best_tensors()
