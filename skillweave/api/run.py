@@ -15,7 +15,7 @@ from skillweave.envs.make import EngineName
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.weights import write_weights
-from skillweave.messages import as_path, whole_number
+from skillweave.messages import as_path, shown_path, whole_number
 from skillweave.reporting.film import Film
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
@@ -48,7 +48,7 @@ class Run:
         self._player: Player | None = None
 
     def __repr__(self) -> str:
-        return printable(f"<Run {self.path}: {str(self.declaration).strip('<>')}>")
+        return printable(f"<Run {shown_path(self.path)}: {str(self.declaration).strip('<>')}>")
 
     def _repr_html_(self) -> str:
         """Return a table of what it is, and of its stages, for notebooks."""

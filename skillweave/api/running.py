@@ -20,7 +20,7 @@ from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import copied, every_hierarchy
-from skillweave.messages import as_path, short
+from skillweave.messages import absolute, as_path, short, shown_path
 from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
@@ -75,7 +75,9 @@ def begin(
     """
     _may_train()
     check_callback(callback)
-    run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
+    # An environment may change the working directory as it is made.
+    place = absolute("." if run_dir is None else as_path(run_dir, "run_dir"))
+    run_dir = None if run_dir is None else place
     if not isinstance(resume, bool):
         raise SkillweaveError(f"resume is {short(resume)}; it must be True or False")
     if resume and run_dir is None:
@@ -98,8 +100,8 @@ def begin(
             cluster.check()
         content = content | {"recipe": declared.recipe, "track": track}
         if run_dir is None:
-            run_dir = make_numbered(_run_name(declared, content))
-            note = "; ".join(filter(None, (f"run: {run_dir}", note)))
+            run_dir = make_numbered(_run_name(declared, content), place)
+            note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
             stack.callback(_remove_if_empty, run_dir)
         run = RunDirectory.create(run_dir, content, partial(keep_starts, learnt=learnt), hold=True)
         stack.callback(run.close)

@@ -16,6 +16,7 @@ from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.telling import put, save_score, tell
+from skillweave.messages import shown_path
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
 from skillweave.types import MissingExtra, SkillweaveError
@@ -125,7 +126,7 @@ class Demo:
         seconds = time.perf_counter() - started
         score = run.evaluate(self._episodes(task), quiet=True)
         save_score(run, score)
-        self.result[name] = score.to_json() | {"run": str(run.path), "seconds": seconds}
+        self.result[name] = score.to_json() | {"run": str(shown_path(run.path)), "seconds": seconds}
         if task == MISSION:
             self.result[name]["complete"] = complete(score)
         return run, score, seconds

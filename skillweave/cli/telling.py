@@ -7,6 +7,7 @@ from typing import Any
 
 from skillweave.api import Run
 from skillweave.cli import commands
+from skillweave.messages import shown_path
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.terminal import put_result, say
@@ -49,4 +50,4 @@ def run_words(run: RunDirectory) -> list[str]:
     """Return where a finished run lies, and commands that show it, as lines."""
     names = ("evaluate", "render", "report")
     commands = [command_words(name, run) for name in names]
-    return [f"run     {run.path}", "next    " + "\n        ".join(commands)]
+    return [f"run     {shown_path(run.path)}", "next    " + "\n        ".join(commands)]

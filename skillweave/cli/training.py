@@ -16,6 +16,7 @@ from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.telling import put, run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.evolution.config import Evolution
+from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
@@ -138,7 +139,7 @@ def _told(
 ) -> tuple[dict[str, Any], list[str]]:
     """What a run has come to, for programs and for people."""
     manifest = trained.info()
-    result: dict[str, Any] = {"run": str(trained.path), "stages": manifest["stages"]}
+    result: dict[str, Any] = {"run": str(shown_path(trained.path)), "stages": manifest["stages"]}
     seconds = sum(p["seconds"] for p in manifest["stages"])
     steps = sum(p["steps"] for p in manifest["stages"])
     lines = [

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy, state_from
+from skillweave.messages import absolute
 from skillweave.reading import fit, shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import resume_words, saved_words
@@ -62,16 +63,45 @@ FINAL = "final"
 LINES = ("metrics_bytes", "lineage_bytes")
 
 
+LONGEST_NAME = 255
+"""Bytes of a file's name, on nearly all file systems."""
+MORE = 14
+"""How much longer a file's name is while it is written."""
+
+
+def _check_file_names(manifest: Mapping[str, Any]) -> None:
+    """Raise a SkillweaveError where the name of a policy's file would be too long."""
+    for entry in manifest["stages"]:
+        for name in (entry["name"], *entry["learns"]):
+            file = _policy_file(entry["name"], name)
+            if len(file) + MORE > LONGEST_NAME:
+                raise SkillweaveError(
+                    f"the weights of {shown(name, 100)} would be in a file whose name has "
+                    f"{len(file)} letters, and file systems take {LONGEST_NAME - MORE}; give "
+                    "skills on the way to it shorter names"
+                )
+
+
+def _policy_file(stage: str, name: str | None) -> str:
+    """Return the name of the file of a stage's policy, or of one who learns in it."""
+    own = stage if name in (None, stage) else f"{stage}.{name}"
+    return f"{file_name(own)}.safetensors"
+
+
 def file_name(path: str) -> str:
     """The name of a file for who has this path: ``inner.skill`` for ``inner/skill``."""
     return path.replace("/", ".")
 
 
 class RunDirectory:
-    """One run on disk. ``manifest`` is the content of ``run.json``."""
+    """One run on disk. ``manifest`` is the content of ``run.json``.
+
+    Its ``path`` is absolute: a program may change its working directory while it trains.
+    """
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
-        self.path, self.manifest = path, manifest
+        self.path, self.manifest = absolute(path), manifest
+        path = self.path
         self._metrics = JsonLines(path / "metrics.jsonl", MetricsLine, self._next_step)
         self.lineage = JsonLines(path / "lineage.jsonl", LineageLine, self._next_step)
         self._checkpoints = Checkpoints(path)
@@ -98,7 +128,8 @@ class RunDirectory:
             SkillweaveError: the directory holds a run that has learnt something or that another
                 process trains, or other files.
         """
-        path = Path(path)
+        path = absolute(path)
+        _check_file_names(manifest)
         if path.is_file():
             raise SkillweaveError(f"{path} exists and is not an empty directory; choose another")
         made = not path.exists()
@@ -402,8 +433,7 @@ class RunDirectory:
 
     def policy_path(self, stage: str, name: str | None = None) -> Path:
         """Where the policy of a stage lies, or of one who learns in it."""
-        file = stage if name in (None, stage) else f"{stage}.{name}"
-        return self.path / "policies" / f"{file_name(file)}.safetensors"
+        return self.path / "policies" / _policy_file(stage, name)
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""

@@ -91,9 +91,9 @@ def from_torch(
 
     ``forward`` gets observations (n, *obs_shape) of the type of its weights (without any, float32),
     images unscaled, of a Dict or Tuple a dict or tuple of such. It returns logits for Discrete
-    (concatenated for MultiDiscrete, one for each bit of MultiBinary), actions for Box (clipped to its bounds); whole numbers are actions
-    everywhere. Its weights are copied into the run; loading the run puts them into the recipe's
-    module, whatever that was initialised with.
+    (concatenated for MultiDiscrete, one for each bit of MultiBinary), actions for Box (clipped to
+    its bounds); whole numbers are actions everywhere. Its weights are copied into the run; loading
+    the run puts them into the recipe's module, whatever that was initialised with.
 
     Args:
         module: acts in evaluation mode, as a copy of what it is when training starts.
