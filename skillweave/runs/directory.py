@@ -444,10 +444,17 @@ class RunDirectory:
         """How long ``metrics.jsonl`` and ``lineage.jsonl`` are, for ``rewind``."""
         return {"metrics_bytes": self._metrics.size, "lineage_bytes": self.lineage.size}
 
-    def rewind(self, at: Mapping[str, Any]) -> None:
-        """Drop the lines after those that ``line_bytes`` told: training writes them again."""
-        self._metrics.rewind(at.get("metrics_bytes"))
-        self.lineage.rewind(at.get("lineage_bytes"))
+    def rewind(self, at: Mapping[str, Any]) -> list[str]:
+        """Drop the lines after those that ``line_bytes`` told: training writes them again.
+
+        Returns:
+            The files that lack lines, as they were removed or shortened.
+        """
+        whole = {
+            "metrics.jsonl": self._metrics.rewind(at.get("metrics_bytes")),
+            "lineage.jsonl": self.lineage.rewind(at.get("lineage_bytes")),
+        }
+        return [name for name, complete in whole.items() if not complete]
 
     def _next_step(self) -> str:
         return resume_words(self)

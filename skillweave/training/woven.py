@@ -25,7 +25,7 @@ from skillweave.experience import Anchor
 from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.starts import start_of
-from skillweave.runs.states import load_state
+from skillweave.runs.states import load_state, state_path
 from skillweave.seeding import Seeds
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.replay_learner import ReplayLearner, store_of
@@ -122,6 +122,8 @@ class WovenAgents(OneAgent):
             device = resolve_device(algorithm.config.device)
             before, anchor = self._before(name), None
             if before is not None:
+                if not saved:
+                    self._tell_lost_state(name, log)
                 fresh = self._as_before(name, algorithm, fresh, *before)
                 anchor = self._anchor(name, algorithm, fresh, device, log)
             if saved:
@@ -155,6 +157,16 @@ class WovenAgents(OneAgent):
         if self.stage.continues:
             return None  # all is in its final state
         return start_of(self.stage.run, self.stage.name, name, self.algorithms[name])
+
+    def _tell_lost_state(self, name: str, log: StageLog) -> None:
+        """Say so where the file of a state was deleted."""
+        latest, path = self._latest_stage(name), state_path(self.stage.run, name)
+        kept = latest.get("kept", {}).get("kept")
+        if latest and latest.get("evolution") is None and kept != "before" and not path.exists():
+            log.tell(
+                f"{path} is not there any more, so {name!r} goes on with its weights alone, and "
+                "the end is another one"
+            )
 
     def _as_before(
         self, name: str, algorithm: Algorithm, fresh: Any, policy: AgentPolicy, steps: int
