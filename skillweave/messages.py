@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,28 @@ def whole_number(value: object, name: str, least: int) -> int:
     if value > MOST:
         raise SkillweaveError(f"{name} is {short(value)}; it must be at most {MOST:,}")
     return int(value)
+
+
+def absolute(path: str | Path) -> Path:
+    """Return the path from the root on, which leads to the same place from everywhere.
+
+    Raises:
+        SkillweaveError: the working directory, from which it leads, was deleted.
+    """
+    try:
+        return Path(path).absolute()
+    except OSError as error:
+        raise SkillweaveError(
+            f"{path} leads from the working directory, and that is not there any more: change to "
+            "another directory, or give the path from the root on"
+        ) from error
+
+
+def shown_path(path: Path) -> Path:
+    """Return a path for messages: from the working directory on where it is below that."""
+    with suppress(OSError, ValueError):
+        return path.relative_to(Path.cwd()) if path.is_absolute() else path
+    return path
 
 
 def as_path(path: str | Path, name: str) -> Path:

@@ -1,6 +1,7 @@
 """Words that every room shares: steps, and what acts and what learns.
 
-This module imports nothing of the library but ``tracebacks``, and no torch at run time.
+This module imports nothing of the library but ``terminal`` and ``tracebacks``, and no torch when it
+runs.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from gymnasium import Space
 from numpy.typing import NDArray
 
+from skillweave.terminal import printable
 from skillweave.tracebacks import ShortTraceback
 
 T = TypeVar("T")
@@ -45,9 +47,15 @@ def flat(prefix: str, value: Any) -> dict[str, Any]:
 class SkillweaveError(ShortTraceback, Exception):
     """An error made for people: it says what was wrong, where, and what to do about it."""
 
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
+
 
 class Interrupted(ShortTraceback, KeyboardInterrupt):
     """Training was interrupted; the message says what is saved and how to go on."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
 
 
 class MissingExtra(SkillweaveError, ImportError):

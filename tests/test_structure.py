@@ -21,6 +21,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 # The table of docs/architecture.md: what a room may import. `seeding` is open to all.
 BASE = {
     "types",
+    "terminal",
     "tracebacks",
     "notebooks",
     "messages",
@@ -36,9 +37,10 @@ EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "rec
 EVERYTHING |= {"export"}
 ROOMS: dict[str, set[str]] = {
     "seeding": set(),
+    "terminal": set(),
     "tracebacks": set(),
     "notebooks": set(),
-    "types": {"tracebacks"},
+    "types": {"terminal", "tracebacks"},
     "shapes": set(),
     "messages": {"types", "tracebacks"},
     "arguments": {"types", "messages"},

@@ -17,6 +17,7 @@ from skillweave.networks.config import Network
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
+from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.losses import critic_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.seeding import Seeds
@@ -49,11 +50,11 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
 
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
         """The fields that both have, but for the critics."""
-        return super().fresh_fields(params) | {"policy_loss": torch.zeros(len(params))}
+        return super().fresh_fields(params) | {"policy_loss": torch.zeros(len(params), **FLOAT)}
 
     def fresh_networks(self, seeds: Sequence[Seeds]) -> dict[str, Tensor]:
         """The same with fresh networks."""
-        params = torch.zeros(len(seeds), self.layout.size)
+        params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         generators = self.member_generators(seeds)
         self.net.init_(self.layout.views(params), 0.01, generators)
         critic = self.critics.init(generators)
@@ -62,7 +63,7 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
             "critic_target": critic.clone(),
             "critic_mu": torch.zeros_like(critic),
             "critic_nu": torch.zeros_like(critic),
-            "critic_count": torch.zeros(len(seeds), dtype=torch.int64),
+            "critic_count": torch.zeros(len(seeds), **INT),
         }
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -122,7 +123,7 @@ class Critics:
 
     def init(self, generators: list[torch.Generator]) -> Tensor:
         """Fresh parameters (P, K, D), one generator per member."""
-        flat = torch.zeros(len(generators), self.count, self.layout.size)
+        flat = torch.zeros(len(generators), self.count, self.layout.size, **FLOAT)
         for member, generator in enumerate(generators):
             self.net.init_(self.layout.views(flat[member]), 1.0, [generator] * self.count)
         return flat

@@ -17,6 +17,7 @@ from skillweave.experience import Report
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.stacked import Layout
+from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
@@ -212,15 +213,15 @@ class Algorithm:
             "params": params,
             "mu": torch.zeros_like(params),
             "nu": torch.zeros_like(params),
-            "count": torch.zeros(members, dtype=torch.int64),
-            "obs_mean": torch.zeros(members, self.obs.size),
-            "obs_var": torch.ones(members, self.obs.size),
-            "obs_count": torch.full((members,), 1e-4),
-            "return_mean": torch.zeros(members, 1),
-            "return_var": torch.ones(members, 1),
-            "return_count": torch.full((members,), 1e-4),
+            "count": torch.zeros(members, **INT),
+            "obs_mean": torch.zeros(members, self.obs.size, **FLOAT),
+            "obs_var": torch.ones(members, self.obs.size, **FLOAT),
+            "obs_count": torch.full((members,), 1e-4, **FLOAT),
+            "return_mean": torch.zeros(members, 1, **FLOAT),
+            "return_var": torch.ones(members, 1, **FLOAT),
+            "return_count": torch.full((members,), 1e-4, **FLOAT),
             **{
-                k: torch.full((members,), member_setting(self.config, k))
+                k: torch.full((members,), member_setting(self.config, k), **FLOAT)
                 for k in self.member_hyperparameters
             },
         }

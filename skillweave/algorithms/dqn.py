@@ -21,7 +21,7 @@ from skillweave.experience import Sample
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Layout, Views
-from skillweave.ops.device import Constant
+from skillweave.ops.device import FLOAT, Constant
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import categorical_projection, td_loss, weighted_mean
 from skillweave.ops.returns import td_target
@@ -53,7 +53,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         if config.distributional:
             low = -WIDEST if config.v_min is None else config.v_min
             high = WIDEST if config.v_max is None else config.v_max
-            self.atoms = Constant(torch.linspace(low, high, config.n_atoms))
+            self.atoms = Constant(torch.linspace(low, high, config.n_atoms, **FLOAT))
         self.net = QNet(
             self.obs, config.network, self.codec.size,
             atoms=config.n_atoms if config.distributional else 1,
@@ -81,7 +81,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """A state of fresh members, one for each seed."""
-        params = torch.zeros(len(seeds), self.layout.size)
+        params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         self.net.init_(self.layout.views(params), self.member_generators(seeds))
         return State(**self.fresh_fields(params), target=params.clone())
 
@@ -97,7 +97,9 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         spent = min(1.0, progress / max(cfg.exploration_fraction, 1e-9))
         start, final = cfg.exploration_initial_eps, cfg.exploration_final_eps
         eps = 0.0 if cfg.noisy else start + spent * (final - start)
-        params.extra["epsilon"] = torch.full((len(state.params), 1), eps, device=device)
+        params.extra["epsilon"] = torch.full(
+            (len(state.params), 1), eps, dtype=torch.float32, device=device
+        )
         return params
 
     def noise(
@@ -105,10 +107,12 @@ class DQNAlgorithm(OffPolicyAlgorithm):
     ) -> list[tuple[Tensor, Tensor | None]]:
         """For each step, uniform numbers (P, batch, A + 1) and the weights' noise (P, K)."""
         shape, inner = (steps, batch, self.codec.size + 1), self.net.noise_size
-        uniform = torch.stack([torch.rand(shape, generator=g) for g in generators], dim=1)
+        uniform = torch.stack([torch.rand(shape, generator=g, **FLOAT) for g in generators], dim=1)
         if not inner:
             return [(u, None) for u in uniform]
-        normal = torch.stack([torch.randn(steps, inner, generator=g) for g in generators], dim=1)
+        normal = torch.stack(
+            [torch.randn(steps, inner, generator=g, **FLOAT) for g in generators], dim=1
+        )
         return list(zip(uniform, normal, strict=True))
 
     def act(

@@ -15,6 +15,7 @@ from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.parameters import rate_now
 from skillweave.experience import Report, Sample
 from skillweave.networks.stacked import Views
+from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.optim import adam_, clip_grad_norm_
 
@@ -50,7 +51,7 @@ class OffPolicyAlgorithm(Algorithm):
 
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
         """The fields that every state has, and the count of gradient steps."""
-        updates = torch.zeros(len(params), dtype=torch.int64)
+        updates = torch.zeros(len(params), **INT)
         return super().fresh_fields(params) | {"updates": updates}
 
     def update(
@@ -92,7 +93,7 @@ class OffPolicyAlgorithm(Algorithm):
         self, generators: Sequence[torch.Generator], batch: int, mask: Tensor | None
     ) -> Tensor:
         """Actions (P, batch, ...) drawn uniformly from those allowed, on the CPU."""
-        drawn = [torch.rand(batch, self.codec.size, generator=g) for g in generators]
+        drawn = [torch.rand(batch, self.codec.size, generator=g, **FLOAT) for g in generators]
         uniform = torch.stack(drawn)
         if not self.codec.discrete:
             return 2.0 * uniform - 1.0
@@ -130,4 +131,4 @@ class OffPolicyAlgorithm(Algorithm):
 
 def normal(generators: Sequence[torch.Generator], *shape: int) -> Tensor:
     """Standard normal numbers (P, *shape), from one generator per member."""
-    return torch.stack([torch.randn(shape, generator=g) for g in generators])
+    return torch.stack([torch.randn(shape, generator=g, **FLOAT) for g in generators])

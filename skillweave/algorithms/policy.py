@@ -174,7 +174,7 @@ def state_from(
     """
     shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
     for family in groups:  # after growth each parameter has an age of its own
-        if tensors.get(family.count, torch.empty(0)).ndim > 1:
+        if family.count in tensors and tensors[family.count].ndim > 1:
             shapes[family.count] = shapes[family.weights[0]]
     found = {
         name: checked_tensor(tensors, name, shapes[name], value.dtype, where)

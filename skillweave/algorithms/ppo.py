@@ -27,7 +27,7 @@ from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
-from skillweave.ops.device import all_false
+from skillweave.ops.device import FLOAT, all_false
 from skillweave.ops.distributions import mask_logits, with_epsilon
 from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
 from skillweave.ops.moments import masked_mean
@@ -83,7 +83,7 @@ class PPOAlgorithm(Algorithm):
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """A state of fresh members, one for each seed."""
-        params = torch.zeros(len(seeds), self.layout.size)
+        params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         views, generators = self.layout.views(params), self.member_generators(seeds)
         self.actor_net.init_(views, 0.01, generators)
         # All values begin at 0. A random critic's errors are the only advantages until something

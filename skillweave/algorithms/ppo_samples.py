@@ -52,7 +52,7 @@ def epsilon_now(config: PPO | SkillCritic, progress: float, like: Tensor) -> Ten
         return None
     fallen = min(1.0, progress / max(config.epsilon_fraction, 1e-9))
     share = first if last is None else first + fallen * (last - first)
-    return torch.full((len(like), 1, 1), share, device=like.device)
+    return torch.full((len(like), 1, 1), share, dtype=torch.float32, device=like.device)
 
 
 @torch.no_grad()

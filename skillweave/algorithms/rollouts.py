@@ -143,7 +143,9 @@ def minibatches(
     size, device = rows.advantage.shape[1], rows.advantage.device
     parts = min(size, max(1, round(samples.most / batch_size)))
     for _ in range(epochs):
-        order = torch.stack([torch.randperm(size, generator=g) for g in rng]).to(device)
+        order = torch.stack([torch.randperm(size, generator=g, device="cpu") for g in rng]).to(
+            device
+        )
         shuffle = functools.partial(take_rows, rows=order)
         shuffled = rows.changed(shuffle, shuffle)
         for part in range(parts):

@@ -26,6 +26,7 @@ from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, Views
+from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.distributions import (
     mask_logits,
     masked_log_probs,
@@ -83,11 +84,11 @@ class SACAlgorithm(ActorCriticAlgorithm):
         members = len(seeds)
         return State(
             **self.fresh_networks(seeds),
-            log_alpha=torch.full((members, 1), math.log(self.config.ent_coef)),
-            alpha_mu=torch.zeros(members, 1),
-            alpha_nu=torch.zeros(members, 1),
-            alpha_count=torch.zeros(members, dtype=torch.int64),
-            entropy=torch.zeros(members),
+            log_alpha=torch.full((members, 1), math.log(self.config.ent_coef), **FLOAT),
+            alpha_mu=torch.zeros(members, 1, **FLOAT),
+            alpha_nu=torch.zeros(members, 1, **FLOAT),
+            alpha_count=torch.zeros(members, **INT),
+            entropy=torch.zeros(members, **FLOAT),
         )
 
     def act(

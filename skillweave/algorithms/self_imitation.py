@@ -22,7 +22,7 @@ from skillweave.algorithms.ppo_samples import Terms
 from skillweave.algorithms.rollouts import Cells, first_true
 from skillweave.experience import Report, Rollout
 from skillweave.networks.stacked import Views, take_rows
-from skillweave.ops.device import all_false
+from skillweave.ops.device import BOOL, FLOAT, all_false
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
@@ -75,11 +75,11 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         obs = to_tensor(np.zeros((1, *obs_shape(space)), obs_dtype(space)))[0]
         return State(
             **vars(super().fresh_state(seeds)),
-            kept=torch.zeros(lead, dtype=torch.bool),
+            kept=torch.zeros(lead, **BOOL),
             kept_obs=obs.new_zeros(*lead, *obs.shape),
             kept_action=to_tensor(action).new_zeros(*lead, *action.shape[1:]),
-            kept_mask=torch.ones(*lead, width, dtype=torch.bool),
-            kept_return=torch.zeros(lead),
+            kept_mask=torch.ones(*lead, width, **BOOL),
+            kept_return=torch.zeros(lead, **FLOAT),
         )
 
     def check_state(self, state: Any) -> None:
@@ -143,7 +143,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         for step in range(cfg.imitation_steps):
             if all_false(active := step < due):
                 break
-            drawn = torch.stack([torch.rand(cfg.batch_size, generator=g) for g in rng])
+            drawn = torch.stack([torch.rand(cfg.batch_size, generator=g, **FLOAT) for g in rng])
             place = torch.searchsorted(total, drawn.to(total.device) * total[:, -1:], right=True)
             # Rounding may lead beyond the last row; of a member without rows it does.
             batch = rows.take(place.clamp_max(total.shape[1] - 1))

@@ -25,6 +25,7 @@ from skillweave.algorithms.rollouts import values_after
 from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Layout, take_rows
+from skillweave.ops.device import FLOAT
 from skillweave.ops.losses import value_loss
 from skillweave.ops.moments import explained_variance
 from skillweave.ops.optim import adam_, clip_grad_norm_
@@ -56,7 +57,7 @@ class SkillCriticAlgorithm(Algorithm):
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> AgentState:
         """A state of fresh members, to which all skills are worth the same."""
-        params = torch.zeros(len(seeds), self.layout.size)
+        params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         self.net.init_(self.layout.views(params), 0.0, self.member_generators(seeds))
         return AgentState(**self.fresh_fields(params))
 
@@ -127,7 +128,9 @@ class SkillCriticAlgorithm(Algorithm):
         loss = target.new_zeros(len(target))
         parts = max(1, round(size / cfg.batch_size))
         for _ in range(cfg.update_epochs):
-            order = torch.stack([torch.randperm(size, generator=g) for g in rng]).to(target.device)
+            order = torch.stack([torch.randperm(size, generator=g, device="cpu") for g in rng]).to(
+                target.device
+            )
             for rows in order.chunk(parts, dim=1):
                 own = {k: take_rows(v, rows) for k, v in inputs.items()}
                 worth, goal = self.net(leaves, own), take_rows(target, rows)

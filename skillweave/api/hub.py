@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import shutil
 import tempfile
 from pathlib import Path
@@ -87,9 +88,12 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
         raise SkillweaveError(f"{path} is there already; choose another folder")
     found = hub.download(hub.check_name(name), revision)
     manifest = hub.public(RunDirectory.open(found).manifest)  # others may have pushed all of it
-    part = path.with_name(f".{path.name}.part")
+    # A name that nobody can know: a link that waits there would lead elsewhere.
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        (part / "policies").mkdir(parents=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir()
+        (part / "policies").mkdir()
         for file in (f for pattern in hub.WANTED for f in found.glob(pattern)):
             shutil.copy(file, part / file.relative_to(found))
         RunDirectory(part, manifest).save()

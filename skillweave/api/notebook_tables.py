@@ -12,6 +12,7 @@ from skillweave.hierarchy.nesting import every_skill, inner_of
 from skillweave.notebooks import Markup, facts, joined, paragraph, table
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill, Skill, about, own_methods
+from skillweave.terminal import printable
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import SkillweaveError
@@ -23,13 +24,13 @@ if TYPE_CHECKING:
 def hierarchy_line(declared: Hierarchy) -> str:
     """Return what ``repr`` says of a hierarchy."""
     names = ", ".join(s.name for s in declared.skills)
-    return f"<{type(declared).__name__} of {names} on {declared.spec.name}>"
+    return printable(f"<{type(declared).__name__} of {names} on {declared.spec.name}>")
 
 
 def agent_line(declared: Agent) -> str:
     """Return what ``repr`` says of a plain agent."""
     kind = _kind(declared.algorithm)
-    return f"<{type(declared).__name__} of {kind} on {declared.spec.name}>"
+    return printable(f"<{type(declared).__name__} of {kind} on {declared.spec.name}>")
 
 
 def hierarchy_html(declared: Hierarchy) -> str:

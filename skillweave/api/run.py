@@ -16,7 +16,7 @@ from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.hierarchy.weights import write_weights
-from skillweave.messages import as_path, whole_number
+from skillweave.messages import as_path, shown_path, whole_number
 from skillweave.reporting.film import Film
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
@@ -25,6 +25,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.trackers import track_film
 from skillweave.skills import Skill
+from skillweave.terminal import printable
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
 from skillweave.training.plain_agent import PlainAgent
@@ -48,7 +49,7 @@ class Run:
         self._player: Player | None = None
 
     def __repr__(self) -> str:
-        return f"<Run {self.path}: {str(self.declaration).strip('<>')}>"
+        return printable(f"<Run {shown_path(self.path)}: {str(self.declaration).strip('<>')}>")
 
     def _repr_html_(self) -> str:
         """Return a table of what it is, and of its stages, for notebooks."""
@@ -235,7 +236,9 @@ class Run:
         Raises:
             SkillweaveError: a part cannot be exported; the message says which, and what to do.
         """
-        return write_export(as_path(path, "path"), self.policy, self.declaration.spec.name)
+        path = as_path(path, "path")
+        must_be_own(path)
+        return write_export(path, self.policy, self.declaration.spec.name)
 
     @checked_names
     def report(
@@ -289,6 +292,7 @@ class Run:
             The path.
         """
         path = as_path(path, "path")
+        must_be_own(path.parent)
         write_weights(path, self.declaration, self.policy)
         return path
 

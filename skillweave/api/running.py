@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
@@ -20,7 +20,8 @@ from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import copied, every_hierarchy
-from skillweave.messages import as_path, short
+from skillweave.messages import absolute, as_path, short, shown_path
+from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
@@ -29,6 +30,7 @@ from skillweave.runs.manifest import identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
+from skillweave.terminal import steady_streams
 from skillweave.training.callback import Callback, TrainCallback, check_callback
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.training.stage_log import Listener
@@ -73,7 +75,9 @@ def begin(
     """
     _may_train()
     check_callback(callback)
-    run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
+    # An environment may change the working directory as it is made.
+    place = absolute("." if run_dir is None else as_path(run_dir, "run_dir"))
+    run_dir = None if run_dir is None else place
     if not isinstance(resume, bool):
         raise SkillweaveError(f"resume is {short(resume)}; it must be True or False")
     if resume and run_dir is None:
@@ -84,7 +88,7 @@ def begin(
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
     spaces = _plan(declared, content, evolve, cluster)
-    with called_by(caller_of(declared)), ExitStack() as stack:
+    with _surroundings(), called_by(caller_of(declared)), ExitStack() as stack:
         if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
             own, told = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
@@ -96,8 +100,8 @@ def begin(
             cluster.check()
         content = content | {"recipe": declared.recipe, "track": track}
         if run_dir is None:
-            run_dir = make_numbered(_run_name(declared, content))
-            note = "; ".join(filter(None, (f"run: {run_dir}", note)))
+            run_dir = make_numbered(_run_name(declared, content), place)
+            note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
             stack.callback(_remove_if_empty, run_dir)
         run = RunDirectory.create(run_dir, content, partial(keep_starts, learnt=learnt), hold=True)
         stack.callback(run.close)
@@ -187,6 +191,13 @@ def _plan(
     return observation_space, action_space
 
 
+@contextmanager
+def _surroundings() -> Iterator[None]:
+    """Train in surroundings that the user has made for other things."""
+    with steady_streams(), normal_tensors():
+        yield
+
+
 def go_on(
     declared: Hierarchy | Agent,
     run: RunDirectory,
@@ -201,7 +212,7 @@ def go_on(
     if not run.finished:
         _may_train()
     must_be_own(run.path)
-    with ExitStack() as stack:
+    with _surroundings(), ExitStack() as stack:
         stack.enter_context(called_by(caller_of(declared)))
         stack.callback(run.close)
         run.begin()

@@ -1,12 +1,26 @@
-"""Whether something fits into the machine's memory, before it is made."""
+"""Whether something fits into memory, before it is made."""
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from skillweave.types import SkillweaveError
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+PROCESSES, GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+"""Where Linux tells of memory, and of the limits of groups of processes."""
+FILES = {
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    2: ("memory.max", "memory.current", "inactive_file"),
+}
+"""By version of control groups, the files of limit and use, and the entry of dropped files."""
 
 
 def check_memory(count: int, each: int, what: str, lower: str) -> None:
@@ -23,11 +37,62 @@ def check_memory(count: int, each: int, what: str, lower: str) -> None:
 
 
 def free_memory() -> int | None:
-    """Bytes that the machine can still give at most, or None where it does not say."""
-    meminfo = Path("/proc/meminfo")
-    text = meminfo.read_text() if meminfo.exists() else ""
-    if found := re.search(r"MemAvailable: *(\d+) kB", text):
+    """Bytes that this process can still get at most, or None where the system does not say.
+
+    In a container, or in a job of a cluster, that is often less than the machine has.
+    """
+    known = [free for free in (_of_machine(), *_of_groups(), _of_process()) if free is not None]
+    return min(known, default=None)
+
+
+def _of_machine() -> int | None:
+    """Bytes that the machine can still give."""
+    if found := re.search(r"MemAvailable: *(\d+) kB", _text(PROCESSES / "meminfo")):
         return int(found[1]) * 1024
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):  # macOS: all that it has
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return None
+
+
+def _of_groups() -> Iterator[int]:
+    """Yield what each control group that this process is in can still give (cgroups 1 and 2)."""
+    for line in _text(PROCESSES / "self" / "cgroup").splitlines():
+        _, kinds, name = line.split(":", 2)
+        if kinds and "memory" not in kinds.split(","):
+            continue
+        root = GROUPS / "memory" if kinds else GROUPS
+        group = root / name.lstrip("/")
+        # A container may see its own group as the root, under the name that it has outside.
+        while group.is_relative_to(root):
+            free = _of_group(group, FILES[1 if kinds else 2])
+            if free is not None:
+                yield free
+            group = group.parent
+
+
+def _of_group(group: Path, names: tuple[str, str, str]) -> int | None:
+    """What a group can still give: its limit less its use, but for files that can be dropped."""
+    limit, used = (_text(group / name).strip() for name in names[:2])
+    if not limit.isdecimal() or not used.isdecimal():  # "max": no limit
+        return None
+    files = re.search(rf"^{names[2]} (\d+)$", _text(group / "memory.stat"), re.MULTILINE)
+    return max(int(limit) - int(used) + (int(files[1]) if files else 0), 0)
+
+
+def _of_process() -> int | None:
+    """Bytes that ``ulimit -v`` leaves."""
+    pages = _text(PROCESSES / "self" / "statm").split()
+    if resource is None or not pages:
+        return None
+    most = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if most == resource.RLIM_INFINITY:
+        return None
+    return max(most - int(pages[0]) * os.sysconf("SC_PAGE_SIZE"), 0)
+
+
+def _text(file: Path) -> str:
+    """Return what a file says; nothing where it is not there."""
+    try:
+        return file.read_text("utf-8")
+    except (OSError, ValueError):
+        return ""

@@ -151,7 +151,7 @@ def _filled_columns(named: dict[str, Tensor]) -> dict[str, Tensor]:
         return named
     order = filled.to(torch.int8).argsort(dim=1, descending=True, stable=True)
     order = order[:, : int(filled.sum(1).max())]
-    member = torch.arange(len(order))[:, None]
+    member = torch.arange(len(order), device="cpu")[:, None]
     return {
         k: x if x.shape[2] == 1 else x.transpose(1, 2)[member, order].transpose(1, 2)
         for k, x in named.items()

@@ -15,7 +15,8 @@ from typing import Any
 from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
-from skillweave.cli.telling import save_score, tell
+from skillweave.cli.telling import put, save_score, tell
+from skillweave.messages import shown_path
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
 from skillweave.types import MissingExtra, SkillweaveError
@@ -44,14 +45,14 @@ class Demo:
     result: dict[str, Any] = field(default_factory=dict)
     """Everything as data, for ``--json``."""
     quoted: dict[str, dict[str, Any]] = field(
-        default_factory=lambda: json.loads(FLAT_RESULTS.read_text())
+        default_factory=lambda: json.loads(FLAT_RESULTS.read_text("utf-8"))
     )
     """By task, the recorded flat agent with all steps."""
 
     def say(self, text: str = "") -> None:
         """Print a line at once, since the next one may take a minute."""
         if not self.command.json:
-            print(text, flush=True)
+            put(text)
 
     def lander(self) -> None:
         """Learn LunarLander with the tutorial's three skills."""
@@ -125,7 +126,7 @@ class Demo:
         seconds = time.perf_counter() - started
         score = run.evaluate(self._episodes(task), quiet=True)
         save_score(run, score)
-        self.result[name] = score.to_json() | {"run": str(run.path), "seconds": seconds}
+        self.result[name] = score.to_json() | {"run": str(shown_path(run.path)), "seconds": seconds}
         if task == MISSION:
             self.result[name]["complete"] = complete(score)
         return run, score, seconds

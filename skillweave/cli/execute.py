@@ -22,6 +22,7 @@ from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.several import open_runs
+from skillweave.terminal import one_line
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import SkillweaveError
 
@@ -169,7 +170,7 @@ def _list(command: commands.List) -> None:
     shipped = []
     for name in recipes.names():
         weights = (recipes.source(name).with_suffix(".safetensors")).exists()
-        doc = ast.get_docstring(ast.parse(recipes.source(name).read_text())) or ""
+        doc = ast.get_docstring(ast.parse(recipes.source(name).read_text("utf-8"))) or ""
         shipped.append({"name": name, "about": doc.splitlines()[0], "pretrained": weights})
     runs = [_run_line(p.parent) for p in sorted(Path("runs").glob("*/run.json"))]
     lines = ["recipes:"]
@@ -177,7 +178,8 @@ def _list(command: commands.List) -> None:
         lines.append(f"  {r['name']:<22} {r['about']}{' [weights]' if r['pretrained'] else ''}")
     if runs:
         lines.append("runs:")
-        lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in runs]
+        told = [{k: one_line(v) for k, v in r.items()} for r in runs]
+        lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in told]
     tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
 
 

@@ -8,19 +8,35 @@ import re
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
+
+from skillweave.terminal import end_quietly, put_result, say, steady_streams
 
 ADDRESS = re.compile(r"auto|local|(ray://)?[^\s/-][^\s/]*:\S*")
 """What may follow ``--ray``."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; 0 on success, 1 on an error, 2 on wrong arguments, 130 on Ctrl-C."""
+    """Run one command; 0 on success, 1 on an error, 2 on wrong arguments, 130 on Ctrl-C.
+
+    A reader that went away (``| head``) is no error.
+    """
+    try:
+        with steady_streams():
+            return _main(arguments)
+    except BrokenPipeError:
+        return 0
+    finally:
+        end_quietly()
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     if list(words) == ["--version"]:
         from skillweave import __version__
 
-        print(f"skillweave {__version__}")
+        put_result(f"skillweave {__version__}")
         return 0
     import tyro
 
@@ -29,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = ["--no-deterministic" if word == "--stochastic" else word for word in words]
     given = _with_addresses(given)
     if (wrong := _unknown_command(words, [commands.name_of(c) for c in commands.COMMANDS])) != "":
-        print(f"error: {wrong}", file=sys.stderr)
+        say(f"error: {wrong}")
         return 2
     parser: dict[str, Any] = {commands.name_of(c): c for c in commands.COMMANDS}
     command: Any = tyro.extras.subcommand_cli_from_dict(
@@ -50,12 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return execute.run(command)
     except SkillweaveError as error:
         if command.traceback or all_frames_wanted():
-            traceback.print_exception(error)
+            say("".join(traceback.format_exception(error)).rstrip())
         return _fail(command, str(error), 1)
     except KeyboardInterrupt as error:
         return _fail(command, str(error) or "interrupted", 130)
-    except BrokenPipeError:
-        return 1
 
 
 def _unknown_command(words: Sequence[str], known: Sequence[str]) -> str:
@@ -79,7 +93,8 @@ def _with_addresses(words: Sequence[str]) -> list[str]:
 
 def _fail(command: Any, message: str, code: int) -> int:
     if command.json:
-        print(json.dumps({"error": message}))
+        with suppress(OSError):  # it is told below as well
+            put_result(json.dumps({"error": message}))
     kind = "stopped" if code == 130 else "error"
-    print(f"{kind}: {message}", file=sys.stderr)
+    say(f"{kind}: {message}")
     return code

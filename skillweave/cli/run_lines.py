@@ -7,6 +7,7 @@ from typing import Any
 
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.runs.kept import best_words, kept_words
+from skillweave.terminal import one_line
 from skillweave.training.evaluation_file import SavedEvaluation
 
 
@@ -14,11 +15,12 @@ def run_lines(
     m: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
 ) -> list[str]:
     """Return a run's manifest and its saved evaluations, as lines."""
-    lines = [f"{m['kind']} on {m['env']}, seed {m['seed']}, made {m['created']}"]
+    env, created = one_line(m["env"]), one_line(m["created"])
+    lines = [f"{m['kind']} on {env}, seed {m['seed']}, made {created}"]
     calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
     calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
     calls += f", guide: {m['guide']['kind']}" if "guide" in m else ""
-    lines += [f"  recipe: {m.get('recipe') or '(declared in Python)'}{calls}"]
+    lines += [f"  recipe: {one_line(m.get('recipe') or '(declared in Python)')}{calls}"]
     lines += [
         f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
     ]
@@ -52,10 +54,10 @@ def run_lines(
             )
         if kept := p.get("kept"):
             lines.append(f"    {kept_words(kept)}")
-    lines += ["  " + ", ".join(f"{k} {v}" for k, v in m["versions"].items())]
+    lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in m["versions"].items())]
     for told in saved:
         if told is not None:
             how = "greedy" if told.deterministic else "sampled"
-            lines.append(f"  evaluated {told.made}, seed {told.seed}, {how}:")
+            lines.append(f"  evaluated {one_line(told.made)}, seed {told.seed}, {how}:")
             lines += [f"    {line}" for line in told.evaluation.for_people().splitlines()]
     return lines

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import platform
 import re
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import astuple, dataclass, replace
@@ -30,6 +29,7 @@ from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
 from skillweave.hierarchy import training
 from skillweave.messages import short, told, whole_number
+from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import SkillweaveError
 
@@ -127,7 +127,7 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
             if not command.quiet:
                 says = result if isinstance(result, str) else f"return {result:.1f}"
                 line = f"{len(found)} of {len(jobs)}: {job.path.name}: {says}"
-                print(line, file=sys.stderr, flush=True)
+                say(line)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"{len(found)} of {len(jobs)} runs are finished; the same command goes on"

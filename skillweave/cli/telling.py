@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any
 
 from skillweave.api import Run
 from skillweave.cli import commands
+from skillweave.messages import shown_path
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
+from skillweave.terminal import put_result, say
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
 from skillweave.types import SkillweaveError
@@ -17,7 +18,24 @@ from skillweave.types import SkillweaveError
 
 def tell(command: commands.Output, data: dict[str, Any], text: str) -> None:
     """Print JSON where it is asked for, else the text."""
-    print(json.dumps(data, default=str) if command.json else text)
+    put(as_json(data) if command.json else text)
+
+
+def as_json(data: object) -> str:
+    """Return one line of JSON, without any character that a terminal obeys."""
+    return json.dumps(data, default=str).replace("\x7f", "\\u007f")
+
+
+def put(text: str = "") -> None:
+    """Print a line of results.
+
+    Raises:
+        SkillweaveError: standard output cannot be written.
+    """
+    try:
+        put_result(text)
+    except OSError as error:
+        raise SkillweaveError(f"could not write to standard output: {error.strerror}") from error
 
 
 def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = True) -> None:
@@ -25,11 +43,11 @@ def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bo
     try:
         save_evaluation(RunDirectory.open(trained.path), score, seed, deterministic)
     except SkillweaveError as error:
-        print(f"the evaluation is not kept in the run: {error}", file=sys.stderr)
+        say(f"the evaluation is not kept in the run: {error}")
 
 
 def run_words(run: RunDirectory) -> list[str]:
     """Return where a finished run lies, and commands that show it, as lines."""
     names = ("evaluate", "render", "report")
     commands = [command_words(name, run) for name in names]
-    return [f"run     {run.path}", "next    " + "\n        ".join(commands)]
+    return [f"run     {shown_path(run.path)}", "next    " + "\n        ".join(commands)]

@@ -13,9 +13,10 @@ from skillweave.api.declared import declared_by
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
-from skillweave.cli.telling import run_words, save_score, tell
+from skillweave.cli.telling import put, run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.evolution.config import Evolution
+from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import SkillweaveError
 
@@ -43,7 +44,7 @@ def train(command: commands.Train) -> None:
     result, lines = _told(command, trained, command.render)
     if command.versus_flat:
         if not command.json:  # now: the flat agent takes as long again
-            print("\n".join(lines), flush=True)
+            put("\n".join(lines))
         flat = _trained(command, hierarchy, True, flat_out, baseline=True)
         result["flat"], more = _told(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
@@ -138,7 +139,7 @@ def _told(
 ) -> tuple[dict[str, Any], list[str]]:
     """What a run has come to, for programs and for people."""
     manifest = trained.info()
-    result: dict[str, Any] = {"run": str(trained.path), "stages": manifest["stages"]}
+    result: dict[str, Any] = {"run": str(shown_path(trained.path)), "stages": manifest["stages"]}
     seconds = sum(p["seconds"] for p in manifest["stages"])
     steps = sum(p["steps"] for p in manifest["stages"])
     lines = [

@@ -165,7 +165,7 @@ class _Reader(pickle.Unpickler):
             raise SkillweaveError(f"refused: the pickle refers to {shown(pid)}")
         if (key, dtype) not in self._storages:
             data = bytearray(self._file.read(f"{self._prefix}data/{key}"))
-            empty = torch.empty(0).to(dtype)
+            empty = torch.empty(0, dtype=dtype, device="cpu")
             self._storages[key, dtype] = torch.frombuffer(data, dtype=dtype) if data else empty
         found = self._storages[key, dtype]
         if len(found) != size:

@@ -10,6 +10,7 @@ import torch
 
 from skillweave.buffers.replay import ReplayStore
 from skillweave.experience import Experience, Sample
+from skillweave.ops.device import FLOAT
 from skillweave.types import Array
 
 
@@ -20,7 +21,7 @@ class TransitionBuffer:
     """
 
     def __init__(self, capacity: int, seed: int, gamma: float = 1.0, **how: Any) -> None:
-        self._capacity, self._gamma, self._how = capacity, torch.tensor([gamma]), how
+        self._capacity, self._gamma, self._how = capacity, torch.tensor([gamma], **FLOAT), how
         self._rngs, self._after = [np.random.default_rng(seed)], np.empty(0)
         self._buffer: ReplayStore | None = None
 

@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from skillweave.runs.trackers import wandb_mode
+from skillweave.terminal import say
 from skillweave.types import MissingExtra
 
 _messages: list[str] = []
@@ -39,4 +40,4 @@ def stay_offline() -> None:
         os.environ["WANDB_MODE"] = "offline"
         _messages.append("no login to Weights & Biases, so its runs stay offline")
     if "wandb" in sys.modules and _messages:
-        print(f"skillweave: {_messages.pop()}", file=sys.stderr)
+        say(f"skillweave: {_messages.pop()}")

@@ -8,12 +8,15 @@ Letters in shapes: R rows, one per network (a member, or a member's critic).
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from skillweave.networks.config import Activation
 from skillweave.networks.stacked import Views
 from skillweave.networks.units import Joint, Units
+from skillweave.ops.device import FLOAT
 
 IDENTITY: tuple[Activation, ...] = ("relu", "elu", "silu", "gelu")
 """Activations through which a new layer can compute the identity; through tanh it cannot."""
@@ -31,10 +34,10 @@ def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) ->
         old = named[part.name]
         shape = list(old.shape)
         shape[part.axis] = extra * part.block
-        new = torch.zeros(shape)
+        new = torch.zeros(shape, **FLOAT)
         if part.name.endswith("weight"):
-            inputs = shape[-2] if part.axis == -1 else int(torch.tensor(shape[-3:]).prod())
-            new = torch.randn(shape, generator=generator) * (2.0 / inputs) ** 0.5
+            inputs = shape[-2] if part.axis == -1 else math.prod(shape[-3:])
+            new = torch.randn(shape, generator=generator, **FLOAT) * (2.0 / inputs) ** 0.5
         elif part.name.endswith("_sigma"):
             new = new + old.mean()
         found[part.name] = new
@@ -75,8 +78,11 @@ def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
     for part in (*units.own, *units.onward):
         old = found[part.name]
         end = part.start + units.count * part.block
-        inner = part.start + kept[..., None] * part.block + torch.arange(part.block)
-        before, after = torch.arange(part.start), torch.arange(end, old.shape[part.axis])
+        inner = part.start + kept[..., None] * part.block + torch.arange(part.block, device="cpu")
+        before, after = (
+            torch.arange(*span, device="cpu")
+            for span in ((0, part.start), (end, old.shape[part.axis]))
+        )
         index = torch.cat(
             [before.expand(rows, -1), inner.flatten(1), after.expand(rows, -1)], dim=1
         )
@@ -103,9 +109,9 @@ def deepened(
     readers = [tuple(_moved(n, joint, 1) for n in pair) for pair in joint.readers]
     width = found[readers[0][0]].shape[-2]
     rows = len(found[readers[0][0]])
-    eye = torch.eye(width).expand(rows, -1, -1)
+    eye = torch.eye(width, **FLOAT).expand(rows, -1, -1)
     weight = torch.cat([eye, -eye], dim=-1) if paired else eye
-    bias = torch.full((rows, 1, weight.shape[-1]), float(activation == "elu"))
+    bias = torch.full((rows, 1, weight.shape[-1]), float(activation == "elu"), **FLOAT)
     for kind in joint.kinds:
         value = weight if kind == "weight" else bias if kind == "bias" else None
         like = weight if kind.startswith("weight") else bias

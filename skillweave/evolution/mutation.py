@@ -14,6 +14,7 @@ from skillweave.evolution.architecture import check_architecture, draw_change, r
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
 from skillweave.evolution.stacks import Member, Origin, copy, networks_of
 from skillweave.networks.config import Network
+from skillweave.ops.device import FLOAT
 from skillweave.types import SkillweaveError
 
 Spaces = tuple[Any, Any]
@@ -146,8 +147,8 @@ def _add_noise(member: Member, by: Mutations, spaces: Spaces, rng: np.random.Gen
     for name, view in algorithm.layout.views(noise).items():
         if name in algorithm.acting.shapes:
             scale = online[name].square().mean().sqrt() * by.strength
-            chosen = torch.rand(view.shape, generator=generator) < by.share
-            view.copy_(torch.randn(view.shape, generator=generator) * chosen * scale)
+            chosen = torch.rand(view.shape, generator=generator, **FLOAT) < by.share
+            view.copy_(torch.randn(view.shape, generator=generator, **FLOAT) * chosen * scale)
     if not bool(noise.any()):
         return member
     for name in algorithm.parameter_groups()[0].weights:

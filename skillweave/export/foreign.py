@@ -12,6 +12,7 @@ from gymnasium.spaces import Box, MultiBinary
 from torch import Tensor, nn
 
 from skillweave.export.graphs import Graph, leaves_of, traced
+from skillweave.ops.device import BOOL, FLOAT
 from skillweave.skills.onnx_file import OnnxPolicy
 from skillweave.skills.torch_module import TorchPolicy
 from skillweave.spaces import action_codec, obs_dtype
@@ -74,8 +75,8 @@ def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
     space, choices, noise = policy.observation_space, _choices(policy), _noise(policy, sampled)
     given = {leaf.name: leaf.example() for leaf in leaves_of(space)}
     if choices:
-        given["mask"] = torch.ones(1, choices, dtype=torch.bool)
-    given |= {f"noise.{i}": torch.zeros(1, n) for i, (_, n) in enumerate(noise)}
+        given["mask"] = torch.ones(1, choices, **BOOL)
+    given |= {f"noise.{i}": torch.zeros(1, n, **FLOAT) for i, (_, n) in enumerate(noise)}
     module = _Module(policy, bool(choices)).eval()
     return Graph(traced(module, given, ["action"], where), choices, noise=noise)
 

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.ops.device import BOOL, FLOAT
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts
 from skillweave.types import MissingExtra, SkillweaveError
@@ -117,12 +118,12 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
     told = Graph(b"", choices, algorithm.memory_size, noise)
     given = {leaf.name: leaf.example() for leaf in leaves}
     if choices:
-        given["mask"] = torch.ones(1, choices, dtype=torch.bool)
+        given["mask"] = torch.ones(1, choices, **BOOL)
     outputs = ["action"]
     if told.memory:
-        given["memory"] = torch.zeros(1, told.memory)
+        given["memory"] = torch.zeros(1, told.memory, **FLOAT)
         outputs.append("memory.after")
-    given |= {f"noise.{i}": torch.full((1, n), 0.5) for i, (_, n) in enumerate(noise)}
+    given |= {f"noise.{i}": torch.full((1, n), 0.5, **FLOAT) for i, (_, n) in enumerate(noise)}
     module = _Acting(policy, len(leaves), told)
     return replace(told, content=traced(module, given, outputs, where))
 

@@ -17,6 +17,7 @@ from skillweave.export.states import States
 from skillweave.runs.files import write_bytes
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts
+from skillweave.terminal import printable
 from skillweave.types import Policy
 
 FORMAT = 1
@@ -37,9 +38,10 @@ class Export:
     def __str__(self) -> str:
         said = f"{self.path}: {len(self.files)} files"
         if not self.code:
-            return said
+            return printable(said)
         needs = "\n".join(f"  {name!r}: {what}" for name, what in self.code.items())
-        return f"{said}\nRunner({str(self.path)!r}, code={{name: function}}) needs\n{needs}"
+        runner = f"Runner({str(self.path)!r}, code={{name: function}})"
+        return printable(f"{said}\n{runner} needs\n{needs}")
 
 
 def write_export(path: Path, policy: Policy, env: str) -> Export:

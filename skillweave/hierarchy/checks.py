@@ -58,7 +58,12 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
             raise SkillweaveError(
                 f"two skills are named {name!r}; give one another name: class attribute 'name'"
             )
-        if name in reserved:
+        if alike := [k for k in names if k != name and k.lower() == name.lower()]:
+            raise SkillweaveError(
+                f"the skills {name!r} and {alike[0]!r} differ in case alone, and some file systems "
+                "take their files for one; give one another name: class attribute 'name'"
+            )
+        if name.lower() in reserved:
             raise SkillweaveError(f"a skill cannot be named {name!r}, which names a stage")
     return tuple(skills)
 

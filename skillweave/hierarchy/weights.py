@@ -52,7 +52,9 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
             continue
         ready[name] = source_of(own)
         if isinstance(own, Foreign) and (content := own.content()) is not None:
-            tensors[f"{name}/content"] = torch.tensor(np.frombuffer(content, np.uint8))
+            tensors[f"{name}/content"] = torch.tensor(
+                np.frombuffer(content, np.uint8), device="cpu"
+            )
     hierarchies = dict(_hierarchies_of(declaration, policy))
     header = {
         "kind": "hierarchy",

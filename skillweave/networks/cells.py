@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.stacked import Views, orthogonal_
-from skillweave.ops.device import Constant
+from skillweave.ops.device import FLOAT, Constant
 from skillweave.spaces import ObsCodec
 from skillweave.types import SkillweaveError
 
@@ -108,7 +108,7 @@ class CellsEncoder:
         """
         for i, (rows, cells) in enumerate(zip(self._rows, self._sizes, strict=True)):
             views[f"{i}.bias"].zero_()
-            every = torch.empty(1, cells * KINDS, WIDTH)
+            every = torch.empty(1, cells * KINDS, WIDTH, **FLOAT)
             for member, generator in zip(views[f"{i}.weight"], generators, strict=True):
                 orthogonal_(every, math.sqrt(2.0), [generator])
                 member.copy_(every[0, rows])
@@ -137,5 +137,5 @@ def _kinds(highest: Tensor) -> Tensor:
 
 def _rows_of(kinds: Tensor) -> Tensor:
     """Rows of kinds that exist, in a table with KINDS for each value (K·KINDS, …)."""
-    exists = torch.arange(KINDS) < kinds[:, None]
+    exists = torch.arange(KINDS, device="cpu") < kinds[:, None]
     return exists.flatten().nonzero().flatten()

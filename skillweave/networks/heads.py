@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from skillweave.ops.device import Constant
+from skillweave.ops.device import BOOL, FLOAT, INT, Constant
 from skillweave.ops.distributions import (
     categorical_kl,
     categorical_sample,
@@ -60,13 +60,13 @@ class ActionHead:
         for n in codec.parts:
             rows.append([start + min(i, n - 1) for i in range(widest)])
             start += n
-        self._columns = Constant(torch.tensor(rows))
+        self._columns = Constant(torch.tensor(rows, **INT))
         exists = [[i < n for i in range(widest)] for n in codec.parts]
-        self._exists = Constant(torch.tensor(exists))
+        self._exists = Constant(torch.tensor(exists, **BOOL))
         # Which dimensions of a Box have two bounds, and so units in which they span [−1, 1].
         bounded = [] if codec.discrete else codec.span[2].tolist()
         self._narrows = any(bounded) and not self.squash
-        self._bounded = Constant(torch.tensor(bounded))
+        self._bounded = Constant(torch.tensor(bounded, **BOOL))
 
     @property
     def discrete(self) -> bool:
@@ -86,9 +86,9 @@ class ActionHead:
         """
         shape = (steps, batch, self.codec.size)
         if self.discrete:
-            drawn = [gumbel(torch.rand(shape, generator=g)) for g in generators]
+            drawn = [gumbel(torch.rand(shape, generator=g, **FLOAT)) for g in generators]
         else:
-            drawn = [torch.randn(shape, generator=g) for g in generators]
+            drawn = [torch.randn(shape, generator=g, **FLOAT) for g in generators]
         return torch.stack(drawn, dim=1)
 
     def act(self, head: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:

@@ -16,7 +16,7 @@ from skillweave.networks.recurrent import (
     sequence,
 )
 from skillweave.networks.stacked import Views, mlp, mlp_init_, mlp_shapes, orthogonal_
-from skillweave.ops.device import Constant
+from skillweave.ops.device import INT, Constant
 from skillweave.spaces import ObsCodec
 from skillweave.types import SkillweaveError
 
@@ -157,4 +157,4 @@ def _places(sees: tuple[int, ...], size: int) -> Tensor:
         raise SkillweaveError(
             f"Network.sees names the number {max(sees)} of an observation, but it {there}"
         )
-    return torch.tensor(sees)
+    return torch.tensor(sees, **INT)

@@ -23,7 +23,7 @@ from skillweave.messages import short, told
 from skillweave.named import Named
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.stacked import Views
-from skillweave.ops.device import Constant
+from skillweave.ops.device import Constant, usual_defaults
 from skillweave.spaces import ObsCodec
 from skillweave.spaces.packing import parts
 from skillweave.types import SkillweaveError
@@ -82,7 +82,7 @@ class ModuleEncoder:
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
         """Fill fresh parameters in place: those of a module that each member's generator seeds."""
         for member, generator in enumerate(generators):
-            seed = int(torch.randint(2**62, (), generator=generator))
+            seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
             fresh = dict(self._made(seed).named_parameters())
             for name, view in views.items():
                 view[member].copy_(fresh[name].detach())
@@ -107,7 +107,7 @@ class ModuleEncoder:
 
     def _made(self, seed: int) -> nn.Module:
         """Return a new module of the factory, initialised by a seed alone."""
-        with torch.random.fork_rng(devices=[]):
+        with usual_defaults(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             try:
                 module = self._factory.function(self.space)
@@ -133,7 +133,7 @@ class ModuleEncoder:
         rng = np.random.default_rng(0)
         examples = [part.examples(rng)[:rows] for part in self._parts]
         try:
-            with torch.no_grad():
+            with usual_defaults(), torch.no_grad():
                 return module(_nested(self._obs.space, iter(examples)))
         except Exception as error:
             shapes = ", ".join(str(tuple(leaf.shape)) for leaf in examples)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from skillweave.networks.config import Activation, Network
+from skillweave.ops.device import FLOAT
 
 Views = Mapping[str, Tensor]
 """Named parameters, each (P, *shape)."""
@@ -89,7 +90,7 @@ def orthogonal_(weight: Tensor, gain: float, generators: list[torch.Generator]) 
     So a member's weights do not depend on its neighbours. Saxe et al. 2014.
     """
     for member, generator in enumerate(generators):
-        fresh = torch.empty(weight.shape[1:])
+        fresh = torch.empty(weight.shape[1:], **FLOAT)
         torch.nn.init.orthogonal_(fresh, gain, generator=generator)
         weight[member].copy_(fresh)
 

@@ -5,11 +5,19 @@ Generators stay on the CPU, so that a seed gives the same numbers on every devic
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from skillweave.types import SkillweaveError
 
+FLOAT: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+INT: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
+BOOL: dict[str, Any] = {"dtype": torch.bool, "device": "cpu"}
+"""What new tensors are: the defaults of PyTorch are the user's (``torch.set_default_dtype``)."""
 DEVICES = ("cpu", "cuda", "auto")
 """Names of devices that settings know."""
 
@@ -61,3 +69,28 @@ def all_false(flags: Tensor) -> bool:
     On the CPU, where looking costs nothing, it is the answer; elsewhere it is always False.
     """
     return flags.device.type == "cpu" and not bool(flags.any())
+
+
+@contextmanager
+def normal_tensors() -> Iterator[None]:
+    """Leave ``torch.inference_mode``, whose tensors cannot be learnt with; no gradients are made.
+
+    The mode is one of this thread, and of the user: it may surround the whole training.
+    """
+    if not torch.is_inference_mode_enabled():
+        yield
+        return
+    with torch.inference_mode(False), torch.no_grad():
+        yield
+
+
+@contextmanager
+def usual_defaults() -> Iterator[None]:
+    """Set the defaults of PyTorch as they are when Python starts, for code that relies on them."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.device("cpu"), torch.inference_mode(False), torch.enable_grad():
+            yield
+    finally:
+        torch.set_default_dtype(before)

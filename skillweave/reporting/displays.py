@@ -5,10 +5,12 @@ from __future__ import annotations
 import functools
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from skillweave.notebooks import Area, Markup, in_notebook, joined, paragraph, table
+from skillweave.terminal import end_quietly, printable
 
 
 @dataclass
@@ -72,13 +74,54 @@ def open_display(*, transient: bool = False) -> Display | None:
     if _open:
         return None
     found: Display | None = None
-    if in_notebook():
-        found = Cell(transient)
-    elif _may_draw():
-        found = make_bars(transient)
-    if found is not None:
-        _open.append(found)
+    try:
+        if in_notebook():
+            found = Cell(transient)
+        elif _may_draw():
+            found = make_bars(transient)
+    except (OSError, ValueError):
+        return None
+    if found is None:
+        return None
+    found = Shielded(found)
+    _open.append(found)
     return found
+
+
+class Shielded:
+    """A display that shows nothing any more once it cannot be drawn: training goes on.
+
+    Its reader has gone away, or the disk of a log is full.
+    """
+
+    def __init__(self, display: Display) -> None:
+        self.every, self._display, self._draws = display.every, display, True
+
+    def put(self, row: Row) -> None:
+        """Add or replace a row."""
+        self._try(self._display.put, row)
+
+    def draw(self) -> None:
+        """Show all rows."""
+        self._try(self._display.draw)
+
+    def message(self, text: str) -> None:
+        """Show a line of text."""
+        self._try(self._display.message, text)
+
+    def close(self) -> None:
+        """Draw for the last time; what was changed for the display is changed back in any case."""
+        _open.remove(self)
+        self._draws = True
+        self._try(self._display.close)
+
+    def _try(self, act: Callable[..., None], *told: Any) -> None:
+        if self._draws:
+            try:
+                act(*told)
+            except (OSError, ValueError):
+                self._draws = False
+                end_quietly()
 
 
 class Bars:
@@ -94,7 +137,7 @@ class Bars:
         """Add or replace a row."""
         fields = {"steps": row.steps, "result": row.result, "speed": row.speed, "left": row.left}
         if row.key not in self._tasks:
-            name = f"  {row.name}" if row.under else row.name
+            name = printable(f"  {row.name}" if row.under else row.name)
             self._tasks[row.key] = self._bars.add_task(name, total=1.0, **fields)
         self._bars.update(self._tasks[row.key], completed=row.share or 0.0, **fields)
 
@@ -108,9 +151,10 @@ class Bars:
 
     def close(self) -> None:
         """Draw for the last time."""
-        _open.remove(self)
-        self._bars.refresh()
-        self._bars.stop()
+        try:
+            self._bars.refresh()
+        finally:
+            self._bars.stop()
 
 
 class Cell:
@@ -154,7 +198,6 @@ class Cell:
 
     def close(self) -> None:
         """Draw for the last time."""
-        _open.remove(self)
         if self._transient:
             self._area.clear()
         elif self._rows or self._messages:
@@ -174,7 +217,12 @@ def _may_draw() -> bool:
     """Return whether it is worth importing rich to find out if bars can be drawn."""
     if os.environ.get("TERM") == "dumb" or any(os.environ.get(v) for v in ("NO_COLOR", "CI")):
         return False
-    return sys.stderr.isatty()
+    return _is_terminal(sys.stderr)
+
+
+def _is_terminal(stream: Any) -> bool:
+    """Return whether a standard stream, which may be closed or None, is a terminal."""
+    return stream is not None and not stream.closed and bool(stream.isatty())
 
 
 def make_bars(transient: bool) -> Bars | None:
@@ -195,7 +243,7 @@ def make_bars(transient: bool) -> Bars | None:
         right("{task.fields[left]}"),
         console=console,
         auto_refresh=False,  # no thread beside training
-        redirect_stdout=sys.stdout.isatty(),  # else print() would land on stderr, not in the pipe
+        redirect_stdout=_is_terminal(sys.stdout),  # else print() would land on stderr
         expand=True,
         transient=transient,
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.notebooks import Markup, joined, paragraph
+from skillweave.terminal import printable
 
 LARGEST = 50_000_000
 """Bytes of a film that a notebook shows: it keeps a copy inside."""
@@ -17,7 +18,7 @@ class Film(dict[str, Any]):
 
     def __repr__(self) -> str:
         returns = ", ".join(f"{episode['return']:.1f}" for episode in self["episodes"])
-        return f"<Film {self['path']}: {self['frames']:,} frames, return {returns}>"
+        return printable(f"<Film {self['path']}: {self['frames']:,} frames, return {returns}>")
 
     def _repr_html_(self) -> str:
         """Return the film as a part of the page."""

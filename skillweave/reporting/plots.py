@@ -50,7 +50,9 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
             written.append(folder / f"{file_name(name)}{suffix}")
             figure.savefig(written[-1], dpi=120)
     if not written:
-        raise SkillweaveError(f"{run.path} holds nothing to draw yet: no episode has ended")
+        lines = run.path / "metrics.jsonl"
+        why = "no episode has ended" if lines.exists() else f"there is no {lines}"
+        raise SkillweaveError(f"{run.path} holds nothing to draw: {why}")
     return written
 
 

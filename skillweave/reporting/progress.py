@@ -6,7 +6,6 @@ Everything goes to stderr, so that stdout stays clean for results; in a notebook
 from __future__ import annotations
 
 import logging
-import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.reporting.displays import Display, Row, open_display
+from skillweave.terminal import printable, say
 from skillweave.training.episodes import INFO
 
 EVERY = 5.0
@@ -117,7 +117,8 @@ class Progress:
 
     def message(self, text: str) -> None:
         """A line of text, above the bars where there are any."""
-        LOG.info(text)
+        text = printable(text)
+        LOG.info("%s", text)
         if self._display is None:
             self._line(text)
         else:
@@ -203,7 +204,7 @@ class Progress:
 
     def _line(self, text: str) -> None:
         if not self._quiet:
-            print(text, file=sys.stderr, flush=True)
+            say(text)
 
 
 class EpisodeProgress:

@@ -10,6 +10,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from skillweave.messages import shown_path
 from skillweave.runs.checkpoints import Checkpoints
 
 Caller = Literal["command line", "hierarchy", "agent", "train_agent"]
@@ -49,7 +50,7 @@ def command_words(name: str, run: Told) -> str:
     needs = "resume_needs_recipe" if name == "resume" else "needs_recipe"
     recipe = run.manifest.get("recipe") or "FILE.py"
     own = recipe.endswith(".py") and run.manifest.get(needs, True)
-    words = f"skillweave {name} {shlex.quote(str(run.path))}"
+    words = f"skillweave {name} {shlex.quote(str(shown_path(run.path)))}"
     return words + (f" --recipe {shlex.quote(recipe)}" if own else "")
 
 
@@ -61,22 +62,23 @@ def resume_words(run: Told, *more: str) -> str:
     if from_command_line():
         return command_words("resume", run)
     seed = [f"seed={run.manifest['seed']}"] if run.manifest.get("seed") else []
-    return _call(run, ", ".join([python_string(run.path), *seed, "resume=True", *more]))
+    return _call(run, ", ".join([python_string(shown_path(run.path)), *seed, "resume=True", *more]))
 
 
 def start_words(run: Told) -> str:
     """Return what begins a new run with the policies of this one."""
     if from_command_line():
         recipe = run.manifest.get("recipe") or "RECIPE"
-        return f"skillweave train {shlex.quote(recipe)} --start-from {shlex.quote(str(run.path))}"
-    return _call(run, f"start_from={python_string(run.path)}")
+        where = shlex.quote(str(shown_path(run.path)))
+        return f"skillweave train {shlex.quote(recipe)} --start-from {where}"
+    return _call(run, f"start_from={python_string(shown_path(run.path))}")
 
 
 def load_words(run: Told) -> str:
     """Return what loads a finished run, or shows how it does."""
     if from_command_line():
         return command_words("evaluate", run)
-    path = python_string(run.path)
+    path = python_string(shown_path(run.path))
     return f"sw.load({path}, hierarchy)" if run.manifest.get("needs_recipe") else f"sw.load({path})"
 
 

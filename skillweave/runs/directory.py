@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy, state_from
+from skillweave.messages import absolute
 from skillweave.reading import fit, shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import resume_words, saved_words
@@ -44,6 +45,7 @@ from skillweave.runs.files import (
 )
 from skillweave.runs.jsonl import JsonLines
 from skillweave.runs.kept import to_be_judged
+from skillweave.runs.links import check_no_links
 from skillweave.runs.lock import NAME as LOCK
 from skillweave.runs.lock import Lock
 from skillweave.runs.manifest import Checkpoint, MetricsLine, identity, read_manifest, versions
@@ -61,16 +63,45 @@ FINAL = "final"
 LINES = ("metrics_bytes", "lineage_bytes")
 
 
+LONGEST_NAME = 255
+"""Bytes of a file's name, on nearly all file systems."""
+MORE = 14
+"""How much longer a file's name is while it is written."""
+
+
+def _check_file_names(manifest: Mapping[str, Any]) -> None:
+    """Raise a SkillweaveError where the name of a policy's file would be too long."""
+    for entry in manifest["stages"]:
+        for name in (entry["name"], *entry["learns"]):
+            file = _policy_file(entry["name"], name)
+            if len(file) + MORE > LONGEST_NAME:
+                raise SkillweaveError(
+                    f"the weights of {shown(name, 100)} would be in a file whose name has "
+                    f"{len(file)} letters, and file systems take {LONGEST_NAME - MORE}; give "
+                    "skills on the way to it shorter names"
+                )
+
+
+def _policy_file(stage: str, name: str | None) -> str:
+    """Return the name of the file of a stage's policy, or of one who learns in it."""
+    own = stage if name in (None, stage) else f"{stage}.{name}"
+    return f"{file_name(own)}.safetensors"
+
+
 def file_name(path: str) -> str:
     """The name of a file for who has this path: ``inner.skill`` for ``inner/skill``."""
     return path.replace("/", ".")
 
 
 class RunDirectory:
-    """One run on disk. ``manifest`` is the content of ``run.json``."""
+    """One run on disk. ``manifest`` is the content of ``run.json``.
+
+    Its ``path`` is absolute: a program may change its working directory while it trains.
+    """
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
-        self.path, self.manifest = path, manifest
+        self.path, self.manifest = absolute(path), manifest
+        path = self.path
         self._metrics = JsonLines(path / "metrics.jsonl", MetricsLine, self._next_step)
         self.lineage = JsonLines(path / "lineage.jsonl", LineageLine, self._next_step)
         self._checkpoints = Checkpoints(path)
@@ -107,7 +138,8 @@ class RunDirectory:
             SkillweaveError: the directory holds a run that has learnt something or that another
                 process trains, or other files.
         """
-        path = Path(path)
+        path = absolute(path)
+        _check_file_names(manifest)
         if path.is_file():
             raise SkillweaveError(f"{path} exists and is not an empty directory; choose another")
         made = not path.exists()
@@ -117,6 +149,7 @@ class RunDirectory:
             raise SkillweaveError(f"could not make {path}: {error.strerror}") from error
         before = cls.open(path) if os.path.lexists(path / "run.json") else None
         if before is not None:
+            check_no_links(path)
             check_replaceable(before)
         check_ours(path, before)  # before the lock is written there
         lock = Lock(path)
@@ -174,10 +207,11 @@ class RunDirectory:
             finished: also if it is finished, to train it for longer.
 
         Raises:
-            SkillweaveError: another process trains it, or it cannot be written.
+            SkillweaveError: another process trains it, it cannot be written, or it holds links.
         """
         if self._lock is not None or (self.finished and not finished):
             return
+        check_no_links(self.path)
         self._lock = Lock(self.path)
         try:
             # Another process may have gone on with it.
@@ -409,8 +443,7 @@ class RunDirectory:
 
     def policy_path(self, stage: str, name: str | None = None) -> Path:
         """Where the policy of a stage lies, or of one who learns in it."""
-        file = stage if name in (None, stage) else f"{stage}.{name}"
-        return self.path / "policies" / f"{file_name(file)}.safetensors"
+        return self.path / "policies" / _policy_file(stage, name)
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a line to ``metrics.jsonl``."""
@@ -421,10 +454,17 @@ class RunDirectory:
         """How long ``metrics.jsonl`` and ``lineage.jsonl`` are, for ``rewind``."""
         return {"metrics_bytes": self._metrics.size, "lineage_bytes": self.lineage.size}
 
-    def rewind(self, at: Mapping[str, Any]) -> None:
-        """Drop the lines after those that ``line_bytes`` told: training writes them again."""
-        self._metrics.rewind(at.get("metrics_bytes"))
-        self.lineage.rewind(at.get("lineage_bytes"))
+    def rewind(self, at: Mapping[str, Any]) -> list[str]:
+        """Drop the lines after those that ``line_bytes`` told: training writes them again.
+
+        Returns:
+            The files that lack lines, as they were removed or shortened.
+        """
+        whole = {
+            "metrics.jsonl": self._metrics.rewind(at.get("metrics_bytes")),
+            "lineage.jsonl": self.lineage.rewind(at.get("lineage_bytes")),
+        }
+        return [name for name, complete in whole.items() if not complete]
 
     def _next_step(self) -> str:
         return resume_words(self)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +23,7 @@ SCHEMA = 1
 """Version of everything written here; readers refuse newer ones."""
 TEMPORARY = ".*.tmp"
 """What files are named while they are written; only a killed process leaves some behind."""
+_BINARY = getattr(os, "O_BINARY", 0)  # of Windows
 LARGEST_JSON = 16 * 2**20
 """Bytes of a JSON file."""
 
@@ -37,12 +38,13 @@ def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> No
     try:
         if make_directories:
             path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(".tmp", f".{path.name}.", path.parent)
+        temporary = str(path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp")
+        # The system gives it the mode that the umask leaves.
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
         _sync(path.parent)
     except BaseException as error:
@@ -118,9 +120,28 @@ def write_json(path: Path, data: Mapping[str, Any], *, make_directories: bool = 
 
 def json_bytes(path: Path, data: Mapping[str, Any]) -> bytes:
     """What ``write_json`` writes."""
-    plain = json.loads(_json(path, {"schema": SCHEMA, **data}))
+    plain = _whole(json.loads(_json(path, {"schema": SCHEMA, **data})))
     text = _json(path, plain | {"sha256": _json_digest(plain)}, indent=2)
     return text.encode() + b"\n"
+
+
+def _whole(data: Any) -> Any:
+    """Return JSON whose texts are of whole characters.
+
+    In a locale that does not know all characters, Python has halves of some in the names of files.
+    """
+    if isinstance(data, str):
+        return data if data.isascii() else _whole_text(data)
+    if isinstance(data, dict):
+        return {_whole(k): _whole(v) for k, v in data.items()}
+    return [_whole(x) for x in data] if isinstance(data, list) else data
+
+
+def _whole_text(text: str) -> str:
+    try:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:
+        return text.encode("utf-8", "backslashreplace").decode()
 
 
 def read_json(

@@ -18,6 +18,7 @@ from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import json_bytes
 from skillweave.runs.hub_errors import asking, status_of
+from skillweave.runs.links import check_no_links_around
 from skillweave.types import MissingExtra, SkillweaveError
 
 KINDS = (".safetensors", ".json", ".jsonl", ".md", ".gif", ".mp4", ".png")
@@ -191,7 +192,8 @@ def _of_a_run(path: str) -> bool:
 def must_be_own(folder: Path) -> None:
     """Raise a SkillweaveError where a folder is in the cache of the hub's library.
 
-    What is written there would be loaded the next time as if its owner had pushed it.
+    What is written there would be loaded the next time as if its owner had pushed it. A folder in a
+    run that holds links is refused, too.
     """
     if (name := _copied_from(folder)) is not None:
         raise SkillweaveError(
@@ -199,6 +201,7 @@ def must_be_own(folder: Path) -> None:
             "or pushed from there, as it would be taken for its owner's. Take a copy of your own, "
             f"and use that: skillweave pull {name}"
         )
+    check_no_links_around(folder)
 
 
 def is_copy_of_hub(folder: Path) -> bool:

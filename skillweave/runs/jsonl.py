@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.reading import check_file, fit, load_json, shown
+from skillweave.runs.links import own_copy
 from skillweave.types import SkillweaveError
 
 
@@ -42,7 +43,8 @@ class JsonLines:
         text = "".join(json.dumps(record) + "\n" for record in records)
         try:
             if self._file is None:
-                self._file = self.path.open("a")
+                own_copy(self.path)
+                self._file = self.path.open("a", encoding="utf-8")
             self._file.write(text)
             self._file.flush()
         except OSError as error:
@@ -55,8 +57,11 @@ class JsonLines:
     def _next(self) -> str:
         return "" if self._next_step is None else f", then: {self._next_step()}"
 
-    def rewind(self, size: int | None) -> None:
+    def rewind(self, size: int | None) -> bool:
         """Remove all after ``size`` bytes: training will write it again.
+
+        Returns:
+            Whether there were so many bytes, or it is not known how many there should be.
 
         Raises:
             SkillweaveError: the disk cannot be written.
@@ -64,9 +69,11 @@ class JsonLines:
         self.close()
         try:
             if size is not None and self.size > size:
+                own_copy(self.path)
                 os.truncate(self.path, size)
         except OSError as error:
             raise SkillweaveError(f"could not write {self.path}: {error.strerror}") from error
+        return size is None or self.size >= size
 
     def read(self) -> Iterator[dict[str, Any]]:
         """The records, without a last line that is incomplete.

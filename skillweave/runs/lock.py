@@ -31,11 +31,27 @@ class Lock:
         self._directory, self._path = directory, directory / NAME
         self.exclusive = False
         """The system keeps other processes away."""
-        try:
-            self._handle = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise SkillweaveError(f"could not write {self._path}: {error.strerror}") from error
-        _held.add(self._handle)
+        self._open()
+        self._lock()
+        if self.exclusive and os.fstat(self._handle).st_nlink > 1:
+            # The run was copied by hard links (cp -al): the copy gets a lock of its own.
+            with suppress(FileNotFoundError):
+                os.unlink(self._path)
+            self.release()
+            self._open()
+            self._lock()
+        if self.exclusive:
+            with suppress(OSError):  # it is for messages alone
+                os.ftruncate(self._handle, 0)
+                os.write(self._handle, f"{os.getpid()} {platform.node()}\n".encode())
+
+    def _lock(self) -> None:
+        """Lock the file that is open, where the system can.
+
+        Raises:
+            SkillweaveError: another process has locked it.
+        """
+        self.exclusive = False
         if fcntl is None:
             return
         try:
@@ -44,14 +60,20 @@ class Lock:
             owner = self._owner()
             self.release()
             raise SkillweaveError(
-                f"{directory} is being trained by {owner}; wait until it ends, or stop it"
+                f"{self._directory} is being trained by {owner}; wait until it ends, or stop it"
             ) from error
         except OSError:  # a file system without locks
             return
         self.exclusive = True
-        with suppress(OSError):  # it is for messages alone
-            os.ftruncate(self._handle, 0)
-            os.write(self._handle, f"{os.getpid()} {platform.node()}\n".encode())
+
+    def _open(self) -> None:
+        """Open the file, which is made if it is not there."""
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+        try:
+            self._handle = os.open(self._path, flags, 0o666)
+        except OSError as error:
+            raise SkillweaveError(f"could not write {self._path}: {error.strerror}") from error
+        _held.add(self._handle)
 
     def _owner(self) -> str:
         """Return which process holds it, as far as the file says."""

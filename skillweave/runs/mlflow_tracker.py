@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from skillweave.messages import told
 from skillweave.runs.directory import RunDirectory
+from skillweave.terminal import say
 from skillweave.types import SkillweaveError, flat
 
 EXPERIMENT = "skillweave"
@@ -122,4 +122,4 @@ class MLflow:
             self._client.set_terminated(self._id, status)
         except Exception as error:
             text = f"MLflow did not take all metrics (they are in the run's files): {told(error)}"
-            print(text, file=sys.stderr)
+            say(text)

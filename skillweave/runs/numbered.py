@@ -20,27 +20,27 @@ def safe_name(text: str) -> str:
     return name or "run"
 
 
-def make_numbered(name: str) -> Path:
-    """Make the directory ``runs/<name>-<n>`` and return it; ``n`` is the next free number.
+def make_numbered(name: str, below: Path) -> Path:
+    """Make the directory ``runs/<name>-<n>`` below another one; ``n`` is the next free number.
 
     Two processes that call it at once get two directories.
 
     Raises:
         SkillweaveError: it cannot be made.
     """
-    name = safe_name(name)
+    name, folder = safe_name(name), below / FOLDER
     pattern = re.compile(rf"{re.escape(name)}-(\d+)")
     try:
-        FOLDER.mkdir(exist_ok=True)
-        taken = (pattern.fullmatch(path.name) for path in FOLDER.iterdir())
+        folder.mkdir(exist_ok=True)
+        taken = (pattern.fullmatch(path.name) for path in folder.iterdir())
         number = max((int(found[1]) for found in taken if found), default=0) + 1
         while True:
-            path = FOLDER / f"{name}-{number}"
+            path = folder / f"{name}-{number}"
             with suppress(FileExistsError):
                 path.mkdir()
                 return path
             number += 1
     except OSError as error:
         raise SkillweaveError(
-            f"could not make a directory in {FOLDER}: {error.strerror}"
+            f"could not make a directory in {folder}: {error.strerror}"
         ) from error

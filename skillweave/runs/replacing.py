@@ -9,6 +9,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from skillweave.messages import shown_path
 from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.files import TEMPORARY, remove
 from skillweave.runs.lock import NAME as LOCK
@@ -34,13 +35,13 @@ def check_replaceable(run: RunDirectory) -> None:
     """Raise a SkillweaveError where a run has learnt something that a new one would replace."""
     if run.finished:
         raise SkillweaveError(
-            f"{run.path} holds a finished run, which is never replaced. Load it: "
+            f"{shown_path(run.path)} holds a finished run, which is never replaced. Load it: "
             f"{load_words(run)}; or give more steps and continue it: {resume_words(run)}; or "
             "choose another directory"
         )
     if run.has_learnt:
         raise SkillweaveError(
-            f"{run.path} holds an unfinished run, {saved_words(run)}. Continue it: "
+            f"{shown_path(run.path)} holds an unfinished run, {saved_words(run)}. Continue it: "
             f"{resume_words(run)}; or choose another directory"
         )
 

@@ -24,7 +24,7 @@ def learns_again(run: RunDirectory, stage: str, name: str) -> bool:
 def save_state(run: RunDirectory, stage: str, name: str, state: Any) -> None:
     """Write the state, a dataclass of tensors on the CPU, that ``name`` ends a stage with."""
     run.check()
-    path = _path(run, name)
+    path = state_path(run, name)
     make_directory(path.parent)
     header = {"learns": name} | run.place(stage)
     write_tensors(path, vars(state), header, make_directories=False)
@@ -39,7 +39,7 @@ def load_state(run: RunDirectory, name: str, like: S) -> S | None:
     Raises:
         SkillweaveError: the file is damaged, or belongs elsewhere.
     """
-    path = _path(run, name)
+    path = state_path(run, name)
     if not path.exists():
         return None
     tensors, header = read_tensors(path)
@@ -55,10 +55,11 @@ def drop_states(run: RunDirectory, stage: str) -> None:
     """Remove the states of those who have learnt in this stage and learn no more after it."""
     for name in run.stage(stage)["learns"]:
         if not learns_again(run, stage, name):
-            remove(_path(run, name))
+            remove(state_path(run, name))
     with suppress(OSError):  # it holds others still, or never was there
         (run.path / "states").rmdir()
 
 
-def _path(run: RunDirectory, name: str) -> Path:
+def state_path(run: RunDirectory, name: str) -> Path:
+    """Return where the state lies that ``name`` ended its latest stage with."""
     return run.path / "states" / f"{file_name(name)}.safetensors"

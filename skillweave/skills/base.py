@@ -21,6 +21,7 @@ from skillweave.skills.spelling import misspelt
 from skillweave.types import Array, SkillweaveError, Step
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
+DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
 """What a skill may be named: its name names files, too."""
 
 
@@ -128,6 +129,11 @@ class Skill:
         if not NAME.fullmatch(self.name):
             raise SkillweaveError(
                 f"{where}: the name names files too; use letters, digits, '_' and '-', at most 64"
+            )
+        if DEVICE.fullmatch(self.name):
+            raise SkillweaveError(
+                f"{where}: the name names files too, and {self.name!r} is a device on Windows; "
+                "choose another name"
             )
         for field in ("max_steps", "steps", "call_steps"):
             value = getattr(self, field)

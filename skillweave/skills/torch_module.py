@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -52,10 +51,11 @@ class TorchPolicy(Foreign):
         from skillweave.spaces import unpack
 
         self.must_be_bound()
-        some = next(chain(self.module.parameters(), self.module.buffers()), None)
-        device = None if some is None else some.device
+        state = [*self.module.parameters(), *self.module.buffers()]
+        device = state[0].device if state else None
+        dtype = next((x.dtype for x in state if x.is_floating_point()), torch.float32)
         with torch.inference_mode():
-            output = self.module(_tensors(unpack(self.observation_space, obs), device))
+            output = self.module(_tensors(unpack(self.observation_space, obs), device, dtype))
         if not isinstance(output, torch.Tensor):
             raise SkillweaveError(
                 f"{self._who} returned a {type(output).__name__}; forward must return one tensor"
@@ -89,11 +89,11 @@ def from_torch(
 ) -> TorchPolicy:
     """A PyTorch module as a skill's policy; a skill takes the bare module too.
 
-    ``forward`` gets observations as float32 (n, *obs_shape), images unscaled, of a Dict or Tuple a
-    dict or tuple of such. It returns logits for Discrete (concatenated for MultiDiscrete, one for
-    each bit of MultiBinary), actions for Box (clipped to its bounds); whole numbers are actions
-    everywhere. Its weights are copied into the run; loading the run puts them into the recipe's
-    module, whatever that was initialised with.
+    ``forward`` gets observations (n, *obs_shape) of the type of its weights (without any, float32),
+    images unscaled, of a Dict or Tuple a dict or tuple of such. It returns logits for Discrete
+    (concatenated for MultiDiscrete, one for each bit of MultiBinary), actions for Box (clipped to
+    its bounds); whole numbers are actions everywhere. Its weights are copied into the run; loading
+    the run puts them into the recipe's module, whatever that was initialised with.
 
     Args:
         module: acts in evaluation mode, as a copy of what it is when training starts.
@@ -111,14 +111,14 @@ def from_torch(
     return TorchPolicy(module, observation_space, action_space)
 
 
-def _tensors(obs: Any, device: Any) -> Any:
+def _tensors(obs: Any, device: Any, dtype: Any) -> Any:
     import torch
 
     if isinstance(obs, dict):
-        return {name: _tensors(part, device) for name, part in obs.items()}
+        return {name: _tensors(part, device, dtype) for name, part in obs.items()}
     if isinstance(obs, tuple):
-        return tuple(_tensors(part, device) for part in obs)
-    return torch.tensor(obs, dtype=torch.float32, device=device)
+        return tuple(_tensors(part, device, dtype) for part in obs)
+    return torch.tensor(obs, dtype=dtype, device=device)
 
 
 def weights_of(module: nn.Module, who: str) -> bytes:

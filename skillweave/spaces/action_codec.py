@@ -75,7 +75,7 @@ class ActionCodec:
     def check(self, action: Tensor) -> None:
         """Raise a ValueError where actions in policy units (…) are none of this space."""
         if self.discrete:
-            most = torch.tensor(self.parts if self.multi else self.parts[0])
+            most = torch.tensor(self.parts if self.multi else self.parts[0], device="cpu")
             if not bool(((action >= 0) & (action < most.to(action.device))).all()):
                 raise ValueError("an action of its rows does not exist")
 

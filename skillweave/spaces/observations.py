@@ -155,8 +155,12 @@ class ObsCodec:
             if x.is_floating_point() and not bool(x.isfinite().all()):
                 raise ValueError("an observation is not finite")
             if leaf.choices:
-                flat = x.reshape(-1, len(leaf.choices)).long() - torch.tensor(leaf.start)
-                if not bool(((flat >= 0) & (flat < torch.tensor(leaf.choices))).all()):
+                flat = x.reshape(-1, len(leaf.choices)).long() - torch.tensor(
+                    leaf.start, device="cpu"
+                )
+                if not bool(
+                    ((flat >= 0) & (flat < torch.tensor(leaf.choices, device="cpu"))).all()
+                ):
                     raise ValueError("an observation holds a choice that does not exist")
 
     def highest(self, i: int) -> Tensor:

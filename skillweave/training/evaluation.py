@@ -24,6 +24,7 @@ from skillweave.notebooks import joined, paragraph, table
 from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
+from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.reflex_tally import ReflexTally
 from skillweave.training.skill_report import SkillReport, SkillTally, all_steps
@@ -125,7 +126,7 @@ class Evaluation:
         """``str()``, and for a hierarchy a table of its skills, and what looks like a mistake."""
         skills = [skill_table(self.skills)] if self.skills else []
         reflexes = reflex_lines(self.reflexes, sum(self.lengths))
-        return "\n".join([str(self), *skills, *reflexes, *hints(self.skills)])
+        return printable("\n".join([str(self), *skills, *reflexes, *hints(self.skills)]))
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -155,7 +156,7 @@ class Evaluation:
         if self.skills:
             shares = ", ".join(f"{k} {v:.0%}" for k, v in j["skill_usage"].items())
             line += f"; skills: {shares}"
-        return line
+        return printable(line)
 
 
 def interquartile_mean(values: Array) -> float:

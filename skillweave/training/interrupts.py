@@ -7,11 +7,12 @@ default are taken over: a program that has a handler of its own keeps it.
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
+
+from skillweave.terminal import say
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
@@ -35,12 +36,8 @@ def deferred(until: str) -> Iterator[None]:
         _received.append(signal.Signals(number).name)
         if len(_received) > 1:
             raise KeyboardInterrupt
-        with suppress(RuntimeError, OSError, ValueError):  # it may interrupt another print
-            print(
-                f"\nstopping {until}, and saving; press Ctrl-C again to stop at once",
-                file=sys.stderr,
-                flush=True,
-            )
+        with suppress(RuntimeError):  # it may interrupt another print
+            say(f"\nstopping {until}, and saving; press Ctrl-C again to stop at once")
 
     _received.clear()
     before = {s: signal.getsignal(s) for s in SIGNALS}

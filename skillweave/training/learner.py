@@ -124,7 +124,8 @@ class RolloutLearner:
             return {}
         seeds = member_seeds(self._seeds, "learn", stack.members, update)
         generators = [s.torch() for s in seeds]
-        stack.state, report = stack.algorithm.update(stack.state, rollout, generators)
+        with torch.enable_grad():  # the user may have switched gradients off
+            stack.state, report = stack.algorithm.update(stack.state, rollout, generators)
         metrics: dict[str, Tensor] = report.metrics
         if anchor is not None and "anchor_kl" in metrics:
             anchor.coef = adapted(anchor.coef, metrics["anchor_kl"], anchor.nats)
@@ -168,7 +169,7 @@ def keep_to_guide(learner: Learner, target_kl: float | None) -> None:
     """Keep the selector within ``target_kl`` of its guide; None disables this."""
     if target_kl is not None and isinstance(learner, RolloutLearner):
         (stack,) = learner.stacks
-        coef = torch.ones(stack.members, device=stack.state.params.device)
+        coef = torch.ones_like(stack.state.params[:, 0])
         learner.anchor = Anchor(None, coef, target_kl)
 
 
@@ -177,7 +178,8 @@ def adapted(coef: Tensor, kl: Tensor, nats: float) -> Tensor:
 
     The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
     """
-    factor = torch.where(kl > 1.5 * nats, 2.0, torch.where(kl < nats / 1.5, 0.5, 1.0))
+    one = torch.ones_like(kl)
+    factor = torch.where(kl > 1.5 * nats, 2.0 * one, torch.where(kl < nats / 1.5, 0.5 * one, one))
     return (coef * factor).clamp(1e-3, 1e3)
 
 

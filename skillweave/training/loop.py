@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from skillweave.collecting.group import Collectors
+from skillweave.ops.device import INT
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
@@ -65,10 +66,12 @@ class Progress:
         """Return what a checkpoint needs beside ``update``, ``steps`` and ``seconds``."""
         report = self.report or Report(0, 0, False, {})
         numbers = [self.reported, report.update, report.steps, int(report.due)]
-        summary = {k: torch.tensor(v, dtype=torch.float64) for k, v in report.summary.items()}
+        summary = {
+            k: torch.tensor(v, dtype=torch.float64, device="cpu") for k, v in report.summary.items()
+        }
         metrics = {k: v.detach().cpu().clone() for k, v in self.metrics.items()}
         return (
-            {"report": torch.tensor(numbers, dtype=torch.int64)}
+            {"report": torch.tensor(numbers, **INT)}
             | prefixed("summary", summary)
             | prefixed("metrics", metrics)
         )

@@ -163,7 +163,8 @@ class ReplayLearner:
             size = cfg.batch_size * min(draws, due - done)
             drawn = self.store.sample(size, gamma, rngs, beta, first, progress)
             for sample in drawn.split(cfg.batch_size):
-                stack.state, report = stack.algorithm.update(stack.state, sample, generators)
+                with torch.enable_grad():  # the user may have switched gradients off
+                    stack.state, report = stack.algorithm.update(stack.state, sample, generators)
                 metrics = report.metrics
                 if cfg.prioritized:
                     self.store.update_priorities(sample.index, report.error, first)

@@ -83,11 +83,14 @@ class StageLog:
         self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), dict(at)
         self._callbacks = [x for x in listeners if isinstance(x, TrainCallback)]
         self._has_final = False
-        run.rewind(self.entry | self.at)
-        self.entry.update(run.line_bytes() | self.entry, status="training")
+        lack = run.rewind(self.entry | self.at)
+        known = self.entry if not lack else {}
+        self.entry.update(run.line_bytes() | known, status="training")
         run.save()
         for listener in listeners:
             listener.stage(name, int(self.entry["budget"]))
+        for file in lack:
+            self.tell(f"{run.path / file} was removed or shortened: curves begin where it does")
 
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """An update was made."""

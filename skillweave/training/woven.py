@@ -22,10 +22,10 @@ from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
 from skillweave.experience import Anchor
-from skillweave.ops.device import resolve_device
+from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.starts import start_of
-from skillweave.runs.states import load_state
+from skillweave.runs.states import load_state, state_path
 from skillweave.seeding import Seeds
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.replay_learner import ReplayLearner, store_of
@@ -122,6 +122,8 @@ class WovenAgents(OneAgent):
             device = resolve_device(algorithm.config.device)
             before, anchor = self._before(name), None
             if before is not None:
+                if not saved:
+                    self._tell_lost_state(name, log)
                 fresh = self._as_before(name, algorithm, fresh, *before)
                 anchor = self._anchor(name, algorithm, fresh, device, log)
             if saved:
@@ -156,6 +158,16 @@ class WovenAgents(OneAgent):
             return None  # all is in its final state
         return start_of(self.stage.run, self.stage.name, name, self.algorithms[name])
 
+    def _tell_lost_state(self, name: str, log: StageLog) -> None:
+        """Say so where the file of a state was deleted."""
+        latest, path = self._latest_stage(name), state_path(self.stage.run, name)
+        kept = latest.get("kept", {}).get("kept")
+        if latest and latest.get("evolution") is None and kept != "before" and not path.exists():
+            log.tell(
+                f"{path} is not there any more, so {name!r} goes on with its weights alone, and "
+                "the end is another one"
+            )
+
     def _as_before(
         self, name: str, algorithm: Algorithm, fresh: Any, policy: AgentPolicy, steps: int
     ) -> Any:
@@ -184,7 +196,11 @@ class WovenAgents(OneAgent):
             return None
         params = algorithm.acting_params(state, device=device)
         # Who seldom succeeded has little to lose, and much to learn.
-        return Anchor(params, torch.ones(1, device=device), self.together.reference_kl / rate)
+        return Anchor(
+            params,
+            torch.ones(1, dtype=torch.float32, device=device),
+            self.together.reference_kl / rate,
+        )
 
     def _part(self, name: str, stack: Stack, log: StageLog, *, learnt_before: bool) -> Learner:
         """The learner of the selector, or of a skill."""
@@ -276,7 +292,7 @@ class WovenAgents(OneAgent):
     def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
         """Return all states among the extra tensors."""
         assert isinstance(self.learner, WovenLearner)
-        states = {"counts": torch.tensor(list(self.learner.counts.values()))}
+        states = {"counts": torch.tensor(list(self.learner.counts.values()), **INT)}
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
         return None, extra | states | self.best_tensors()

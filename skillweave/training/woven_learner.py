@@ -12,6 +12,7 @@ from torch import Tensor
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Experience
+from skillweave.ops.device import FLOAT
 from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.training.stage import CRITIC, SELECTOR, decides
 from skillweave.types import Array, prefixed, unprefixed
@@ -143,4 +144,4 @@ def how_it_acted(name: str, rows: Experience) -> dict[str, Tensor]:
         found["usage"] = valid.mean()
         if valid.any():
             found["reward"] = rows.reward[valid].mean()
-    return {key: torch.tensor([float(value)]) for key, value in found.items()}
+    return {key: torch.tensor([float(value)], **FLOAT) for key, value in found.items()}

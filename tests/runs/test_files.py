@@ -79,7 +79,7 @@ def test_a_written_file_can_be_read_by_others(saved: Path) -> None:
     assert saved.stat().st_mode & 0o777 == 0o644
 
 
-@pytest.mark.parametrize("call", ["fsync", "replace", "chmod"])
+@pytest.mark.parametrize("call", ["fsync", "replace"])
 def test_a_full_disk_leaves_the_old_file_and_no_temporary_file(
     saved: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:

@@ -68,13 +68,13 @@ def test_any_name_becomes_a_folder(text: str, name: str) -> None:
 def test_numbers_go_on_after_the_largest_and_other_files_do_not_count() -> None:
     for name in ("a-2", "a-10", "a-b-20", "b-30", "a-x"):
         (Path("runs") / name).mkdir(parents=True)
-    assert make_numbered("a") == Path("runs/a-11")
-    assert make_numbered("a") == Path("runs/a-12")
-    assert make_numbered("c") == Path("runs/c-1")
+    assert make_numbered("a", Path()) == Path("runs/a-11")
+    assert make_numbered("a", Path()) == Path("runs/a-12")
+    assert make_numbered("c", Path()) == Path("runs/c-1")
 
 
 def _several(_: int) -> list[str]:
-    return [str(make_numbered("same")) for _ in range(20)]
+    return [str(make_numbered("same", Path())) for _ in range(20)]
 
 
 def test_processes_that_start_at_once_get_directories_of_their_own() -> None:
@@ -84,15 +84,15 @@ def test_processes_that_start_at_once_get_directories_of_their_own() -> None:
 
 
 def test_train_without_a_directory_makes_one_and_prints_it(capfd) -> None:
+    here = Path("runs").absolute()
     first = declare().train()
-    assert first.path == Path("runs/CartPole-v1-1")
+    assert first.path == here / "CartPole-v1-1"
     assert "run: runs/CartPole-v1-1" in capfd.readouterr().err
-    assert declare(name="walker").train(quiet=True).path == Path("runs/walker-1")
-    assert declare().train(flat=True, quiet=True).path == Path("runs/CartPole-v1-flat-1")
-    assert sw.train_agent(CARTPOLE, ON, 64, quiet=True).path == Path("runs/CartPole-v1-2")
-    assert Agent(lambda: gym.make("CartPole-v1"), ON, 64).train(quiet=True).path == Path(
-        "runs/lambda-1"
-    )
+    assert declare(name="walker").train(quiet=True).path == here / "walker-1"
+    assert declare().train(flat=True, quiet=True).path == here / "CartPole-v1-flat-1"
+    assert sw.train_agent(CARTPOLE, ON, 64, quiet=True).path == here / "CartPole-v1-2"
+    plain = Agent(lambda: gym.make("CartPole-v1"), ON, 64)
+    assert plain.train(quiet=True).path == here / "lambda-1"
 
 
 def test_a_declaration_that_is_wrong_leaves_no_directory() -> None:
@@ -149,7 +149,7 @@ def test_links_are_not_followed() -> None:
     Path("elsewhere").mkdir()
     Path("elsewhere/weights.safetensors").write_text("years of work")
     (Path("run") / "starts").symlink_to(Path("elsewhere").absolute())
-    with pytest.raises(SkillweaveError, match="run holds starts"):
+    with pytest.raises(SkillweaveError, match="run/starts is a link to"):
         declare().train("run", quiet=True)
     assert Path("elsewhere/weights.safetensors").exists()
 

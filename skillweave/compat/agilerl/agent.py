@@ -139,7 +139,7 @@ class Agent:
 
 def random_seed() -> int:
     """A seed from torch's generator, so that ``torch.manual_seed`` makes agents repeatable."""
-    return int(torch.randint(2**62, ()))
+    return int(torch.randint(2**62, (), device="cpu"))
 
 
 def plain(value: Any) -> Any:

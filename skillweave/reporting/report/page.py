@@ -43,8 +43,8 @@ def write_page(
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     parts = {
-        "style": (HERE / "style.css").read_text(),
-        "script": (HERE / "page.js").read_text(),
+        "style": (HERE / "style.css").read_text("utf-8"),
+        "script": (HERE / "page.js").read_text("utf-8"),
         "library": library(),
         "data": data,
         "film": None if film is None else base64.b64encode(film.data).decode(),

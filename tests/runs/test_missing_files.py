@@ -1,0 +1,136 @@
+"""A run of which files were deleted: it goes on with a sentence, or an error names the file."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skillweave import Agent, Apart, Evolution, Hierarchy, SkillweaveError, Together, TrainDefaults
+from skillweave.cli import main
+from tests.small_runs import ON, Left, Push, policies
+
+
+class Stop(Exception):
+    pass
+
+
+def tree(factor: int = 1) -> Hierarchy:
+    return Hierarchy(
+        "CartPole-v1",
+        [Left(), Push()],
+        call_steps=4,
+        algorithm=ON,
+        selector=ON,
+        learn="apart, then together",
+        apart=Apart(skill_steps=96 * factor, selector_steps=96 * factor),
+        together=Together(steps=192 * factor),
+        train_defaults=TrainDefaults(checkpoint_every=64),
+    )
+
+
+def stopped(folder: Path, stage: str, steps: int) -> Path:
+    def stop(event: Any) -> None:
+        if event.stage == stage and event.steps >= steps:
+            raise Stop
+
+    with pytest.raises(Stop):
+        tree().train(folder, quiet=True, callback=stop)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs that were stopped while all learnt together, and before; and a finished one."""
+    folder = tmp_path_factory.mktemp("runs")
+    stopped(folder / "stopped", "together", 128)
+    stopped(folder / "early", "together", 1)
+    tree().train(folder / "finished", quiet=True).evaluate(1, save=True, quiet=True)
+    return folder
+
+
+def removed(runs: Path, tmp_path: Path, kind: str, name: str) -> Path:
+    run = shutil.copytree(runs / kind, tmp_path / "run")
+    path = run / name
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [".lock", "final", "checkpoint.previous.safetensors"])
+def test_files_that_going_on_does_not_need(name, runs, tmp_path):
+    run = removed(runs, tmp_path, "stopped", name)
+    tree().resume(run, quiet=True)
+    assert policies(run) == policies(runs / "finished")
+
+
+def test_lines_of_metrics(tmp_path, capsys):
+    def agent() -> Agent:
+        return Agent("CartPole-v1", ON, 160)
+
+    def stop(event: Any) -> None:
+        if event.steps >= 96:
+            raise Stop
+
+    with pytest.raises(Stop):
+        agent().train(tmp_path / "run", quiet=True, checkpoint_every=32, callback=stop)
+    run, file = tmp_path / "run", tmp_path / "run" / "metrics.jsonl"
+    file.unlink()
+    agent().resume(run)
+    said = capsys.readouterr().err
+    assert f"{file} was removed or shortened: curves begin where it does" in said
+    agent().train(tmp_path / "reference", quiet=True, checkpoint_every=32)
+    assert policies(run) == policies(tmp_path / "reference")
+    file.unlink()
+    for words in (["info", str(run)], ["evaluate", str(run), "--episodes", "1"]):
+        assert main(words) == 0
+    assert main(["plot", str(run)]) == 1
+    assert f"there is no {file}" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_state_to_go_on_with(runs, tmp_path, capsys):
+    run = shutil.copytree(runs / "early", tmp_path / "run")
+    for path in run.glob("checkpoint*"):
+        path.unlink()
+    (run / "states" / "left.safetensors").unlink()
+    tree().resume(run)
+    said = capsys.readouterr().err
+    assert "left.safetensors is not there any more, so 'left' goes on with its weights" in said
+    assert "selector.safetensors is not there" not in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["policies/left.safetensors", "policies", "run.json"])
+def test_files_without_which_there_is_no_run(name, runs, tmp_path):
+    for kind in ("stopped", "finished"):
+        run = removed(runs, tmp_path / kind, kind, name)
+        for use in (
+            lambda run=run: tree().resume(run, quiet=True),
+            lambda run=run: tree().load(run),
+            lambda run=run: tree().train(tmp_path / "new", start_from=run, quiet=True),
+        ):
+            with pytest.raises(SkillweaveError) as caught:
+                use()
+            file = "run.json" if name == "run.json" else "left.safetensors"
+            assert file in str(caught.value)
+
+
+@pytest.mark.slow
+def test_the_final_state_of_a_run_that_gets_more_steps(runs, tmp_path):
+    run = removed(runs, tmp_path, "finished", "final")
+    tree().load(run).evaluate(1, quiet=True)
+    with pytest.raises(SkillweaveError, match="does not hold the final state of stage"):
+        tree(2).train(run, resume=True, quiet=True)
+
+
+@pytest.mark.slow
+def test_the_lineage_of_a_population(tmp_path, capsys):
+    agent = Agent("CartPole-v1", ON, 600)
+    run = agent.train(tmp_path / "run", quiet=True, evolve=Evolution(population=3)).path
+    (run / "lineage.jsonl").unlink()
+    for words in (["info", str(run)], ["plot", str(run)], ["evaluate", str(run)]):
+        main(words)
+        assert "Traceback" not in capsys.readouterr().err
