@@ -16,6 +16,8 @@ from dataclasses import MISSING, fields, is_dataclass
 from difflib import SequenceMatcher
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+
 from skillweave.messages import short
 from skillweave.types import SkillweaveError
 
@@ -61,7 +63,7 @@ def checked_names(target: T) -> T:
     """Let a function, or a class, raise a SkillweaveError where its arguments are wrong.
 
     Of a dataclass, attributes are checked as well: those of a frozen one cannot be set, those of
-    another only if they exist.
+    another only if they exist. NumPy's numbers become Python's.
 
     Args:
         target: a function, a method, or a class (above ``@dataclass``, if it is one).
@@ -72,15 +74,30 @@ def checked_names(target: T) -> T:
     if not isinstance(target, type):
         return typing.cast(T, _checked(target))
     kind: Any = target
-    kind.__init__ = _checked(kind.__init__)
-    if "__dataclass_params__" in vars(kind):
+    made = "__dataclass_params__" in vars(kind)
+    kind.__init__ = _checked(kind.__init__, settings=made)
+    if made:
         _check_attributes(kind, kind.__dataclass_params__.frozen)
     return target
 
 
-def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+def plain(value: Any) -> Any:
+    """A setting with Python's numbers and texts in place of NumPy's, also in a tuple or a list."""
+    if isinstance(value, np.generic):
+        found = value.item()
+        return value if isinstance(found, np.generic) else found
+    if type(value) in (tuple, list):
+        converted = [plain(one) for one in value]
+        same = all(a is b for a, b in zip(value, converted, strict=True))
+        return value if same else type(value)(converted)
+    return value
+
+
+def _checked(function: Callable[..., Any], settings: bool = False) -> Callable[..., Any]:
     @functools.wraps(function)
     def checked(*args: Any, **named: Any) -> Any:
+        if settings:
+            args, named = tuple(map(plain, args)), {k: plain(v) for k, v in named.items()}
         try:
             return function(*args, **named)
         except TypeError:

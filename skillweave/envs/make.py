@@ -21,6 +21,7 @@ from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
 from skillweave.messages import close_matches, short, shortened, told, whole_number
+from skillweave.reading import as_json
 from skillweave.types import MissingExtra, SkillweaveError
 
 MOST = 65_536
@@ -47,7 +48,8 @@ class EnvSpec:
 
     Args:
         env: a Gymnasium id, or a function that makes one environment.
-        kwargs: passed to ``gymnasium.make``, or to that function; not to ``pool``.
+        kwargs: passed to ``gymnasium.make``, or to that function; not to ``pool``. A run records
+            them, so to train they must be numbers, texts, lists and dicts.
         wrappers: applied to each environment, first one first.
         engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
             environment as Gymnasium defines it, else sync.
@@ -190,6 +192,31 @@ class EnvSpec:
         if isinstance(self.env, str):
             return self.env
         return str(getattr(self.env, "__name__", type(self.env).__name__))
+
+    @property
+    def json_kwargs(self) -> dict[str, Any]:
+        """``kwargs`` as a run records them.
+
+        Raises:
+            SkillweaveError: one of them cannot be recorded; the message names it and proposes a
+                function.
+        """
+        found = {}
+        for name, value in self.kwargs.items():
+            known = isinstance(self.env, str)
+            call = f"gymnasium.make({self.env!r}, " if known else f"{self._called}("
+            found[name] = as_json(
+                value,
+                f"{self.name}: kwargs[{name!r}]",
+                f"put it into a function, and give that as env: def make(): return {call}"
+                f"{name}=...)",
+            )
+        return found
+
+    @property
+    def _called(self) -> str:
+        """What a message calls the function that makes the environment."""
+        return self.name if self.name.isidentifier() else "your_function"
 
     @property
     def is_data(self) -> bool:

@@ -24,6 +24,8 @@ def check_env(env: object) -> None:
             f"env is {short(env)}; it must be a Gymnasium id, a function that makes an "
             "environment, or an EnvSpec (environments are made many times over)"
         )
+    if isinstance(env, EnvSpec):
+        _ = env.json_kwargs  # says which of them a run cannot record
 
 
 def check_algorithm(value: object, where: str, *, optional: bool = False, also: str = "") -> None:

@@ -17,7 +17,7 @@ from skillweave.arguments import checked_names
 from skillweave.envs.checks import LONGEST_EPISODE, time_limit
 from skillweave.envs.infos import told_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
-from skillweave.messages import whole_number
+from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
@@ -60,6 +60,8 @@ class Evaluation:
                 f"{len(self.returns)} returns and {len(self.lengths)} lengths; every episode has "
                 "one of each, and there is at least one episode"
             )
+        if self.alone is not None and self.alone not in self.skills:
+            raise SkillweaveError(f"no report of the skill that acted alone, {short(self.alone)}")
 
     @property
     def mean(self) -> float:

@@ -102,7 +102,7 @@ class PlainAgent:
         return {
             "kind": "agent",
             "env": self.spec.name,
-            "env_kwargs": self.spec.kwargs,
+            "env_kwargs": self.spec.json_kwargs,
             "seed": seed,
             "checkpoint_every": how.checkpoint_every,
             "eval_every": how.eval_every,
