@@ -59,6 +59,18 @@ ELSEWHERE = {
 """Names that other libraries give to settings, with the names that they have here."""
 
 
+STARTS = (
+    "options", "reset_options", "reset_kwargs", "start_state", "start_states", "initial_state",
+    "initial_states", "init_state", "start_distribution",
+)  # fmt: skip
+"""Names under which users look for other starts of episodes."""
+STARTS_BY = (
+    "episodes start where the environment's reset() puts them; to start elsewhere, give a wrapper "
+    "whose reset() passes on options or sets the state, EnvSpec(env, wrappers=(Elsewhere,)): the "
+    "documentation has its lines, under 'A curriculum', 'Start episodes elsewhere'"
+)
+
+
 def checked_names(target: T) -> T:
     """Let a function, or a class, raise a SkillweaveError where its arguments are wrong.
 
@@ -141,6 +153,8 @@ def _wrong_arguments(
         places = [_Place(k, "", "") for k in by_name]
         if owner is not None:
             places += _other_places(owner, makes)
+        if unknown[0] in STARTS and not (unknown[0] in ELSEWHERE and "skills" in by_name):
+            return f"{who} has no {what} {unknown[0]!r}: {STARTS_BY}"
         end = meant(unknown[0], places, f"its {what}s are")
         return f"{who} has no {what} {unknown[0]!r}{end}"
     ordered = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]

@@ -14,7 +14,7 @@ import numpy as np
 
 import skillweave.toys  # registers their ids  # noqa: F401
 from skillweave.arguments import checked_names
-from skillweave.envs.checks import CheckedEnv
+from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, random_actions
@@ -79,6 +79,8 @@ class EnvSpec:
     obs_names: ObsNames | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
+        if is_batched(self.env):
+            raise refuse_batched(short(self.env))
         made = isinstance(self.env, gym.Env)
         if made or not (isinstance(self.env, str) or callable(self.env)):
             raise SkillweaveError(
@@ -162,7 +164,11 @@ class EnvSpec:
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error
             raise SkillweaveError(f"the environment {env_id} needs more: {error}") from error
         except (gym.error.Error, ImportError) as error:
-            why, advice = shortened(str(error)).rstrip("."), close_matches(env_id, gym.registry)
+            entry = gym.registry.get(env_id)
+            if entry is not None and entry.entry_point is None and entry.vector_entry_point:
+                raise refuse_batched(env_id) from error
+            others = gym.registry.keys() - {env_id}
+            why, advice = shortened(str(error)).rstrip("."), close_matches(env_id, others)
             if not advice and ":" not in env_id:
                 advice = (
                     " If a package of its own registers it, install that and import it, or write "
@@ -300,6 +306,12 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
         pool = make(num_envs=1, threads=1, seed=0)
     except MissingExtra:
         return False
+    if isinstance(pool, gym.vector.VectorEnv):
+        raise SkillweaveError(
+            f"{spec.name}: pool made {short(pool)}, a VectorEnv, which steps all its environments "
+            "at once; a pool must step some while the others stand still, as EnvPool does: leave "
+            "out pool, and each environment is stepped by itself"
+        )
     for what in ("observation_space", "action_space"):
         theirs, ours = getattr(pool, what), getattr(reference, what)
         alike = isinstance(theirs, type(ours)) and theirs.shape == ours.shape
