@@ -16,6 +16,8 @@ from dataclasses import MISSING, fields, is_dataclass
 from difflib import SequenceMatcher
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+
 from skillweave.messages import short
 from skillweave.types import SkillweaveError
 
@@ -57,11 +59,23 @@ ELSEWHERE = {
 """Names that other libraries give to settings, with the names that they have here."""
 
 
+STARTS = (
+    "options", "reset_options", "reset_kwargs", "start_state", "start_states", "initial_state",
+    "initial_states", "init_state", "start_distribution",
+)  # fmt: skip
+"""Names under which users look for other starts of episodes."""
+STARTS_BY = (
+    "episodes start where the environment's reset() puts them; to start elsewhere, give a wrapper "
+    "whose reset() passes on options or sets the state, EnvSpec(env, wrappers=(Elsewhere,)): the "
+    "documentation has its lines, under 'A curriculum', 'Start episodes elsewhere'"
+)
+
+
 def checked_names(target: T) -> T:
     """Let a function, or a class, raise a SkillweaveError where its arguments are wrong.
 
     Of a dataclass, attributes are checked as well: those of a frozen one cannot be set, those of
-    another only if they exist.
+    another only if they exist. NumPy's numbers become Python's.
 
     Args:
         target: a function, a method, or a class (above ``@dataclass``, if it is one).
@@ -72,15 +86,30 @@ def checked_names(target: T) -> T:
     if not isinstance(target, type):
         return typing.cast(T, _checked(target))
     kind: Any = target
-    kind.__init__ = _checked(kind.__init__)
-    if "__dataclass_params__" in vars(kind):
+    made = "__dataclass_params__" in vars(kind)
+    kind.__init__ = _checked(kind.__init__, settings=made)
+    if made:
         _check_attributes(kind, kind.__dataclass_params__.frozen)
     return target
 
 
-def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+def plain(value: Any) -> Any:
+    """A setting with Python's numbers and texts in place of NumPy's, also in a tuple or a list."""
+    if isinstance(value, np.generic):
+        found = value.item()
+        return value if isinstance(found, np.generic) else found
+    if type(value) in (tuple, list):
+        converted = [plain(one) for one in value]
+        same = all(a is b for a, b in zip(value, converted, strict=True))
+        return value if same else type(value)(converted)
+    return value
+
+
+def _checked(function: Callable[..., Any], settings: bool = False) -> Callable[..., Any]:
     @functools.wraps(function)
     def checked(*args: Any, **named: Any) -> Any:
+        if settings:
+            args, named = tuple(map(plain, args)), {k: plain(v) for k, v in named.items()}
         try:
             return function(*args, **named)
         except TypeError:
@@ -124,6 +153,8 @@ def _wrong_arguments(
         places = [_Place(k, "", "") for k in by_name]
         if owner is not None:
             places += _other_places(owner, makes)
+        if unknown[0] in STARTS and not (unknown[0] in ELSEWHERE and "skills" in by_name):
+            return f"{who} has no {what} {unknown[0]!r}: {STARTS_BY}"
         end = meant(unknown[0], places, f"its {what}s are")
         return f"{who} has no {what} {unknown[0]!r}{end}"
     ordered = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]

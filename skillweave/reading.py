@@ -29,6 +29,9 @@ from typing import (
     is_typeddict,
 )
 
+import numpy as np
+
+from skillweave.messages import short
 from skillweave.types import SkillweaveError
 
 DEEPEST = 100
@@ -124,6 +127,33 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
             raise SkillweaveError(f"{where} is damaged: it is nested too deep")
         layer, depth = [x for part in layer for x in _inside(part)], depth + 1
     return data
+
+
+def as_json(value: Any, where: str, advice: str) -> Any:
+    """Return a setting as plain JSON: NumPy's numbers as Python's, tuples as lists.
+
+    Args:
+        where: what messages call it; the places in it are added: ``kwargs['sizes'][0]``.
+        advice: the end of messages, what to do.
+
+    Raises:
+        SkillweaveError: it holds something that is not the same after it was written and read.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float) and math.isfinite(value):
+        return value
+    if isinstance(value, list | tuple):
+        return [as_json(x, f"{where}[{i}]", advice) for i, x in enumerate(value)]
+    if isinstance(value, Mapping) and all(isinstance(k, str) for k in value):
+        return {k: as_json(x, f"{where}[{k!r}]", advice) for k, x in value.items()}
+    keys = " with keys that are no text" if isinstance(value, Mapping) else ""
+    raise SkillweaveError(
+        f"{where} is {short(value)}{keys}, but a run records only finite numbers, texts, and lists "
+        f"and dicts of them; {advice}"
+    )
 
 
 def load_json(text: str | bytes, **how: Any) -> Any:

@@ -21,7 +21,7 @@ from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
-from skillweave.spaces import action_codec, obs_codec
+from skillweave.spaces import ObsCodec, action_codec, obs_codec
 from skillweave.types import Array, SkillweaveError, prefixed
 
 S = TypeVar("S")
@@ -103,6 +103,28 @@ class ActingParams:
         self.extra = {name: state[f"extra.{name}"].clone() for name in self.extra}
 
 
+def read_by(config: Any, observation_space: gym.Space[Any], where: str = "") -> ObsCodec:
+    """Return the codec by which the networks of settings read observations.
+
+    Args:
+        config: settings of an algorithm.
+        where: the start of messages: ``skill 'land': ``.
+
+    Raises:
+        SkillweaveError: the channels of an image may be in more than one axis.
+    """
+    network = getattr(config, "network", None)
+    codec = obs_codec(observation_space, getattr(network, "planes", None))
+    # Cells are read one by one, so the order of their axes makes no difference.
+    if codec.unclear and getattr(network, "encoder", None) != "cells":
+        raise SkillweaveError(
+            f"{where}{codec.unclear[0]} may have its planes (channels) in the first axis or in the "
+            f'last: write {type(config).__name__}(network=Network(planes="first")), or '
+            'planes="last", with the other settings of the network'
+        )
+    return codec
+
+
 class Algorithm:
     """The part of an algorithm that is the same for all.
 
@@ -143,7 +165,7 @@ class Algorithm:
             )
         self.config = config
         self.observation_space, self.action_space = observation_space, action_space
-        self.obs, self.codec = obs_codec(observation_space), action_codec(action_space)
+        self.obs, self.codec = read_by(config, observation_space), action_codec(action_space)
         self.normalize_obs = config.normalize_obs and self.obs.scaled
 
     # What an algorithm defines

@@ -14,7 +14,7 @@ import gymnasium as gym
 from skillweave.algorithms.config_off_policy import DQN, SAC, TD3, OffPolicy
 from skillweave.algorithms.config_on_policy import PPO, OnPolicy, SelfImitationPPO, SkillCritic
 from skillweave.named import Named
-from skillweave.reading import fit, shown
+from skillweave.reading import as_json, fit, shown
 from skillweave.types import SkillweaveError
 
 AlgorithmConfig: TypeAlias = OnPolicy | OffPolicy
@@ -113,15 +113,27 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
 
 
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
-    """Settings as plain JSON, with the algorithm's name under ``algorithm``."""
-    return {"algorithm": type(config).__name__, **_as_json(config)}
+    """Settings as plain JSON, with the algorithm's name under ``algorithm``.
+
+    Raises:
+        SkillweaveError: a setting, of a user's own algorithm, cannot be recorded.
+    """
+    name = type(config).__name__
+    return {"algorithm": name, **_settings(config, name)}
 
 
-def _as_json(value: Any) -> Any:
-    """Return settings as dicts; functions of the user are the names that are recorded."""
+def _settings(value: Any, where: str) -> Any:
+    """Return settings as dicts; functions of the user are the names that are recorded.
+
+    Raises:
+        SkillweaveError: a setting, of a user's own algorithm, cannot be recorded.
+    """
     if is_dataclass(value):
-        return {f.name: _as_json(getattr(value, f.name)) for f in fields(value)}
-    return str(value) if isinstance(value, Named) else value
+        own = {f.name: getattr(value, f.name) for f in fields(value)}
+        return {name: _settings(one, f"{where}.{name}") for name, one in own.items()}
+    if isinstance(value, Named):
+        return str(value)
+    return as_json(value, where, "record a name, and let the algorithm look up what it means")
 
 
 def own_encoders(config: Any) -> list[str]:

@@ -90,3 +90,5 @@ def check_networks(config: Any) -> None:
     check(config, "critic", isinstance(critic, Network | None), "a Network() or None")
     if critic is not None:
         check(config, "critic", critic.rnn is None, "without rnn")
+        same = critic.planes in (None, config.network.planes)
+        check(config, "critic", same, "without planes: Network.planes of network counts for both")

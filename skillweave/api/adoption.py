@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -147,7 +146,7 @@ def _reflexes(names: list[str]) -> str:
 def _check_place(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
     """Raise a SkillweaveError where a run was trained in another environment."""
     theirs, kwargs = run.manifest["env"], run.manifest["env_kwargs"]
-    mine, own = declared.spec.name, json.loads(json.dumps(declared.spec.kwargs, default=str))
+    mine, own = declared.spec.name, declared.spec.json_kwargs
     if (theirs, kwargs) == (mine, own):
         return
     if theirs == mine:

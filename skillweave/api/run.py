@@ -88,7 +88,9 @@ class Run:
             deterministic: act greedily, else sample. Of a hierarchy it is about the selector;
                 ``greedy_skills`` is about its skills.
             skill: score this skill alone, as if the selector always chose it. The hierarchy's
-                reflexes are in force, also where it was trained without them.
+                reflexes are in force, also where it was trained without them. Returns are the
+                environment's; ``skills`` has its call in each episode, by its own reward and
+                success: from where it may start to its own end.
             num_envs: environments that exist at once; None: at most as many as in training. It
                 does not change the result of a greedy policy.
             max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
@@ -367,4 +369,4 @@ class Run:
             below = policy.skills.policies[policy.labels.index(node)]
             assert isinstance(below, HierarchyPolicy)
             policy = below
-        return SkillAlone(policy.skills, name)
+        return SkillAlone(policy.skills, name, skill)

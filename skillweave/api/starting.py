@@ -61,8 +61,60 @@ def starts(
 
 
 def _place(run: OneRun, argument: str) -> Path:
-    """Return the directory of a run."""
-    return run.path if isinstance(run, Run) else as_path(run, argument)
+    """Return the directory of a run.
+
+    Raises:
+        SkillweaveError: it is a policy, or a file with one; the message says what can be done with
+            it.
+    """
+    if isinstance(run, Run):
+        run = run.path
+    if (use := _use_of(run)) is not None:
+        what, way = use
+        raise SkillweaveError(
+            f"{argument} is {what}, and a training starts only from what a run of Skillweave has "
+            f"learnt: its directory; {way}"
+        )
+    return as_path(run, argument)
+
+
+def _use_of(value: Any) -> tuple[str, str] | None:
+    """What a value is that was learnt elsewhere, and how it can be used; None: it is none."""
+
+    def as_skill(policy: str) -> str:
+        return (
+            "to let it act untrained, make it a skill of a hierarchy: class Ready(sw.Skill): "
+            f"policy = {policy}"
+        )
+
+    if isinstance(value, str | Path) and "\0" not in str(value):
+        path = Path(value)
+        if path.is_dir():
+            return None
+        # Stable-Baselines3 adds the ending where it saves and loads.
+        bare = not path.exists() and path.with_name(f"{path.name}.zip").exists()
+        if path.suffix == ".zip" or bare:
+            zipped = str(path) if path.suffix == ".zip" else f"{path}.zip"
+            return f"the file {zipped}", as_skill(f'sw.from_sb3({zipped!r}, "ppo", trust=True)')
+        if path.suffix == ".onnx":
+            return f"the file {path}", as_skill(f"sw.from_onnx({str(path)!r})")
+        if path.suffix in (".pt", ".pth"):
+            return f"the file {path}", as_skill("the torch module with these weights")
+        if path.suffix == ".safetensors":
+            way = "start from the run that it was written from"
+            return f"the weights file {path}", way
+        return None
+    if hasattr(value, "predict") and hasattr(value, "policy"):  # a model of Stable-Baselines3
+        return f"a {type(value).__name__}", as_skill("sw.from_sb3(model)")
+    if hasattr(value, "state_dict") and not isinstance(value, type):
+        learns = (
+            "; or to train it further, let a function of the observation space return a copy of "
+            "its layers before the last: Network(encoder=function)"
+        )
+        return f"a {type(value).__name__}, a torch module", as_skill("module") + learns
+    if callable(value) or (hasattr(value, "act") and hasattr(value, "start")):
+        return f"{short(value)}, a policy", as_skill("this one")
+    return None
 
 
 def _learnt_by_name(

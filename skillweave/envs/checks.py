@@ -45,6 +45,24 @@ LIKE_METHODS = (
 _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
 
 
+def is_batched(env: object) -> bool:
+    """Whether it is a simulator that steps many environments at once, or its class."""
+    kind = env if isinstance(env, type) else type(env)
+    return issubclass(kind, gym.vector.VectorEnv) or (
+        hasattr(env, "num_envs") and hasattr(env, "step_async")  # Stable-Baselines3's
+    )
+
+
+def refuse_batched(name: str) -> SkillweaveError:
+    """Return the error for an environment that ``is_batched``."""
+    return SkillweaveError(
+        f"{name} steps many environments at once (a VectorEnv), and Skillweave steps each by "
+        "itself, as some stand still while others act; write a gymnasium.Env around a simulator of "
+        "one environment (num_envs=1), and give that: the documentation has its lines, under "
+        "'Robots', 'Simulators that step many at once'"
+    )
+
+
 class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
     """An environment whose errors, and whose wrong answers, are told with its number and its step.
 
@@ -58,6 +76,8 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(self, env: gym.Env[Any, Any], name: str, number: int | None = None) -> None:
+        if is_batched(env):
+            raise refuse_batched(name)
         if not isinstance(env, gym.Env):
             raise SkillweaveError(
                 f"{name} made {short(env)}, which is no environment (no gymnasium.Env)"

@@ -14,13 +14,14 @@ import numpy as np
 
 import skillweave.toys  # registers their ids  # noqa: F401
 from skillweave.arguments import checked_names
-from skillweave.envs.checks import CheckedEnv
+from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
 from skillweave.messages import close_matches, short, shortened, told, whole_number
+from skillweave.reading import as_json
 from skillweave.types import MissingExtra, SkillweaveError
 
 MOST = 65_536
@@ -47,7 +48,8 @@ class EnvSpec:
 
     Args:
         env: a Gymnasium id, or a function that makes one environment.
-        kwargs: passed to ``gymnasium.make``, or to that function; not to ``pool``.
+        kwargs: passed to ``gymnasium.make``, or to that function; not to ``pool``. A run records
+            them, so to train they must be numbers, texts, lists and dicts.
         wrappers: applied to each environment, first one first.
         engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
             environment as Gymnasium defines it, else sync.
@@ -77,6 +79,8 @@ class EnvSpec:
     obs_names: ObsNames | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
+        if is_batched(self.env):
+            raise refuse_batched(short(self.env))
         made = isinstance(self.env, gym.Env)
         if made or not (isinstance(self.env, str) or callable(self.env)):
             raise SkillweaveError(
@@ -160,7 +164,11 @@ class EnvSpec:
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error
             raise SkillweaveError(f"the environment {env_id} needs more: {error}") from error
         except (gym.error.Error, ImportError) as error:
-            why, advice = shortened(str(error)).rstrip("."), close_matches(env_id, gym.registry)
+            entry = gym.registry.get(env_id)
+            if entry is not None and entry.entry_point is None and entry.vector_entry_point:
+                raise refuse_batched(env_id) from error
+            others = gym.registry.keys() - {env_id}
+            why, advice = shortened(str(error)).rstrip("."), close_matches(env_id, others)
             if not advice and ":" not in env_id:
                 advice = (
                     " If a package of its own registers it, install that and import it, or write "
@@ -190,6 +198,31 @@ class EnvSpec:
         if isinstance(self.env, str):
             return self.env
         return str(getattr(self.env, "__name__", type(self.env).__name__))
+
+    @property
+    def json_kwargs(self) -> dict[str, Any]:
+        """``kwargs`` as a run records them.
+
+        Raises:
+            SkillweaveError: one of them cannot be recorded; the message names it and proposes a
+                function.
+        """
+        found = {}
+        for name, value in self.kwargs.items():
+            known = isinstance(self.env, str)
+            call = f"gymnasium.make({self.env!r}, " if known else f"{self._called}("
+            found[name] = as_json(
+                value,
+                f"{self.name}: kwargs[{name!r}]",
+                f"put it into a function, and give that as env: def make(): return {call}"
+                f"{name}=...)",
+            )
+        return found
+
+    @property
+    def _called(self) -> str:
+        """What a message calls the function that makes the environment."""
+        return self.name if self.name.isidentifier() else "your_function"
 
     @property
     def is_data(self) -> bool:
@@ -273,6 +306,12 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
         pool = make(num_envs=1, threads=1, seed=0)
     except MissingExtra:
         return False
+    if isinstance(pool, gym.vector.VectorEnv):
+        raise SkillweaveError(
+            f"{spec.name}: pool made {short(pool)}, a VectorEnv, which steps all its environments "
+            "at once; a pool must step some while the others stand still, as EnvPool does: leave "
+            "out pool, and each environment is stepped by itself"
+        )
     for what in ("observation_space", "action_space"):
         theirs, ours = getattr(pool, what), getattr(reference, what)
         alike = isinstance(theirs, type(ours)) and theirs.shape == ours.shape

@@ -50,8 +50,8 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
         skill.validate()
         check_algorithm(skill.algorithm, f"skill {skill.name!r}: algorithm", optional=True)
         check_target(skill)
-        if inner_of(skill) is None:
-            ready_policy(skill)  # says so where it cannot act
+        if inner_of(skill) is None and ready_policy(skill) is not None:  # says if it cannot act
+            _check_untrained(skill)
     names = [s.name for s in skills]
     for name in names:
         if names.count(name) > 1:
@@ -66,6 +66,23 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
         if name.lower() in reserved:
             raise SkillweaveError(f"a skill cannot be named {name!r}, which names a stage")
     return tuple(skills)
+
+
+_OF_TRAINING = ("algorithm", "steps", "task_weight", "target_return", "target_success")
+"""What of a skill says how it is trained."""
+
+
+def _check_untrained(skill: Skill) -> None:
+    """Raise a SkillweaveError where a skill with a policy says how it is to be trained."""
+    ignored = [field for field in _OF_TRAINING if getattr(skill, field) is not None]
+    if ignored:
+        fields = " and ".join(ignored)
+        raise SkillweaveError(
+            f"skill {skill.name!r} has a policy, so it is not trained, and its {fields} would be "
+            f"ignored: leave out {fields}, or leave out policy to train it. What another run of "
+            "Skillweave has learnt can be trained further: leave out policy, and "
+            f"train(start_from={{{skill.name!r}: run}})"
+        )
 
 
 def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
+from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.hierarchy.guidance import fitted_guide
 from skillweave.hierarchy.nesting import every_skill, inner_hierarchies, inner_of
@@ -29,12 +30,16 @@ def check_settings(declared: Declaration, env: gym.Env[Any, Any], path: str = ""
     for skill in declared.skills:
         if skill.policy is None:
             config = skill.algorithm or declared.algorithm
-            check_spaces(config, space, f"skill {path_of(skill)!r}: ")
+            where = f"skill {path_of(skill)!r}: "
+            check_spaces(config, space, where)
+            read_by(config, env.observation_space, where)
     if isinstance(declared.selector, AlgorithmConfig):
         choices = gym.spaces.Discrete(declared.choices)
         check_spaces(declared.selector, choices, f"{path}{SELECTOR}: ")
+        read_by(declared.selector, env.observation_space, f"{path}{SELECTOR}: ")
     if declared.train_defaults.flat is not None:
         check_spaces(declared.train_defaults.flat, space, "flat: ")
+        read_by(declared.train_defaults.flat, env.observation_space, "flat: ")
     own = (s.algorithm for s in declared.skills)
     for config in (declared.algorithm, declared.selector, declared.train_defaults.flat, *own):
         if isinstance(config, AlgorithmConfig):

@@ -152,10 +152,16 @@ class SkillAlone:
 
     It acts from an episode's start to its end, also where its own initiation set or ends say
     otherwise. Its memory is that of the skill's policy.
+
+    Args:
+        skills: the skill and those beside it.
+        name: of the skill.
+        path: what reports call it; "": its name.
     """
 
-    def __init__(self, skills: SkillSet, name: str) -> None:
+    def __init__(self, skills: SkillSet, name: str, path: str = "") -> None:
         at = [s.name for s in skills.skills].index(name)
+        self.skill, self.path = skills.skills[at], path or name
         self.policy, self.reflexes = skills.policies[at], skills.reflexes
         self.observation_space = self.policy.observation_space
         self.action_space = self.policy.action_space

@@ -12,6 +12,7 @@ from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import who_guides
 from skillweave.hierarchy.nesting import below, every_hierarchy, inner_hierarchies, inner_of
+from skillweave.networks.config import Network
 from skillweave.skills import Skill
 from skillweave.training.scene import (
     Scene,
@@ -200,6 +201,8 @@ def _critic(own: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
         shared |= {f: getattr(own, f) for f in same}
     if "network" in shared:  # the critic remembers nothing
         shared["network"] = replace(shared["network"], rnn=None)
+    elif isinstance(network := getattr(own, "network", None), Network):
+        shared["network"] = Network(planes=network.planes)
     return {CRITIC: SkillCritic(**shared, normalize_obs=own.normalize_obs, deciding=deciding)}
 
 

@@ -58,7 +58,7 @@ def manifest(
     return {
         "kind": "hierarchy",
         "env": declaration.spec.name,
-        "env_kwargs": declaration.spec.kwargs,
+        "env_kwargs": declaration.spec.json_kwargs,
         "seed": seed,
         "checkpoint_every": how.checkpoint_every,
         "eval_every": how.eval_every,

@@ -34,7 +34,7 @@ from skillweave.types import Policy, SkillweaveError
 
 def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Policy) -> None:
     """Write skills and selector, or a plain agent; of ready policies what a run copies too."""
-    place = {"env": declaration.spec.name, "env_kwargs": declaration.spec.kwargs}
+    place = {"env": declaration.spec.name, "env_kwargs": declaration.spec.json_kwargs}
     if isinstance(policy, AgentPolicy):
         weights, description = policy.to_file()
         write_tensors(path, weights, description | place)

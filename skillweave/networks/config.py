@@ -121,7 +121,8 @@ class Network:
     layer_norm: bool = False
     """Normalise each hidden layer before its nonlinearity."""
     cnn: CNN | None = None
-    """How images are encoded; None: CNN() from 36 pixels upwards, CNN.small() below."""
+    """How images are encoded; None: CNN() from 36 pixels upwards, CNN.small() below, with a smaller
+    kernel where an image has less than 3 pixels."""
     rnn: RNN | None = None
     """A memory, for PPO; None: the policy sees one observation at a time."""
     encoder: str | Callable[[Any], Any] | None = None
@@ -136,6 +137,10 @@ class Network:
     """Which numbers of the observation it sees, by their places; None: all. The places are those of
     the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without images,
     which are seen in any case. For a skill that is not to know of the task around it."""
+    planes: Literal["first", "last"] | None = None
+    """Which axis of an image holds its channels, or a board's planes; None: the shape says it, as
+    (8, 8, 111) and (3, 210, 160) do. For the images whose shape does not say it, (3, 3, 3) for
+    example; where each shape does, for all."""
 
     def __post_init__(self) -> None:
         as_tuples(self, "hidden", "sees")
@@ -144,6 +149,7 @@ class Network:
         _widths(self, "hidden")
         _choice(self, "activation", get_args(Activation))
         _choice(self, "layer_norm", (True, False))
+        _choice(self, "planes", ("first", "last", None))
         if self.encoder is not None:
             object.__setattr__(self, "encoder", _encoder(self.encoder))
         if self.sees is not None:

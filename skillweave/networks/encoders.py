@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -97,7 +98,7 @@ class ImageEncoder:
     def __init__(self, obs: ObsCodec, index: int, cnn: CNN | None, activation: Activation) -> None:
         self._obs, self._index = obs, index
         channels, height, width = obs.images[index]
-        self.cnn = cnn or (CNN() if min(height, width) >= 36 else CNN.small())
+        self.cnn = cnn or _usual(min(height, width))
         self._activation = ACTIVATIONS[activation]
         self.shapes: dict[str, tuple[int, ...]] = {}
         self.sizes: list[tuple[int, int]] = []
@@ -115,7 +116,8 @@ class ImageEncoder:
                     raise SkillweaveError(
                         f"Network.cnn does not fit images of {obs.images[index]} (channels, "
                         f"height, width): layer {i} has a kernel of {kernel} pixels, but only "
-                        f"{height}×{width} are left; use CNN.small(), or fewer layers"
+                        f"{height}×{width} are left; leave out cnn, which is then CNN.small() or "
+                        "CNN() as fits, or use smaller kernels or fewer layers"
                     )
                 self._layer(str(i), channels, out, kernel)
                 height, width = ((x - kernel) // stride + 1 for x in (height, width))
@@ -153,6 +155,14 @@ class ImageEncoder:
             for i, stride in enumerate(self.cnn.strides):
                 x = self._activation(_conv(views, str(i), x, stride=stride))
         return x.reshape(batch, members, -1).transpose(0, 1)
+
+
+def _usual(side: int) -> CNN:
+    """Return the CNN for images whose shorter side has so many pixels, if none is given."""
+    if side >= 36:
+        return CNN()
+    small = CNN.small()
+    return replace(small, kernels=tuple(min(side, kernel) for kernel in small.kernels))
 
 
 def _conv(views: Views, name: str, x: Tensor, stride: int = 1, padding: int = 0) -> Tensor:

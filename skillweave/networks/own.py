@@ -238,10 +238,9 @@ def _parts_of(obs: ObsCodec) -> list[_Part]:
     found, start, images = [], 0, 0
     for leaf, space in zip(obs.leaves, _leaf_spaces(obs.space), strict=True):
         if leaf.image is not None:
-            peak = obs.peaks[images]
             low, high = (
-                leaf.image.read(torch.from_numpy(np.asarray(x, np.float32)), torch.Size()) / peak
-                for x in (space.low, space.high)
+                obs.pixels(leaf.image.read(torch.from_numpy(x), torch.Size()), images)
+                for x in (np.asarray(x, np.float64) for x in (space.low, space.high))
             )
             box = gym.spaces.Box(low.numpy(), high.numpy(), dtype=np.float32)
             found.append(_Part(f"image.{images}", box))

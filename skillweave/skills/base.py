@@ -6,12 +6,13 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import Space
 
-from skillweave.arguments import checked_names
+from skillweave.arguments import checked_names, plain
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.skills.answers import answer
@@ -23,6 +24,9 @@ from skillweave.types import Array, SkillweaveError, Step
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
 """What a skill may be named: its name names files, too."""
+
+
+_NUMBERS = ("task_weight", "target_return", "target_success")
 
 
 class Skill:
@@ -135,6 +139,11 @@ class Skill:
                 f"{where}: the name names files too, and {self.name!r} is a device on Windows; "
                 "choose another name"
             )
+        for field in ("max_steps", "steps", "call_steps", *_NUMBERS):
+            value = getattr(self, field)
+            if isinstance(value, np.generic):
+                with suppress(AttributeError):  # of a property
+                    setattr(self, field, plain(value))
         for field in ("max_steps", "steps", "call_steps"):
             value = getattr(self, field)
             if value is not None and (type(value) is not int or value < 1):

@@ -12,10 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.spaces.action_advice import unsupported_action
 from skillweave.spaces.packing import check_size
 from skillweave.types import Array, SkillweaveError
-
-ACTIONS = "Discrete, MultiDiscrete, MultiBinary, Box (of floats)"
 
 
 @dataclass(frozen=True)
@@ -99,6 +98,9 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
     Raises:
         SkillweaveError: the space is not supported; the message says which are.
     """
+    kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary | gym.spaces.Box
+    if not isinstance(space, kinds):
+        raise unsupported_action(space)
     check_size(space, "action", _width(space))
     if not _width(space):
         raise SkillweaveError(f"action space {space} holds nothing to choose")
@@ -110,7 +112,7 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
         return ActionCodec(space, (2,) * int(np.prod(space.shape)))
     if isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating):
         return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
-    raise SkillweaveError(f"action space {space} is not supported; supported are: {ACTIONS}.")
+    raise unsupported_action(space)
 
 
 def _width(space: gym.Space[Any]) -> int:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +16,9 @@ from skillweave.spaces.packing import LARGEST, check_size, obs_dtype, obs_shape,
 from skillweave.types import Array, SkillweaveError
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
+_WIDEST = 2.0**24
+"""The widest range of pixels: bounds further apart are those of a data type, and say nothing."""
+_PICTURE = 36  # sides of what is a picture, and no board
 
 
 def to_tensor(array: Array) -> Tensor:
@@ -35,7 +38,7 @@ class ImageLayout:
 
     stack: tuple[int, ...]  # (S, a, b, c)
     channels_last: bool
-    peak: float  # the value that is 1 to a network
+    sure: bool = field(compare=False)  # whether the shape says where the channels are
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -54,22 +57,53 @@ class ImageLayout:
 def image_layout(space: gym.Space[Any]) -> ImageLayout | None:
     """The layout of a space that is an image, else None.
 
-    Images are Boxes of 3 axes, or of 4 (a stack of frames), of integers or of bounded floats,
-    and matrices of bytes. The shorter of a frame's outer axes is its channels'.
+    Images are Boxes of 3 axes, or of 4 (a stack of frames), with bounds, and matrices of bytes.
+    Where the shape does not say which axis of a frame holds the channels, the layout is not
+    ``sure``, and takes the shorter one of the outer axes.
     """
     if not isinstance(space, gym.spaces.Box):
         return None
-    floats, axes = np.issubdtype(space.dtype, np.floating), len(space.shape)
+    axes = len(space.shape)
     matrix = axes == 2 and space.dtype == np.uint8 and min(space.shape) >= _SMALLEST
-    if not matrix and (axes not in (3, 4) or (floats and not space.is_bounded())):
+    if not matrix and (axes not in (3, 4) or not _has_bounds(space)):
         return None
-    peak = 1.0
-    if space.dtype == np.uint8:
-        peak = 255.0
-    elif np.issubdtype(space.dtype, np.integer):
-        peak = max(1.0, float(space.high.max(initial=1)))
     stack = (1, 1, *space.shape)[-4:]
-    return ImageLayout(stack, stack[3] < stack[1], peak)
+    if matrix:
+        return ImageLayout(stack, False, True)
+    last = _channels_last(*stack[1:])
+    return ImageLayout(stack, stack[3] < stack[1] if last is None else last, last is not None)
+
+
+def _has_bounds(space: gym.spaces.Box) -> bool:
+    """Whether the bounds of a Box are those of its numbers, not of their data type."""
+    if not space.is_bounded():
+        return False
+    span = space.high.astype(np.float64) - space.low.astype(np.float64)
+    return bool((span <= _WIDEST).all())
+
+
+def _channels_last(a: int, b: int, c: int) -> bool | None:
+    """Whether images (a, b, c) have their channels last, by their shape; None: it does not say.
+
+    Of two equal axes and another one, the other one is the channels'. Of three different ones it is
+    the shorter outer one if there are few channels, or if the image is too large for a board.
+    """
+    if a == b != c:
+        return True
+    if b == c != a:
+        return False
+    if a == c:
+        return None
+    channels, longer = min(a, c), max(a, c)
+    side = min(b, longer)
+    if channels > 4:
+        return c < a if side >= max(_PICTURE, 2 * channels) else None
+    squarer = _aspect(b, channels) >= 1.5 * _aspect(b, longer)
+    return c < a if squarer or side >= 2.5 * channels else None
+
+
+def _aspect(a: int, b: int) -> float:
+    return max(a, b) / max(1, min(a, b))
 
 
 @dataclass(frozen=True)
@@ -83,7 +117,13 @@ class _Leaf:
     choices: tuple[int, ...] = ()  # of each entry, where it is to be one-hot
     start: tuple[int, ...] = ()  # first choice of each entry
     image: ImageLayout | None = None
-    high: Array | None = field(default=None, compare=False)  # of an image: the highest numbers
+    bounds: tuple[Array, Array] | None = field(default=None, compare=False)  # of an image
+    name: str = ""  # of the part: ``board``, ``pair.0``; "": it is the whole observation
+
+    def laid_out(self, planes: Literal["first", "last"]) -> _Leaf:
+        """The same leaf, an image, with its channels where ``planes`` says."""
+        assert self.image is not None
+        return replace(self, image=replace(self.image, channels_last=planes == "last", sure=True))
 
     @cached_property
     def size(self) -> int:
@@ -113,7 +153,9 @@ class ObsCodec:
     scaled: bool  # whether the vector has real numbers, which are worth normalising
     item: tuple[int, ...]  # trailing shape of what ``to_tensor`` makes
     leaves: tuple[_Leaf, ...]
-    peaks: tuple[float, ...]  # of each image
+    scales: tuple[PixelScale, ...] = field(compare=False)  # of each image
+    unclear: tuple[str, ...] = ()
+    """The images of which neither their shapes nor a setting say where the channels are."""
 
     def split(self, obs: Tensor | Sequence[Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Raw observations to a vector and images.
@@ -167,23 +209,68 @@ class ObsCodec:
         """The highest number that each pixel of image ``i`` may have, (C, H, W), in its dtype."""
         leaf = [leaf for leaf in self.leaves if leaf.image is not None][i]
         assert leaf.image is not None
-        assert leaf.high is not None
-        return leaf.image.read(torch.from_numpy(leaf.high), torch.Size())
+        assert leaf.bounds is not None
+        return leaf.image.read(torch.from_numpy(leaf.bounds[1]), torch.Size())
 
     def pixels(self, image: Tensor, i: int) -> Tensor:
-        """Image ``i`` as a network takes it: float32, integers scaled to [0, 1]."""
-        peak = self.peaks[i]
-        return image.float() if peak == 1.0 else image.float() / peak
+        """Image ``i`` as a network takes it: float32, scaled to [0, 1] by its bounds."""
+        return self.scales[i](image)
 
 
-def obs_codec(space: gym.Space[Any]) -> ObsCodec:
+class PixelScale:
+    """Pixels scaled to [0, 1] by the bounds of their space, which may differ between pixels.
+
+    Args:
+        low: the lowest number of each pixel, (C, H, W).
+        high: the highest one.
+    """
+
+    def __init__(self, low: Array, high: Array) -> None:
+        low, high = low.astype(np.float64), high.astype(np.float64)
+        span = np.where(high > low, high - low, 1.0)
+        self._same = bool((low == low.flat[0]).all() and (span == span.flat[0]).all())
+        self._low, self._span = float(low.flat[0]), float(span.flat[0])
+        self._each = {
+            torch.device("cpu"): tuple(
+                torch.from_numpy(np.asarray(x, np.float32)) for x in (low, span)
+            )
+        }
+        """By device, the lowest number and the span of each pixel."""
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Pixels (…, C, H, W) of any type as float32."""
+        x = image.float()
+        if not self._same:
+            low, span = self._on(image.device)
+            return (x - low) / span
+        if self._low != 0.0:
+            x = x - self._low
+        return x if self._span == 1.0 else x / self._span
+
+    def _on(self, device: torch.device) -> tuple[Tensor, ...]:
+        if device not in self._each:
+            values = self._each[torch.device("cpu")]
+            self._each[device] = tuple(x.to(device) for x in values)
+        return self._each[device]
+
+
+def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = None) -> ObsCodec:
     """The codec of an observation space.
+
+    Args:
+        planes: which axis holds the channels of the images whose shape does not say it; where each
+            shape says it, of all images. None: the shapes alone count.
 
     Raises:
         SkillweaveError: the space is not supported; the message says which are.
     """
     dtype = obs_dtype(space)
     leaves = tuple(_leaves(space, dtype, None))
+    unclear = [leaf for leaf in leaves if leaf.image is not None and not leaf.image.sure]
+    if planes is not None:
+        again = unclear or [leaf for leaf in leaves if leaf.image is not None]
+        leaves = tuple(leaf.laid_out(planes) if leaf in again else leaf for leaf in leaves)
+        unclear = []
     vectors = [leaf for leaf in leaves if leaf.image is None]
     layouts = [leaf.image for leaf in leaves if leaf.image is not None]
     if not any(leaf.size for leaf in leaves):
@@ -198,16 +285,34 @@ def obs_codec(space: gym.Space[Any]) -> ObsCodec:
         scaled=any(leaf.real for leaf in vectors),
         item=obs_shape(space) if dtype.fields is None else (dtype.itemsize,),
         leaves=leaves,
-        peaks=tuple(layout.peak for layout in layouts),
+        scales=tuple(_scale(leaf) for leaf in leaves if leaf.image is not None),
+        unclear=tuple(_described(leaf) for leaf in unclear),
     )
 
 
-def _leaves(space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None) -> Iterator[_Leaf]:
+def _scale(leaf: _Leaf) -> PixelScale:
+    """The scale of a leaf that is an image."""
+    assert leaf.image is not None
+    assert leaf.bounds is not None
+    values = (np.asarray(x, np.float64) for x in leaf.bounds)
+    low, high = (leaf.image.read(torch.from_numpy(x), torch.Size()).numpy() for x in values)
+    return PixelScale(low, high)
+
+
+def _described(leaf: _Leaf) -> str:
+    """What a message calls a leaf: ``the observation's part board of shape (3, 3, 3)``."""
+    what = f"the observation's part {leaf.name}" if leaf.name else "the observation"
+    return f"{what} of shape {leaf.shape}"
+
+
+def _leaves(
+    space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None, names: tuple[str, ...] = ()
+) -> Iterator[_Leaf]:
     """The leaves of a space whose observations of ``dtype`` lie ``offset`` bytes into the whole."""
     if dtype.fields is not None:
         for name, part in (parts(space) or {}).items():
             field, at = dtype.fields[name][:2]
-            yield from _leaves(part, field.base, (offset or 0) + at)
+            yield from _leaves(part, field.base, (offset or 0) + at, (*names, name))
         return
     shape, place = obs_shape(space), None
     if offset is not None:
@@ -222,7 +327,8 @@ def _leaves(space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None) -> 
         choices,
         start,
         image,
-        None if image is None else space.high,  # type: ignore[attr-defined]
+        None if image is None else (space.low, space.high),  # type: ignore[attr-defined]
+        ".".join(names),
     )
 
 

@@ -63,8 +63,13 @@ def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
     """The dtype of observations; a structured one for Dict and Tuple.
 
     Raises:
-        SkillweaveError: the space is not supported; the message says which are.
+        SkillweaveError: the space is not supported; the message says which are, and what to do.
     """
+    return _dtype(space, space, ())
+
+
+def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> np.dtype[Any]:
+    """The dtype of the part of ``whole`` that has these names."""
     inner = parts(space)
     if inner is None:
         kinds = gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
@@ -76,13 +81,41 @@ def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
                     "wrappers=(lambda env: gymnasium.wrappers.DtypeObservation(env, np.float64),)"
                 )
             return dtype
-        raise SkillweaveError(
-            f"observation space {space} is not supported; supported are: {OBSERVATIONS}. "
-            "A gymnasium wrapper (FlattenObservation, say) can turn other spaces into these."
-        )
-    fields = [(name, obs_dtype(part), obs_shape(part)) for name, part in inner.items()]
+        raise SkillweaveError(_unsupported(space, whole, place))
+    fields = [
+        (name, _dtype(part, whole, (*place, name)), obs_shape(part)) for name, part in inner.items()
+    ]
     # Aligned, so that a part can be read out of the raw bytes without a copy.
     return np.dtype(fields, align=True)
+
+
+def _unsupported(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> str:
+    """A sentence on a space that is not supported, the part of ``whole`` with these names."""
+    part = f"the part {'.'.join(place)} of the observation space" if place else "observation space"
+    shown = " ".join(short(space).split())
+    begin = f"{part} is {shown}, which is not supported; supported are: {OBSERVATIONS}. "
+    wrap, inner = "EnvSpec(env, wrappers=(lambda env: gymnasium.wrappers.{},))", parts(whole) or {}
+    others = [name for name in inner if name != place[0] and _is_supported(inner[name])]
+    if others and isinstance(whole, gym.spaces.Dict):
+        return begin + f"Leave it out: {wrap.format(f'FilterObservation(env, {others})')}"
+    try:
+        flat = gym.spaces.utils.flatten_space(whole)
+    except Exception:  # a space of the user's own
+        flat = None
+    if isinstance(flat, gym.spaces.Box) and flat.shape != (0,):
+        return begin + f"Make a vector of it: {wrap.format('FlattenObservation(env)')}"
+    return begin + (
+        "Let a function make numbers of it: "
+        + wrap.format("TransformObservation(env, function, gymnasium.spaces.Box(...))")
+    )
+
+
+def _is_supported(space: gym.Space[Any]) -> bool:
+    try:
+        obs_dtype(space)
+    except SkillweaveError:
+        return False
+    return True
 
 
 def pack(space: gym.Space[Any], batched: Any) -> Array:

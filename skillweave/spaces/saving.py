@@ -159,7 +159,11 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
     if isinstance(a, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
         plain = {"dtype": None}  # choices are the same whatever the type that holds them
         return space_to_json(a) | plain == space_to_json(b) | plain
-    return image_layout(a) == image_layout(b)
+    layout = image_layout(a)
+    if layout is None or layout != image_layout(b):
+        return layout is None and image_layout(b) is None
+    bounds = ((getattr(a, k), getattr(b, k)) for k in ("low", "high"))
+    return all(np.array_equal(x, y) for x, y in bounds)  # pixels are scaled by them
 
 
 def _dtype_to_json(space: gym.Space[Any]) -> dict[str, Any]:

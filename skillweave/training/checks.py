@@ -10,6 +10,7 @@ import gymnasium as gym
 
 from skillweave.algorithms.config import AlgorithmConfig, OnPolicy
 from skillweave.buffers.ram import check_memory
+from skillweave.envs.checks import is_batched, refuse_batched
 from skillweave.envs.make import EnvSpec
 from skillweave.messages import short
 from skillweave.spaces import obs_dtype, obs_shape
@@ -18,12 +19,16 @@ from skillweave.types import SkillweaveError
 
 def check_env(env: object) -> None:
     """Raise a SkillweaveError where ``env`` cannot be made many times over."""
+    if is_batched(env):
+        raise refuse_batched(short(env))
     made = isinstance(env, gym.Env)
     if made or not (isinstance(env, str | EnvSpec) or callable(env)):
         raise SkillweaveError(
             f"env is {short(env)}; it must be a Gymnasium id, a function that makes an "
             "environment, or an EnvSpec (environments are made many times over)"
         )
+    if isinstance(env, EnvSpec):
+        _ = env.json_kwargs  # says which of them a run cannot record
 
 
 def check_algorithm(value: object, where: str, *, optional: bool = False, also: str = "") -> None:

@@ -19,7 +19,7 @@ from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import told_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
-from skillweave.messages import whole_number
+from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.reading import Count, Positive
 from skillweave.skills.foreign_policy import Foreign
@@ -27,8 +27,8 @@ from skillweave.spaces import same_space
 from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.reflex_tally import ReflexTally
-from skillweave.training.skill_report import SkillReport, SkillTally, all_steps
-from skillweave.training.skill_text import hints, reflex_lines, skill_rows, skill_table
+from skillweave.training.skill_report import SkillReport, all_steps, tally_of
+from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy, SkillweaveError
 
 FIRST_SEED = 1_000_000
@@ -56,6 +56,8 @@ class Evaluation:
     """Episodes that succeeded by ``info["success"]`` of their last step; None: it is not there."""
     reflexes: dict[str, Count] = field(default_factory=dict)
     """Steps in which each reflex acted, by its path."""
+    alone: str | None = None
+    """The skill that acted alone; its report counts one call in each episode. None: all acted."""
 
     def __post_init__(self) -> None:
         if not self.returns or len(self.returns) != len(self.lengths):
@@ -63,6 +65,8 @@ class Evaluation:
                 f"{len(self.returns)} returns and {len(self.lengths)} lengths; every episode has "
                 "one of each, and there is at least one episode"
             )
+        if self.alone is not None and self.alone not in self.skills:
+            raise SkillweaveError(f"no report of the skill that acted alone, {short(self.alone)}")
 
     @property
     def mean(self) -> float:
@@ -96,10 +100,10 @@ class Evaluation:
         returns = np.array(self.returns)
         n = len(returns)
         std = float(returns.std(ddof=1)) if n > 1 else 0.0
-        half = 1.96 * std / np.sqrt(n)
+        half = float(1.96 * std / np.sqrt(n))
         total = all_steps(self.skills)
         skills = {name: report.to_json(total) for name, report in self.skills.items()}
-        return {
+        found = {
             "episodes": n,
             "mean": self.mean,
             "std": std,
@@ -113,7 +117,7 @@ class Evaluation:
             "success_rate": self.success_rate,
             "length_mean": float(np.mean(self.lengths)),
             "cut": self.cut,
-            "skill_usage": {k: v["share"] for k, v in skills.items()},
+            "skill_usage": {k: v["share"] for k, v in skills.items() if k != self.alone},
             "call_length_mean": {k: v["length_mean"] for k, v in skills.items() if v["calls"]},
             "skills": skills,
             "reflexes": {
@@ -121,6 +125,7 @@ class Evaluation:
                 for name, steps in self.reflexes.items()
             },
         }
+        return found if self.alone is None else found | {"skill": self.alone}
 
     def for_people(self) -> str:
         """``str()``, and for a hierarchy a table of its skills, and what looks like a mistake."""
@@ -153,7 +158,9 @@ class Evaluation:
         if self.cut:
             most = f"{max(self.lengths):,} steps (max_steps)"
             line += f"; {self.cut} never ended and were cut after {most}"
-        if self.skills:
+        if self.alone is not None:
+            line += f"; {call_line(self.alone, self.skills[self.alone])}"
+        elif self.skills:
             shares = ", ".join(f"{k} {v:.0%}" for k, v in j["skill_usage"].items())
             line += f"; skills: {shares}"
         return printable(line)
@@ -281,7 +288,8 @@ def _scored(
 ) -> Evaluation:
     """The scores of episodes as they are played."""
     returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
-    tally, reflexes = SkillTally(policy, episodes), ReflexTally(policy)
+    alone, tally = tally_of(policy, episodes)
+    reflexes = ReflexTally(policy)
     success = np.full(episodes, np.nan)
     for played in moments:
         returns[played.episode] += played.reward
@@ -302,6 +310,7 @@ def _scored(
         cut,
         None if np.isnan(success).any() else int(success.sum()),
         reflexes.steps(),
+        alone,
     )
 
 

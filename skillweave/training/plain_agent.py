@@ -8,12 +8,13 @@ from typing import Any
 
 import gymnasium as gym
 
+from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.arguments import checked_names
 from skillweave.envs.make import EnvSpec
 from skillweave.runs.directory import RunDirectory
-from skillweave.spaces import action_codec, obs_codec
+from skillweave.spaces import action_codec
 from skillweave.training.checks import check_algorithm, check_env, check_fields, check_rollout
 from skillweave.training.defaults import TrainDefaults, check_defaults
 from skillweave.training.scene import skill_scene
@@ -75,9 +76,9 @@ class PlainAgent:
         """
         env = self.spec.make()
         try:
-            obs_codec(env.observation_space)
             action_codec(env.action_space)
             check_spaces(self.algorithm, env.action_space, f"{AGENT}: ")
+            read_by(self.algorithm, env.observation_space)
             check_rollout(self.algorithm, env.observation_space)
             return env.observation_space, env.action_space
         finally:
@@ -101,7 +102,7 @@ class PlainAgent:
         return {
             "kind": "agent",
             "env": self.spec.name,
-            "env_kwargs": self.spec.kwargs,
+            "env_kwargs": self.spec.json_kwargs,
             "seed": seed,
             "checkpoint_every": how.checkpoint_every,
             "eval_every": how.eval_every,

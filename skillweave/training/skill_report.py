@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
 from skillweave.collecting.calls import SkillSet, Why, skill_step, skills_below
 from skillweave.reading import Count
-from skillweave.skills import asked
+from skillweave.skills import Skill, asked
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.play import Played
 from skillweave.types import Array, Policy, unprefixed
 
+_MEMORIES = ("chosen", "after")
+"""Fields of a step that hold what a policy remembers."""
 ENDS = {Why.OWN: "own", Why.LIMIT: "limit", Why.INTERRUPTED: "interrupted", Why.EPISODE: "episode"}
 """Why a call ended, as reports name it."""
 
@@ -235,6 +237,104 @@ class SkillTally:
         return int(self._succeeded[i])
 
 
+class CallTally:
+    """Counts what one skill does that acts alone: one call in each episode.
+
+    The call begins where the skill may start, at the episode's start as a rule, and ends by its
+    ``termination``, at its ``max_steps``, or with the episode. The skill acts on after it, but only
+    the call counts: a skill that is called again where its work is done would succeed each time.
+
+    Args:
+        skill: the skill.
+        path: its name in reports.
+        policy: its policy; a hierarchy's own skills are counted, too.
+        episodes: that are played.
+    """
+
+    def __init__(self, skill: Skill, path: str, policy: Policy, episodes: int) -> None:
+        self._skill, self._path = skill, path
+        inner = skills_below(policy) is not None
+        self._below = SkillTally(policy, episodes, f"{path}/") if inner else None
+        self._open, self._done = np.zeros(episodes, bool), np.zeros(episodes, bool)
+        self._elapsed, self._returns = np.zeros(episodes, np.int64), np.zeros(episodes)
+        self._succeeded = 0
+        self._ended = dict.fromkeys(ENDS.values(), 0)
+
+    def add(self, played: Played) -> None:
+        """Count one step of each environment."""
+        waiting = np.flatnonzero(~self._open[played.episode] & ~self._done[played.episode])
+        if len(waiting):
+            obs, where = played.step.obs[waiting], played.rows[waiting]
+            may = asked(self._skill, "initiation", obs, len(waiting), ids=where)
+            self._open[played.episode[waiting[may]]] = True
+        rows = np.flatnonzero(self._open[played.episode])
+        if not len(rows):
+            return
+        episode = played.episode[rows]
+        self._elapsed[episode] += 1
+        elapsed, limit = self._elapsed[episode], self._skill.max_steps
+        own = played.reward[rows]
+        if self._skill.defines("reward"):
+            own = self._asked("reward", played, rows)
+        self._returns[episode] += own
+        why = np.full(len(rows), Why.RUNNING)
+        if limit is not None:
+            why[elapsed >= limit] = Why.LIMIT
+        if self._skill.defines("termination"):
+            why[self._asked("termination", played, rows)] = Why.OWN
+        ended = played.step.terminated[rows] | played.step.truncated[rows]
+        why[ended | (played.over[rows] & (why == Why.RUNNING))] = Why.EPISODE
+        over = np.flatnonzero(why != Why.RUNNING)
+        if self._below is not None:
+            self._below.add(rows_of(played, rows))
+            self._below.cut(episode[over])
+        if not len(over):
+            return
+        for reason, name in ENDS.items():
+            self._ended[name] += int((why == reason).sum())
+        if self._skill.defines("success"):
+            self._succeeded += int(self._asked("success", played, rows[over]).sum())
+        self._open[episode[over]], self._done[episode[over]] = False, True
+
+    def reports(self) -> dict[str, SkillReport]:
+        """The report of the skill by its path; then those of a hierarchy's own skills."""
+        calls = int(self._done.sum())
+        known = not isinstance(self._skill, RecordedSkill)
+        report = SkillReport(
+            int(self._elapsed.sum()), calls, dict(self._ended),
+            self._succeeded if self._skill.defines("success") else None,
+            float(self._returns.sum()) if known else None, calls,
+        )  # fmt: skip
+        below = {} if self._below is None else self._below.reports()
+        return {self._path: report} | below
+
+    def _asked(self, method: str, played: Played, rows: Array) -> Array:
+        """What a method of the skill says about a step of ``rows`` (m,) of those that act."""
+        elapsed = self._elapsed[played.episode[rows]]
+        step = skill_step(played.step, rows, elapsed, self._skill.max_steps)
+        return asked(self._skill, method, step, len(rows), elapsed, played.rows[rows])
+
+
+def tally_of(policy: Policy, episodes: int) -> tuple[str | None, SkillTally | CallTally]:
+    """Return the path of the skill that a policy is alone, or None, and what counts its calls."""
+    skill = getattr(policy, "skill", None)
+    if not isinstance(skill, Skill):
+        return None, SkillTally(policy, episodes)
+    alone: Any = policy
+    return alone.path, CallTally(skill, alone.path, alone.policy, episodes)
+
+
+def rows_of(played: Played, rows: Array) -> Played:
+    """A step of some ``rows`` (m,) of those that act."""
+    if len(rows) == len(played.rows):
+        return played
+    values = {f.name: getattr(played, f.name) for f in fields(played)}
+    step = skill_step(played.step, rows, played.step.elapsed[rows], None)
+    some = {k: v[rows] for k, v in values.items() if isinstance(v, np.ndarray)}
+    memories = {k: values[k] and {n: v[rows] for n, v in values[k].items()} for k in _MEMORIES}
+    return Played(**values | some | memories | {"step": step})
+
+
 def played_below(played: Played, i: int, rows: Array) -> Played:
     """A step of ``rows`` (m,) as it was in the hierarchy that is skill ``i``."""
     assert played.elapsed is not None
@@ -260,7 +360,8 @@ def levels_of(skills: Mapping[str, SkillReport]) -> dict[str, dict[str, SkillRep
 
 def all_steps(skills: Mapping[str, SkillReport]) -> int:
     """Environment steps of all skills, each counted once."""
-    return sum(report.steps for name, report in skills.items() if "/" not in name)
+    top = [name for name in skills if name.rpartition("/")[0] not in skills]
+    return sum(skills[name].steps for name in top)
 
 
 def _ask(

@@ -46,6 +46,19 @@ def skill_table(skills: Mapping[str, SkillReport]) -> str:
     )
 
 
+def call_line(name: str, report: SkillReport) -> str:
+    """Return a part of a sentence on the calls of a skill that acts alone."""
+    if not report.calls:
+        return f"{name} could start nowhere by its initiation()"
+    told = []
+    if report.return_mean is not None:
+        told.append(f"{report.return_mean:,.1f} by its own reward")
+    if report.success_rate is not None:
+        told.append(f"{report.success_rate:.0%} succeed")
+    called = f"{name} alone: {report.calls:,} calls of {report.length_mean:,.0f} steps"
+    return ", ".join([called, *told])
+
+
 def hints(skills: Mapping[str, SkillReport]) -> list[str]:
     """Return a sentence on each thing that looks like a mistake."""
     return [*idle_calls(skills), *late_calls(skills), *hasty_calls(skills)]

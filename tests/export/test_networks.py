@@ -33,6 +33,7 @@ SMALL = Network((8,), cnn=CNN.small())
 REPLAY: dict[str, Any] = {"buffer_size": 100, "network": SMALL, "normalize_obs": True}
 BOX64 = gym.spaces.Box(np.array([-2.0, -np.inf]), np.array([1.0, np.inf]), dtype=np.float64)
 FEW = gym.spaces.Box(0, np.arange(96, dtype=np.uint8).reshape(6, 8, 2) % 7, dtype=np.uint8)
+PLANES = gym.spaces.Box(np.float32(-1), np.arange(1, 106, dtype=np.float32).reshape(3, 5, 7))
 NESTED = gym.spaces.Dict(
     image=gym.spaces.Box(0, 255, (5, 5, 3), np.uint8),
     inner=gym.spaces.Tuple(
@@ -82,6 +83,9 @@ CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
     ),
     "ppo, an encoder of the user's own": (
         PPO(network=Network((8,), encoder=Watching)), NESTED, ASKS["Discrete"][0]
+    ),
+    "ppo, a board with its planes last": (
+        PPO(network=Network((8,), planes="last")), PLANES, ASKS["Discrete"][0]
     ),
     "dqn, impala": (
         DQN(**REPLAY | {"network": Network((8,), cnn=CNN.impala((4,)))}),

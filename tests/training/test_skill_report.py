@@ -414,8 +414,14 @@ def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():
     assert found["nested"].return_sum == 2.0 * found["nested"].steps > 0
     assert sum(found["nested"].ended.values()) == found["nested"].calls
     alone = evaluate(SkillAlone(outer.skills, "nested"), EnvSpec(Walk), episodes=20)
-    assert alone == evaluate(inner, EnvSpec(Walk), episodes=20)
-    assert set(alone.skills) == {"paid", "lucky", "zigzag"}
+    bare = evaluate(inner, EnvSpec(Walk), episodes=20)
+    assert (alone.returns, alone.lengths) == (bare.returns, bare.lengths)
+    assert list(alone.skills) == ["nested", "nested/paid", "nested/lucky", "nested/zigzag"]
+    report, *below = alone.skills.values()
+    assert report.calls == 20 > report.ended["episode"]
+    assert report.return_sum == 2.0 * report.steps == 2.0 * sum(x.steps for x in below)
+    for own in below:
+        assert sum(own.ended.values()) == own.calls
 
 
 def test_where_no_reward_is_defined_it_is_the_environments():

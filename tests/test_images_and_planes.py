@@ -1,0 +1,276 @@
+"""Images and boards: how networks read them, by their spaces or by ``Network.planes``."""
+
+import json
+from itertools import count
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete
+
+import skillweave as sw
+
+BYTES, REALS = np.uint8, np.float32
+
+
+class Shows(gym.Env):
+    """Shows random observations of a space, and the highest and lowest ones."""
+
+    action_space = Discrete(2)
+
+    def __init__(self, space, length=8):
+        self.observation_space, self.length = space, length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        if seed is not None:
+            self.observation_space.seed(seed)
+        return self.see(), {}
+
+    def see(self):
+        if not isinstance(self.observation_space, Box):
+            return self.observation_space.sample()
+        space = self.observation_space
+        if not space.is_bounded() or space.high.max() > 1e6:
+            return self.np_random.integers(9, size=space.shape).astype(space.dtype)
+        return (space.low, space.high)[self.t].copy() if self.t < 2 else space.sample()
+
+    def step(self, action):
+        self.t += 1
+        return self.see(), 1.0, False, self.t == self.length, {}
+
+
+class Recorder(torch.nn.Module):
+    """Records what a network gets."""
+
+    spaces: ClassVar[list] = []
+    seen: ClassVar[list] = []
+
+    def __init__(self, space):
+        super().__init__()
+        self.spaces.append(space)
+        self.flat = torch.nn.Flatten()
+
+    def forward(self, obs):
+        self.seen.append(obs)
+        parts = obs.values() if isinstance(obs, dict) else [obs]
+        return torch.cat([self.flat(x)[:, :4] for x in parts], 1)
+
+
+def settings(**network):
+    return sw.PPO(num_envs=2, n_steps=8, network=sw.Network((4,), **network))
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Return the space that a trained network gets, and what it gets in an evaluation."""
+    numbers = count()
+
+    def of(space, **network):
+        Recorder.spaces.clear()
+        how = settings(encoder=Recorder, **network)
+        spec = sw.EnvSpec(lambda: Shows(space), workers=1)
+        run = sw.train_agent(spec, how, 16, tmp_path / f"{next(numbers)}", quiet=True)
+        Recorder.seen.clear()
+        assert run.evaluate(2, quiet=True).mean == 8
+        return Recorder.spaces[0], list(Recorder.seen)
+
+    return of
+
+
+CHANNELS = np.array([1.0, 10.0, 255.0], REALS)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Box(0, 1, (8, 8, 3), REALS),
+        Box(0, 255, (8, 8, 3), REALS),
+        Box(-1, 1, (3, 8, 8), np.float64),
+        Box(0, 1, (8, 8, 3), BYTES),
+        Box(0, 7, (8, 8, 3), np.int64),
+        Box(-1, 1, (8, 8, 3), np.int8),
+        Box(-0.5 * CHANNELS * np.ones((8, 8, 3), REALS), CHANNELS * np.ones((8, 8, 3), REALS)),
+        Box(np.zeros((3, 8, 8), BYTES), np.ones((3, 8, 8), BYTES) * 9, dtype=BYTES),
+    ],
+    ids=str,
+)
+def test_bounded_images_are_scaled_by_their_bounds(read, space):
+    asked, values = read(space)
+    assert asked == Box(0, 1, (3, 8, 8), REALS)
+    seen = torch.cat([v.flatten(1) for v in values])
+    assert float(seen.min()) == 0.0
+    assert float(seen.max()) == 1.0
+    assert seen.isfinite().all()
+
+
+def test_each_channel_is_scaled_by_its_own_bounds(read):
+    low = np.array([0, -5, 10], REALS) * np.ones((6, 6, 3), REALS)
+    _, values = read(Box(low, low + CHANNELS))
+    seen = torch.cat([v.transpose(0, 1).flatten(1) for v in values], 1)
+    assert seen.min(1).values.tolist() == [0, 0, 0]
+    assert seen.max(1).values.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Box(-np.inf, np.inf, (8, 8, 3), REALS),
+        Box(np.finfo(REALS).min, np.finfo(REALS).max, (8, 8, 3), REALS),
+        Box(0, np.iinfo(np.int64).max, (8, 8, 3), np.int64),
+    ],
+    ids=["none", "of float32", "of int64"],
+)
+def test_bounds_that_say_nothing_leave_numbers_to_be_normalised(read, space):
+    asked, _ = read(space)
+    assert asked == Box(-np.inf, np.inf, (8, 8, 3), REALS)  # as of vectors
+
+
+SURE = {
+    (84, 84, 4): (4, 84, 84),
+    (4, 84, 84): (4, 84, 84),
+    (7, 7, 3): (3, 7, 7),
+    (210, 160, 3): (3, 210, 160),
+    (3, 210, 160): (3, 210, 160),
+    (64, 48, 1): (1, 64, 48),
+    (84, 96, 12): (12, 84, 96),
+    (4, 64, 64, 3): (12, 64, 64),
+    (6, 7, 2): (2, 6, 7),
+    (20, 10, 4): (4, 20, 10),
+    (4, 4, 6): (6, 4, 4),
+    (6, 4, 4): (6, 4, 4),
+    (8, 8, 111): (111, 8, 8),
+    (119, 8, 8): (119, 8, 8),
+    (19, 19, 17): (17, 19, 19),
+    (2, 2, 5): (5, 2, 2),
+}
+UNCLEAR = [
+    (3, 3, 3), (7, 7, 7), (3, 4, 5), (5, 4, 3), (8, 10, 27), (27, 10, 8), (9, 10, 14), (4, 8, 16),
+    (8, 7, 8), (84, 84, 3, 4),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("shape", "channels_first"), SURE.items(), ids=str)
+def test_the_shape_says_where_the_planes_are(read, shape, channels_first):
+    assert read(Box(0, 1, shape, BYTES))[0].shape == channels_first
+
+
+@pytest.mark.parametrize("shape", UNCLEAR, ids=str)
+def test_a_shape_that_says_nothing_is_refused_with_the_setting(tmp_path, shape):
+    run = tmp_path / "run"
+    with pytest.raises(sw.SkillweaveError) as error:
+        sw.train_agent(lambda: Shows(Box(0, 1, shape, BYTES)), settings(), 16, run, quiet=True)
+    assert f"the observation of shape {shape} may have its planes" in str(error.value)
+    assert 'PPO(network=Network(planes="first")), or planes="last"' in str(error.value)
+    assert not run.exists()
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 5), (5, 3, 3), (8, 10, 27)], ids=str)
+def test_the_setting_says_it(read, shape):
+    a, b, c = shape
+    for planes, wanted in (("first", (a, b, c)), ("last", (c, a, b))):
+        assert read(Box(0, 1, shape, REALS), planes=planes)[0].shape == wanted
+
+
+def test_the_setting_counts_for_the_images_of_which_it_is_not_known(read):
+    space = Dict(board=Box(0, 1, (5, 6, 7), BYTES), camera=Box(0, 255, (9, 9, 3), BYTES))
+    with pytest.raises(sw.SkillweaveError, match=r"the observation's part board of shape \(5, 6"):
+        read(space)
+    asked, _ = read(space, planes="first")
+    assert {k: part.shape for k, part in asked.items()} == {"board": (5, 6, 7), "camera": (3, 9, 9)}
+
+
+class Win(sw.Skill):
+    algorithm = sw.PPO(num_envs=2, n_steps=8, network=sw.Network((4,), planes="last"))
+
+
+def test_a_selector_is_refused_before_its_skills_are_trained(tmp_path):
+    def make():
+        return Shows(Box(0, 1, (5, 6, 7), BYTES))
+
+    declared = sw.Hierarchy(make, [Win()], learn="apart", steps=64)
+    with pytest.raises(sw.SkillweaveError, match="selector: the observation of shape"):
+        declared.train(tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "selector",
+    [Win.algorithm, sw.DQN(num_envs=2, learning_starts=8, network=Win.algorithm.network)],
+    ids=["PPO", "DQN"],
+)
+def test_the_critic_of_skills_reads_boards_as_the_selector_does(tmp_path, selector):
+    declared = sw.Hierarchy(
+        lambda: Shows(Box(0, 1, (5, 6, 7), BYTES)), [Win()], selector=selector, steps=64
+    )
+    run = declared.train(tmp_path / "run", quiet=True)
+    assert run.evaluate(2, quiet=True).mean == 8
+
+
+def test_a_critic_of_its_own_reads_boards_as_the_actor_does():
+    sw.PPO(network=sw.Network(planes="last"), critic=sw.Network(planes="last"))
+    sw.PPO(network=sw.Network(planes="last"), critic=sw.Network())
+    with pytest.raises(sw.SkillweaveError, match="planes of network counts for both"):
+        sw.PPO(critic=sw.Network(planes="first"))
+
+
+def test_no_other_word_says_where_planes_are():
+    with pytest.raises(sw.SkillweaveError, match="must be one of first, last, None"):
+        sw.Network(planes="middle")
+
+
+def test_a_run_remembers_the_setting(tmp_path):
+    def make():
+        return Shows(Box(0, 3, (5, 6, 7), BYTES))
+
+    run = sw.train_agent(make, settings(planes="last"), 16, tmp_path / "run", quiet=True)
+    manifest = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert manifest["stages"][0]["algorithm"]["network"]["planes"] == "last"
+    again = sw.Agent(make, settings(planes="last"), 16).load(tmp_path / "run")
+    assert again.evaluate(3, quiet=True).returns == run.evaluate(3, quiet=True).returns
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 5])
+def test_the_usual_network_fits_boards_of_any_size(tmp_path, side):
+    space = Box(0, 1, (side, side + 7, 12) if side > 2 else (side, side, 12), BYTES)
+    planes = {"planes": "last"} if side > 2 else {}
+    run = sw.train_agent(lambda: Shows(space), settings(**planes), 16, tmp_path / "r", quiet=True)
+    assert run.evaluate(1, quiet=True).mean == 8
+
+
+class Board(gym.Env):
+    """Asks whether a piece of plane 1 and one of plane 4 share a cell, eight times an episode."""
+
+    action_space = Discrete(2)
+
+    def __init__(self, last):
+        self.last = last
+        self.observation_space = Box(0, 1, (3, 3, 6) if last else (6, 3, 3), BYTES)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.see(), {}
+
+    def see(self):
+        board = np.zeros((9, 6), BYTES)
+        one, other = self.np_random.choice(9, 2, replace=False)
+        self.yes = int(self.np_random.integers(2))
+        board[one, 1], board[one if self.yes else other, 4] = 1, 1
+        board = board.reshape(3, 3, 6)
+        return board if self.last else np.ascontiguousarray(board.transpose(2, 0, 1))
+
+    def step(self, action):
+        reward, self.t = float(action == self.yes), self.t + 1
+        return self.see(), reward, False, self.t == 8, {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("last", [True, False])
+def test_a_relation_between_planes_is_learnt(tmp_path, last):
+    how = sw.PPO(num_envs=32, n_steps=32, gamma=0.5, network=sw.Network((64,), "relu"))
+    run = sw.train_agent(lambda: Board(last), how, 40_000, tmp_path / "run", quiet=True)
+    assert run.evaluate(50, quiet=True).mean > 7.5  # chance: 4

@@ -1,0 +1,149 @@
+"""What was learnt elsewhere acts as a skill; no training pretends to continue it."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+import skillweave as sw
+
+SMALL = sw.PPO(num_envs=2, n_steps=8)
+
+
+def right(obs):
+    return np.ones(len(obs), np.int64)
+
+
+def module():
+    torch.manual_seed(0)
+    return torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 2))
+
+
+POLICIES = {"function": right, "module": module(), "policy": sw.from_function(right)}
+TRAINING = {
+    "algorithm": SMALL,
+    "steps": 100,
+    "task_weight": 0.5,
+    "target_return": 10.0,
+}
+
+
+def declare(*skills):
+    return sw.Hierarchy("CartPole-v1", skills, algorithm=SMALL, selector=SMALL, steps=32)
+
+
+@pytest.mark.parametrize("field", TRAINING)
+@pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
+def test_a_skill_with_a_policy_takes_no_settings_of_training(policy, field):
+    skill = type("Cloned", (sw.Skill,), {"policy": policy, field: TRAINING[field]})()
+    with pytest.raises(sw.SkillweaveError, match=f"'cloned' has a policy.* its {field} would be"):
+        declare(skill)
+
+
+def test_all_settings_that_would_be_ignored_are_named():
+    class Cloned(sw.Skill):
+        algorithm = SMALL
+        steps = 100
+        target_success = 0.5
+
+        def policy(self, obs):
+            return right(obs)
+
+        def success(self, step):
+            return step.terminated
+
+    with pytest.raises(sw.SkillweaveError, match="algorithm and steps and target_success would"):
+        declare(Cloned())
+
+
+def test_what_a_ready_skill_says_of_its_calls_stays():
+    class Ready(sw.Skill):
+        policy = module()
+        max_steps = 3
+        call_steps = 2
+
+        def reward(self, step):
+            return step.reward
+
+    assert declare(Ready()).skills[0].max_steps == 3
+
+
+def test_a_ready_skill_of_another_run_takes_none_either(tmp_path):
+    run = sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", quiet=True)
+    with pytest.raises(sw.SkillweaveError, match=r"'moves' has a policy.* its steps would be"):
+        declare(run.as_skill("moves", steps=10))
+
+
+class Model:
+    """As a model of Stable-Baselines3."""
+
+    policy = module()
+    observation_space = None
+
+    def predict(self, obs):
+        return right(obs)
+
+
+ELSEWHERE = {
+    "zip": ("models/best.zip", r"policy = sw.from_sb3\('models/best.zip', \"ppo\", trust=True\)"),
+    "onnx": ("models/best.onnx", r"policy = sw.from_onnx\('models/best.onnx'\)"),
+    "pt": ("models/best.pt", "policy = the torch module with these weights"),
+    "weights": ("models/best.safetensors", "start from the run that it was written from"),
+    "model": (Model(), r"policy = sw.from_sb3\(model\)"),
+    "module": (module(), r"policy = module; or to .*Network\(encoder=function\)"),
+    "function": (right, "policy = this one"),
+}
+
+
+@pytest.mark.parametrize(("value", "way"), ELSEWHERE.values(), ids=ELSEWHERE)
+@pytest.mark.parametrize("named", [False, True])
+def test_start_from_shows_the_way_of_what_is_no_run(tmp_path, value, way, named):
+    start, argument = ({"agent": value}, r"start_from\['agent'\]") if named else (value, "start_")
+    with pytest.raises(sw.SkillweaveError, match=f"{argument}.*only from what a run.*{way}"):
+        sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", start_from=start, quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_stable_baselines_leaves_out_the_ending(tmp_path):
+    (tmp_path / "best.zip").write_bytes(b"")
+    with pytest.raises(sw.SkillweaveError, match=r"best.zip', \"ppo\""):
+        sw.train_agent("CartPole-v1", SMALL, 16, start_from=tmp_path / "best", quiet=True)
+
+
+def test_a_folder_may_be_called_anything(tmp_path):
+    there = tmp_path / "first.zip"
+    sw.train_agent("CartPole-v1", SMALL, 16, there, quiet=True)
+    sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", start_from=there, quiet=True)
+
+
+LEARNT = module()
+
+
+def body(space):
+    """Return what stands before the last layer, as start_from's message proposes."""
+    return copy.deepcopy(LEARNT[:-1])
+
+
+def test_a_module_learns_on_as_an_encoder(tmp_path):
+    how = sw.PPO(num_envs=2, n_steps=8, network=sw.Network((), encoder=body), normalize_obs=False)
+    run = sw.train_agent("CartPole-v1", how, 16, tmp_path / "run", quiet=True)
+    weights = run.policy.weights
+    name = next(k for k in weights if k.startswith("actor.encoder") and weights[k].ndim == 2)
+    moved = (weights[name] - LEARNT[0].weight).abs().max()
+    assert 0 < moved < 0.1
+
+
+@pytest.mark.slow
+def test_a_zip_of_stable_baselines_acts_as_proposed(tmp_path, monkeypatch):
+    sb3 = pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(tmp_path)
+    model = sb3.PPO("MlpPolicy", "CartPole-v1", n_steps=64)
+    model.save("best.zip")
+    with pytest.raises(sw.SkillweaveError) as error:
+        sw.train_agent("CartPole-v1", SMALL, 16, "run", start_from="best.zip", quiet=True)
+    proposal = str(error.value).partition("skill of a hierarchy: ")[2]
+    space = {"sw": sw}
+    exec(proposal.replace("): policy", "):\n    policy"), space)
+    run = declare(space["Ready"]()).train("run", quiet=True)
+    assert run.evaluate(1, quiet=True).mean > 0

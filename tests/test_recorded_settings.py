@@ -1,0 +1,172 @@
+"""Settings are recorded in a run as JSON: NumPy's numbers are converted, anything else is named."""
+
+import dataclasses
+import enum
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import skillweave as sw
+
+SMALL = sw.PPO(num_envs=2, n_steps=8)
+
+
+class Arena(gym.Env):
+    """Is made with anything."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, sizes=None):
+        self.sizes = sizes
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.t += 1
+        return (
+            self.observation_space.sample(),
+            float(self.sizes is not None),
+            False,
+            self.t == 5,
+            {},
+        )
+
+
+class Stay(sw.Skill):
+    pass
+
+
+class Colour(enum.Enum):
+    RED = 1
+
+
+def train(path, value, kind):
+    spec = sw.EnvSpec(Arena, kwargs={"sizes": value}, workers=1)
+    if kind == "agent":
+        return sw.train_agent(spec, SMALL, 16, path, quiet=True)
+    how = {"algorithm": SMALL, "selector": SMALL, "steps": 16}
+    return sw.Hierarchy(spec, [Stay()], **how).train(path, quiet=True)
+
+
+ODD = {
+    "object": object(),
+    "array": np.zeros(2),
+    "class": Arena,
+    "lambda": lambda: 1,
+    "path": Path("maps"),
+    "set": {1},
+    "enum": Colour.RED,
+    "bytes": b"a",
+    "nan": float("nan"),
+    "infinity": np.float32("inf"),
+    "key": {1: 2},
+    "inside": {"a": [1, (2, object())]},
+}
+
+
+@pytest.mark.parametrize("kind", ["agent", "hierarchy"])
+@pytest.mark.parametrize("value", ODD.values(), ids=ODD)
+def test_what_no_run_can_record_is_named_before_training(tmp_path, value, kind):
+    with pytest.raises(sw.SkillweaveError) as error:
+        train(tmp_path / "run", value, kind)
+    place = "kwargs['sizes']['a'][1][1] is" if isinstance(value, dict) and "a" in value else ""
+    assert f"Arena: {place or 'kwargs[' + repr('sizes') + '] is'}" in str(error.value)
+    assert "give that as env: def make(): return Arena(sizes=...)" in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("value", [object(), np.zeros(2), {1: 2}], ids=["object", "array", "key"])
+def test_the_function_that_is_proposed_trains(tmp_path, value):
+    def make():
+        return Arena(sizes=value)
+
+    run = sw.train_agent(make, SMALL, 16, tmp_path / "run", quiet=True)
+    assert run.evaluate(1, quiet=True).mean == 5
+
+
+def test_of_a_registered_environment_gymnasiums_make_is_proposed(tmp_path):
+    spec = sw.EnvSpec("CartPole-v1", kwargs={"max_episode_steps": np.array(7)})
+    with pytest.raises(sw.SkillweaveError, match=r"return gymnasium.make\('CartPole-v1', max_ep"):
+        sw.train_agent(spec, SMALL, 16, tmp_path / "run", quiet=True)
+
+    def make():
+        return gym.make("CartPole-v1", max_episode_steps=7)
+
+    run = sw.train_agent(make, SMALL, 16, tmp_path / "run", quiet=True)
+    assert max(run.evaluate(5, quiet=True).lengths) <= 7
+
+
+def test_to_evaluate_anything_may_make_an_environment():
+    right = sw.from_function(lambda obs: np.ones(len(obs), np.int64))
+    spec = sw.EnvSpec(Arena, kwargs={"sizes": object()})
+    assert sw.evaluate(right, spec, episodes=1).mean == 5
+
+
+SAME = {
+    "whole": (np.int64(3), 3),
+    "real": (np.float32(0.1), float(np.float32(0.1))),
+    "flag": (np.bool_(True), True),
+    "text": (np.str_("a"), "a"),
+    "tuple": ((1, 2), [1, 2]),
+    "inside": ({"a": (1, np.int32(2))}, {"a": [1, 2]}),
+    "none": (None, None),
+}
+
+
+@pytest.mark.parametrize(("value", "recorded"), SAME.values(), ids=SAME)
+def test_what_json_can_hold_is_recorded(tmp_path, value, recorded):
+    train(tmp_path / "run", value, "agent")
+    manifest = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert manifest["env_kwargs"] == {"sizes": recorded}
+    spec = sw.EnvSpec(Arena, kwargs={"sizes": value}, workers=1)
+    sw.Agent(spec, SMALL, 16).load(tmp_path / "run")  # the same environment
+
+
+def test_settings_take_numpys_numbers(tmp_path):
+    how = sw.PPO(
+        num_envs=np.int64(2),
+        n_steps=np.int32(8),
+        gamma=np.float32(0.5),
+        learning_rate=np.float64(1e-3),
+        normalize_obs=np.bool_(False),
+        network=sw.Network((np.int64(4), np.int64(3))),
+    )
+    assert (how.gamma, how.network.hidden) == (0.5, (4, 3))
+
+    class Counted(sw.Skill):
+        max_steps = np.int64(5)
+        steps = np.int64(16)
+        task_weight = np.float32(0.5)
+
+    declared = sw.Hierarchy(
+        "CartPole-v1", [Counted()], call_steps=np.int64(3), steps=np.int64(32), algorithm=how,
+        selector=how, learn="apart", together=sw.Together(task_weight=np.float64(0.5)),
+    )  # fmt: skip
+    run = declared.train(tmp_path / "run", seed=np.int64(1), quiet=True)
+    assert run.info()["stages"][0]["budget"] == 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Own(sw.PPO):
+    """Settings of an algorithm of the user's own."""
+
+    table: tuple[int, ...] = ()
+
+
+def test_a_setting_of_an_own_algorithm_is_named(tmp_path):
+    from skillweave.algorithms.ppo import PPOAlgorithm
+
+    own = type("OwnAlgorithm", (PPOAlgorithm,), {"action_spaces": (gym.spaces.Discrete,)})
+    sw.register_algorithm(Own, own)
+    how = Own(num_envs=2, n_steps=8, table=np.zeros(3))
+    with pytest.raises(sw.SkillweaveError, match=r"Own.table is array\(.*record a name"):
+        sw.train_agent("CartPole-v1", how, 16, tmp_path / "run", quiet=True)
+    how = dataclasses.replace(how, table=(np.int64(1), 2))
+    sw.train_agent("CartPole-v1", how, 16, tmp_path / "run", quiet=True)

@@ -1,0 +1,302 @@
+"""Spaces and simulators that are not supported: the error shows a way, and the way works."""
+
+import dataclasses
+import re
+
+import gymnasium
+import gymnasium as gym
+import numpy
+import numpy as np
+import pytest
+from gymnasium.spaces import (
+    Box,
+    Dict,
+    Discrete,
+    Graph,
+    MultiBinary,
+    MultiDiscrete,
+    OneOf,
+    Sequence,
+    Text,
+    Tuple,
+)
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+import skillweave as sw
+
+SMALL = sw.PPO(num_envs=2, n_steps=8)
+REALS = Box(np.float32([-1, -3]), np.float32([1, 5]))
+
+
+class World(gym.Env):
+    """Has any spaces, and sees that each action is in its own."""
+
+    def __init__(self, observation_space=REALS, action_space=Discrete(2)):  # noqa: B008
+        self.observation_space, self.action_space = observation_space, action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.t += 1
+        return self.observation_space.sample(), 1.0, False, self.t == 5, {}
+
+
+def refused(tmp_path, env):
+    """Return the message of the error that training raises before it makes a run."""
+    with pytest.raises(sw.SkillweaveError) as error:
+        sw.train_agent(env, SMALL, 16, tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+    return str(error.value)
+
+
+def followed(tmp_path, env, message, function=None):
+    """Train by the wrapper that a message shows."""
+    assert "\n" not in message
+    code = message[message.index("EnvSpec(") :].replace("Box(...)", "Box(0, 1, (2,), 'float32')")
+    names = {
+        "EnvSpec": sw.EnvSpec, "env": env, "gymnasium": gymnasium, "numpy": numpy,
+        "function": function,
+    }  # fmt: skip
+    spec = dataclasses.replace(eval(code, names), workers=1)
+    run = sw.train_agent(spec, SMALL, 48, tmp_path / "run", quiet=True)
+    assert run.evaluate(2, quiet=True).mean == 5
+
+
+WHOLE = {
+    "two": Box(0, 3, (2,), np.int64),
+    "bytes": Box(0, 255, (2,), np.uint8),
+    "no axis": Box(-3, 3, (), np.int32),
+    "one": Box(-1, 4, (1,), np.int16),
+    "matrix": Box(0, 3, (2, 2), np.int8),
+    "different": Box(np.array([0, -2]), np.array([5, 9]), dtype=np.int64),
+    "flags": Box(0, 1, (2,), bool),
+}
+JOINED = {
+    "choices": Dict(a=Discrete(3), b=Discrete(2, start=4)),
+    "numbers": Dict(x=REALS, y=Box(0, 1, (), np.float32)),
+    "both": Dict(move=Discrete(3), force=REALS),
+    "tuple of one": Tuple((Discrete(3),)),
+    "nested": Tuple((REALS, Dict(g=MultiBinary(3), h=MultiDiscrete([2, 3], start=[1, 1])))),
+    "matrices": Tuple((MultiBinary((2, 2)), MultiDiscrete([[2, 3], [4, 5]]))),
+    "whole and real": Dict(a=Box(0, 3, (2,), np.int64), b=REALS),
+    "without bounds": Dict(a=Box(-np.inf, np.inf, (2,), np.float32), d=Discrete(2)),
+}
+
+
+@pytest.mark.parametrize("space", (WHOLE | JOINED).values(), ids=WHOLE | JOINED)
+def test_a_wrapper_for_actions_is_shown_and_works(tmp_path, space):
+    def env():
+        return World(action_space=space)
+
+    followed(tmp_path, env, refused(tmp_path, env))
+
+
+@pytest.mark.parametrize(
+    "space",
+    [Box(0, 10**6, (2,), np.int64), Text(3), Sequence(REALS), Dict(t=Text(3), b=REALS)],
+    ids=["many", "text", "sequence", "dict"],
+)
+def test_of_other_actions_a_function_is_asked_for(tmp_path, space):
+    message = refused(tmp_path, lambda: World(action_space=space))
+    assert "gymnasium.wrappers.TransformAction(env, function, gymnasium.spaces.Box(" in message
+
+
+def test_each_value_of_a_whole_number_can_be_chosen(tmp_path):
+    taken = set()
+
+    class Notes(World):
+        def step(self, action):
+            taken.add(tuple(action.tolist()))
+            return super().step(action)
+
+    def env():
+        return Notes(action_space=Box(np.array([0, -1]), np.array([1, 1]), dtype=np.int64))
+
+    message = refused(tmp_path, env)
+    assert "MultiDiscrete([2, 3], start=[0, -1])" in message
+    followed(tmp_path, env, message)
+    assert taken == {(a, b) for a in (0, 1) for b in (-1, 0, 1)}
+
+
+SHOWN = {
+    "text": (Text(5), "FlattenObservation"),
+    "one of": (OneOf([REALS, Discrete(3)]), "FlattenObservation"),
+    "sequence": (Sequence(REALS), "TransformObservation"),
+    "graph": (Graph(REALS, Discrete(2)), "TransformObservation"),
+    "text in a dict": (Dict(a=REALS, b=Text(3)), r"FilterObservation\(env, \['a'\]\)"),
+    "sequence below": (
+        Dict(a=Dict(x=REALS, y=Sequence(REALS)), c=Discrete(2)),
+        r"the part a\.y.*FilterObservation\(env, \['c'\]\)",
+    ),
+    "text alone in a dict": (Dict(b=Text(3)), "FlattenObservation"),
+    "text in a tuple": (Tuple((REALS, Text(3))), "the part 1.*FlattenObservation"),
+    "sequence in a tuple": (Tuple((REALS, Sequence(REALS))), "TransformObservation"),
+}
+
+
+@pytest.mark.parametrize(("space", "way"), SHOWN.values(), ids=SHOWN)
+def test_a_wrapper_for_observations_is_shown_and_works(tmp_path, space, way):
+    def env():
+        return World(observation_space=space)
+
+    message = refused(tmp_path, env)
+    assert re.search(way, message), message
+    followed(tmp_path, env, message, lambda obs: np.zeros(2, np.float32))
+
+
+class Mission(gym.Space):
+    """A space of the user's own, as MiniGrid's missions are."""
+
+    def __init__(self):
+        super().__init__(dtype=str)
+
+    def sample(self, mask=None, probability=None):
+        return "go to the door"
+
+    def contains(self, x):
+        return isinstance(x, str)
+
+
+def test_a_space_of_the_users_own_is_left_out(tmp_path):
+    space = Dict(direction=Discrete(4), image=Box(0, 255, (7, 7, 3), np.uint8), mission=Mission())
+
+    def env():
+        return World(observation_space=space)
+
+    message = refused(tmp_path, env)
+    assert "the part mission of the observation space" in message
+    followed(tmp_path, env, message)
+
+
+def test_minigrid_trains_as_proposed(tmp_path):
+    pytest.importorskip("minigrid")
+    name = "MiniGrid-Empty-5x5-v0"
+    message = refused(tmp_path, name)
+    code = message[message.index("EnvSpec(") :]
+    spec = eval(code, {"EnvSpec": sw.EnvSpec, "env": name, "gymnasium": gymnasium})
+    sw.train_agent(dataclasses.replace(spec, workers=1), SMALL, 16, tmp_path / "run", quiet=True)
+
+
+# Simulators that step many environments at once
+
+
+class Batched(VectorEnv):
+    """Steps all its environments, and resets those that end in the same step."""
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, num_envs=4):
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = REALS, Discrete(2)
+        self.observation_space = gym.vector.utils.batch_space(REALS, num_envs)
+        self.action_space = gym.vector.utils.batch_space(Discrete(2), num_envs)
+
+    def reset(self, *, seed=None, options=None):
+        self.t = np.zeros(self.num_envs, int)
+        return self.see(), {}
+
+    def see(self):
+        return np.stack([self.t, self.t], 1).astype(np.float32)
+
+    def step(self, action):
+        self.t += 1
+        over, last = self.t == 5, self.see()
+        self.t[over] = 0
+        reward = np.ones(self.num_envs)
+        return self.see(), reward, np.zeros(self.num_envs, bool), over, {"final_obs": last}
+
+
+def batched():
+    return Batched()
+
+
+gym.register("BatchedForTests-v0", entry_point=None, vector_entry_point=Batched)
+GIVEN = {
+    "class": Batched,
+    "instance": Batched(),
+    "function": batched,
+    "lambda": lambda: Batched(2),
+    "gymnasium's": lambda: gym.make_vec("CartPole-v1", num_envs=2),
+    "id": "BatchedForTests-v0",
+}
+
+
+@pytest.mark.parametrize("env", GIVEN.values(), ids=GIVEN)
+def test_a_batched_simulator_is_refused_with_a_way(tmp_path, env):
+    message = refused(tmp_path, env)
+    assert "steps many environments at once" in message
+    assert "write a gymnasium.Env around a simulator of one environment (num_envs=1)" in message
+    with pytest.raises(sw.SkillweaveError, match="many environments at once"):
+        sw.EnvSpec(env).make()
+
+
+def test_a_pool_that_steps_all_at_once_is_refused(tmp_path):
+    def pool(num_envs, threads, seed):
+        return Batched(num_envs)
+
+    message = refused(tmp_path, sw.EnvSpec(World, pool=pool))
+    assert "must step some while the others stand still" in message
+    sw.train_agent(sw.EnvSpec(World), SMALL, 16, tmp_path / "run", quiet=True)  # without pool
+
+
+class One(gym.Env):
+    """One environment of a simulator, as the documentation writes it."""
+
+    def __init__(self):
+        self.simulator = Batched(num_envs=1)
+        self.observation_space = self.simulator.single_observation_space
+        self.action_space = self.simulator.single_action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        obs, _ = self.simulator.reset(seed=seed, options=options)
+        return obs[0], {}
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.simulator.step(np.asarray(action)[None])
+        if "final_obs" in info:
+            obs = info["final_obs"]
+        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+
+def test_one_environment_of_a_simulator_trains(tmp_path):
+    run = sw.train_agent(One, SMALL, 48, tmp_path / "run", quiet=True)
+    assert run.evaluate(3, quiet=True).returns == (5.0,) * 3
+
+
+# Starts
+
+
+@pytest.mark.parametrize("name", ["options", "reset_options", "initial_state", "start_states"])
+def test_other_starts_are_a_wrapper(name):
+    for ask in (
+        lambda **more: sw.EnvSpec("CartPole-v1", **more),
+        lambda **more: sw.train_agent("CartPole-v1", SMALL, 16, **more),
+        lambda **more: sw.evaluate(None, "CartPole-v1", **more),
+    ):
+        with pytest.raises(sw.SkillweaveError, match=f"no .* {name!r}: episodes start where"):
+            ask(**{name: {"low": -0.1}})
+    with pytest.raises(sw.SkillweaveError, match="'options': is 'skills' meant"):
+        sw.Hierarchy("CartPole-v1", options=[])
+
+
+class Wide(gym.Wrapper):
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed, options={"low": 0.03, "high": 0.04})
+
+
+def test_a_wrapper_starts_episodes_elsewhere(tmp_path):
+    seen = []
+
+    def note(obs):
+        seen.append(obs[:, 0].copy())
+        return np.zeros(len(obs), np.int64)
+
+    spec = sw.EnvSpec("CartPole-v1", wrappers=(Wide,))
+    sw.evaluate(sw.from_function(note), spec, episodes=4, max_steps=1)
+    assert (np.concatenate(seen) > 0.029).all()
+    sw.train_agent(spec, SMALL, 16, tmp_path / "run", quiet=True)
