@@ -260,7 +260,7 @@ class EpisodeProgress:
             self._draw(now)
             return
         told = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
-        print(f"{self._name}: {told}", file=sys.stderr, flush=True)
+        say(f"{self._name}: {told}")
         self._pause = max(PLAIN_PATIENCE, SPREAD * (now - self._begun))
 
     def _draw(self, now: float) -> None:
