@@ -21,8 +21,8 @@ import torch
 from scripts.torture.processes import run_cases
 from scripts.torture.report import Tally, table
 
-PARTS = ("files", "kills", "disk", "code")
-COUNTS = {"files": 100_000, "kills": 1_000, "disk": 1_000, "code": 10_000}
+PARTS = ("files", "kills", "disk", "code", "surroundings")
+COUNTS = {"files": 100_000, "kills": 1_000, "disk": 1_000, "code": 10_000, "surroundings": 360}
 SMALL = {"files": 150, "kills": 10, "disk": 8}
 """Cases in ``make test``, of these samples and kinds."""
 FEW = {
