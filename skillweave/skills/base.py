@@ -25,7 +25,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 """What a skill may be named: its name names files, too."""
 
 
-_NUMBERS = ("task_weight", "target_return", "target_success")
+_OF_TRAINING = ("steps", "task_weight", "target_return", "target_success")
 
 
 class Skill:
@@ -133,7 +133,7 @@ class Skill:
             raise SkillweaveError(
                 f"{where}: the name names files too; use letters, digits, '_' and '-', at most 64"
             )
-        for field in ("max_steps", "steps", "call_steps", *_NUMBERS):
+        for field in ("max_steps", "call_steps", *(_OF_TRAINING if self.policy is None else ())):
             value = getattr(self, field)
             if isinstance(value, np.generic):
                 with suppress(AttributeError):  # of a property
