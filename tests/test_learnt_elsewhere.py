@@ -69,6 +69,41 @@ def test_what_a_ready_skill_says_of_its_calls_stays():
     assert declare(Ready()).skills[0].max_steps == 3
 
 
+class Trains(sw.Skill):
+    algorithm = SMALL
+    steps = 16
+
+    def reward(self, step):
+        return step.reward
+
+
+def test_a_policy_that_comes_later_takes_the_place_of_a_training():
+    class Ready(Trains):
+        policy = right
+
+    later = Trains()
+    later.policy = right
+    for skill in (Ready(), later):
+        declared = declare(skill)
+        assert not declared.any_skill_learns
+        declared.scale(0.5)
+        declared.validate()
+
+
+def test_settings_that_come_later_are_refused_too():
+    class Ready(sw.Skill):
+        policy = right
+
+    class Further(Ready):
+        algorithm = SMALL
+
+    later = Ready()
+    later.steps = 100
+    for skill, field in ((Further(), "algorithm"), (later, "steps")):
+        with pytest.raises(sw.SkillweaveError, match=f"its {field} would be ignored"):
+            declare(skill)
+
+
 def test_a_ready_skill_of_another_run_takes_none_either(tmp_path):
     run = sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", quiet=True)
     with pytest.raises(sw.SkillweaveError, match=r"'moves' has a policy.* its steps would be"):

@@ -65,7 +65,8 @@ def scale_budgets(declared: Declaration, factor: float, *, inner: bool = False) 
         return None if steps is None else max(1, round(steps * factor))
 
     for skill in declared.skills:
-        skill.steps = scaled(skill.steps)
+        if skill.policy is None:
+            skill.steps = scaled(skill.steps)
     for _, below in inner_hierarchies(declared.skills):
         scale_budgets(below, factor, inner=True)
     declared.steps = scaled(declared.steps or (None if inner else DEFAULT_STEPS))

@@ -73,8 +73,17 @@ _OF_TRAINING = ("algorithm", "steps", "task_weight", "target_return", "target_su
 
 
 def _check_untrained(skill: Skill) -> None:
-    """Raise a SkillweaveError where a skill with a policy says how it is to be trained."""
-    ignored = [field for field in _OF_TRAINING if getattr(skill, field) is not None]
+    """Raise a SkillweaveError where a skill with a policy says how it is to be trained.
+
+    A policy that is given later (to the object, or in a subclass) takes the place of a training:
+    what was said of it before is no mistake.
+    """
+    given = _distance(skill, "policy")
+    ignored = [
+        field
+        for field in _OF_TRAINING
+        if given and getattr(skill, field) is not None and _distance(skill, field) <= given
+    ]
     if ignored:
         fields = " and ".join(ignored)
         raise SkillweaveError(
@@ -83,6 +92,12 @@ def _check_untrained(skill: Skill) -> None:
             "Skillweave has learnt can be trained further: leave out policy, and "
             f"train(start_from={{{skill.name!r}: run}})"
         )
+
+
+def _distance(skill: Skill, field: str) -> int:
+    """Where a skill's field is set: 0 on the object, 1 in its class, more in those above."""
+    places = [vars(skill), *map(vars, type(skill).__mro__)]
+    return next((i for i, names in enumerate(places) if field in names), len(places))
 
 
 def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:

@@ -36,10 +36,8 @@ from skillweave import (
 from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
 
 X, Y, VX, VY, ANGLE, SPIN, LEGS = 0, 1, 2, 3, 4, 5, slice(6, 8)
-LEG = slice(8, 12)
-"""The leg that is flown now, one-hot."""
 TO_DO = slice(8, 20)
-"""All legs that are still to be done."""
+"""The legs that are still to be done, in their order, each one-hot."""
 MISSIONS: dict[str, tuple[tuple[str, ...], ...]] = {
     "land": (("land",),),
     "hover": (("hover", "land"),),
@@ -238,9 +236,20 @@ def with_skills(
 
 
 def by_leg(obs: Array) -> Array:
-    """The skill of the leg that is flown now, (N,) by name: the selector as one would write it."""
-    names = np.array(["go_left", "go_right", "hover", "land"])
-    named: Array = names[obs[:, LEG].argmax(axis=1)]
+    """The skill of the leg that is flown now, (N,) by name: the selector as one would write it.
+
+    Where that skill may not start, as the lander is there already, it is that of the next leg; and
+    where all is done, the lander hovers.
+    """
+    n, skills = len(obs), [GoLeft(), GoRight(), Hover(), Land()]
+    may = np.stack([skill.initiation(obs) for skill in skills], axis=1)
+    legs = obs[:, TO_DO].reshape(n, -1, len(KINDS)) > 0
+    found = np.full(n, KINDS.index("hover"))
+    for leg in reversed(range(legs.shape[1])):
+        kind = legs[:, leg].argmax(axis=1)
+        able = legs[:, leg].any(axis=1) & may[np.arange(n), kind]
+        found = np.where(able, kind, found)
+    named: Array = np.array([skill.name for skill in skills])[found]
     return named
 
 

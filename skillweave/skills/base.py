@@ -26,7 +26,7 @@ DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
 """What a skill may be named: its name names files, too."""
 
 
-_NUMBERS = ("task_weight", "target_return", "target_success")
+_OF_TRAINING = ("steps", "task_weight", "target_return", "target_success")
 
 
 class Skill:
@@ -139,7 +139,7 @@ class Skill:
                 f"{where}: the name names files too, and {self.name!r} is a device on Windows; "
                 "choose another name"
             )
-        for field in ("max_steps", "steps", "call_steps", *_NUMBERS):
+        for field in ("max_steps", "call_steps", *(_OF_TRAINING if self.policy is None else ())):
             value = getattr(self, field)
             if isinstance(value, np.generic):
                 with suppress(AttributeError):  # of a property

@@ -91,9 +91,11 @@ def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...])
 
 def _unsupported(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> str:
     """A sentence on a space that is not supported, the part of ``whole`` with these names."""
-    part = f"the part {'.'.join(place)} of the observation space" if place else "observation space"
     shown = " ".join(short(space).split())
-    begin = f"{part} is {shown}, which is not supported; supported are: {OBSERVATIONS}. "
+    what = f"observation space {shown}"
+    if place:
+        what = f"the part {'.'.join(place)} of the observation space, {shown},"
+    begin = f"{what} is not supported; supported are: {OBSERVATIONS}. "
     wrap, inner = "EnvSpec(env, wrappers=(lambda env: gymnasium.wrappers.{},))", parts(whole) or {}
     others = [name for name in inner if name != place[0] and _is_supported(inner[name])]
     if others and isinstance(whole, gym.spaces.Dict):

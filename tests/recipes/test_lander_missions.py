@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from benchmarks.pay.lander_missions import suite
-from skillweave import Apart, Selection, SkillweaveError, Step
+from skillweave import Apart, EnvSpec, Selection, SkillweaveError, Step
 from skillweave.recipes import _missions as world
 from skillweave.recipes import lander_missions as missions
 
@@ -309,6 +311,71 @@ def test_the_selector_by_hand_calls_the_skill_of_the_leg():
     progress.left[:, 0] = np.arange(4)
     obs = progress.seen(np.stack([lander(SKY)] * 4), np.arange(4))
     assert missions.by_leg(obs).tolist() == ["go_left", "go_right", "hover", "land"]
+
+
+def test_the_selector_by_hand_chooses_a_skill_that_may_start_on_any_mission():
+    every = [m for n in (1, 2, 3) for m in itertools.product(world.KINDS, repeat=n)]
+    skills = {skill().name: skill() for skill in missions.SKILLS}
+    for mission in every:
+        progress = world.Progress(1, [mission], gusts=False)
+        progress.begin(ONE, [np.random.default_rng(0)])
+        for done in range(len(mission) + 1):
+            progress.left[0] = [*progress.left[0, 1:], -1] if done else progress.left[0]
+            for place in (SKY, LEFT, RIGHT, ABOVE, PAD):
+                obs = progress.seen(lander(place)[None], ONE)
+                (chosen,) = missions.by_leg(obs)
+                assert skills[chosen].initiation(obs).all(), (mission, done, place)
+                leg = mission[done] if done < len(mission) else "hover"
+                there = {"left": LEFT, "right": RIGHT}.get(leg) == place
+                assert there or chosen.endswith(leg)
+
+
+class Glider(gym.Env):
+    """Flies level, and lands where it is told to on the pad."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (8,), np.float32)
+    action_space = gym.spaces.Discrete(4)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.uniform(-0.1, 0.1), 0
+        return lander((self.x, 0.7)), {}
+
+    def step(self, action):
+        self.x += {1: -0.05, 3: 0.05}.get(int(action), 0.0)
+        self.t += 1
+        rests = action == 2
+        obs = lander((self.x, 0.0 if rests else 0.7))
+        return obs, world.RESTED if rests else 0.0, bool(rests), self.t == 400, {}
+
+
+def glides(point, last):
+    """A policy that flies to a point, and then takes the action ``last``."""
+
+    def policy(obs):
+        way = point - obs[:, missions.X]
+        return np.where(np.abs(way) < 0.06, last, np.where(way < 0, 1, 3))
+
+    return policy
+
+
+@pytest.mark.fast_cases(2)
+@pytest.mark.parametrize(
+    "mission",
+    [("hover", "right"), ("right", "left", "hover"), ("left", "left"), ("hover",),
+     ("left", "right", "left"), ("left", "right", "land")],
+    ids="-".join,
+)  # fmt: skip
+def test_any_mission_is_flown_by_hand(mission, tmp_path):
+    policies = {
+        "hover": glides(0.0, 0), "go_left": glides(-0.5, 0), "go_right": glides(0.5, 0),
+        "land": glides(0.0, 2),
+    }  # fmt: skip
+    found = missions.with_skills("tour", policies, selector=missions.by_leg)
+    found.env = EnvSpec(lambda: world.Mission(Glider(), [mission]))
+    score = found.train(tmp_path / "run", quiet=True).evaluate(3, quiet=True)
+    assert score.success_rate == 1.0
+    assert score.mean == pytest.approx(1.0)
 
 
 def test_landers_in_envpool_and_in_gymnasium_have_the_same_missions():
