@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.messages import short, told
+from skillweave.notices import notice
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import (
     LARGEST_REWARD,
@@ -103,6 +104,16 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if type(info) is not dict:
             self._check_info(info)
         return obs, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Release it; what goes wrong is told, and costs nothing that was learnt."""
+        try:
+            super().close()
+        except (Exception, SystemExit) as error:
+            notice(
+                f"{self._name}: close() raised {told(error)}. What was learnt is kept; what the "
+                "environment holds may not have been released"
+            )
 
     def _number_of(self, reward: Any) -> float:
         try:

@@ -20,6 +20,7 @@ from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.messages import whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.reading import Count, Positive
+from skillweave.seeding import Seeds, global_generators
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.training.play import Played, SeededEpisodes, play
@@ -207,6 +208,20 @@ def evaluate(
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = whole_number(num_envs, "num_envs", 1)
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
+    with global_generators(Seeds(seed) / "evaluation"):
+        return _evaluate(policy, spec, episodes, seed, deterministic, n, limit, watch)
+
+
+def _evaluate(
+    policy: Policy,
+    spec: EnvSpec,
+    episodes: int,
+    seed: int,
+    deterministic: bool,
+    n: int,
+    limit: int | None,
+    watch: Callable[[Played], None] | None,
+) -> Evaluation:
     longest, threshold, pooled = _about(spec)
     envs = make_engine(spec, episodes if pooled else min(n, episodes))
     try:
