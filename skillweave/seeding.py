@@ -6,9 +6,13 @@ so no generator's state has to be saved for a run to resume exactly.
 
 from __future__ import annotations
 
+import random
+import sys
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -55,3 +59,68 @@ class Seeds:
 
         state = self._sequence().generate_state(1, np.uint64)
         return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+
+
+# The global generators of Python, NumPy and torch. The library draws from none of them, but
+# environments may.
+
+
+def seed_global_generators(seeds: Seeds) -> None:
+    """Seed ``random``, ``numpy.random`` and torch's generator of the CPU."""
+    python, numpy, of_torch = seeds.integers(3)
+    random.seed(python)
+    np.random.seed(numpy)  # noqa: NPY002
+    if "torch" in sys.modules:
+        sys.modules["torch"].default_generator.manual_seed(of_torch)
+
+
+def global_generators_state() -> dict[str, Any]:
+    """Return the states of the global generators, by their modules' names."""
+    found: dict[str, Any] = {"random": random.getstate(), "numpy.random": np.random.get_state()}  # noqa: NPY002
+    if "torch" in sys.modules:
+        found["torch"] = sys.modules["torch"].default_generator.get_state()
+    return found
+
+
+@contextmanager
+def global_generators(seeds: Seeds) -> Iterator[None]:
+    """Seed the global generators; after the block they stand where they stood before it."""
+    before = global_generators_state()
+    seed_global_generators(seeds)
+    try:
+        yield
+    finally:
+        random.setstate(before["random"])
+        np.random.set_state(before["numpy.random"])  # noqa: NPY002
+        if "torch" in before:
+            sys.modules["torch"].default_generator.set_state(before["torch"])
+
+
+class GlobalDraws:
+    """Notices which global generators are drawn from, in the first ``looks`` looks."""
+
+    def __init__(self, looks: int) -> None:
+        self.looks = looks
+        """Looks that are left."""
+        self._before: dict[str, bytes] = {}
+
+    def begin(self) -> None:
+        """Remember where the generators stand."""
+        self._before = _fingerprints()
+
+    def end(self) -> list[str]:
+        """Return the generators that were drawn from since ``begin``, by their modules' names."""
+        self.looks -= 1
+        now = _fingerprints()
+        return [name for name, before in self._before.items() if now[name] != before]
+
+
+def _fingerprints() -> dict[str, bytes]:
+    """Return bytes that change whenever a global generator is drawn from."""
+    states = global_generators_state()
+    _, key, *place = states["numpy.random"]
+    found = {"random": repr(hash(states["random"])).encode()}
+    found["numpy.random"] = key.tobytes() + repr(place).encode()
+    if "torch" in states:
+        found["torch"] = states["torch"].numpy().tobytes()
+    return found

@@ -15,12 +15,15 @@ from skillweave.api.continuing import prepared, to_continue
 from skillweave.api.run import Run
 from skillweave.api.starting import Spaces, StartFrom, starts
 from skillweave.collecting.cluster import Ray
+from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.collecting.where import HERE, Where
+from skillweave.envs.make import EnvSpec
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import copied, every_hierarchy
 from skillweave.messages import absolute, as_path, short, shown_path
+from skillweave.notices import collected_notices
 from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
@@ -30,6 +33,7 @@ from skillweave.runs.manifest import identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
+from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
 from skillweave.training.callback import Callback, TrainCallback, check_callback
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
@@ -87,8 +91,9 @@ def begin(
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
-    spaces = _plan(declared, content, evolve, cluster)
     with _surroundings(), called_by(caller_of(declared)), ExitStack() as stack:
+        stack.enter_context(collected_notices())  # they are told by the progress, later
+        spaces = _plan(declared, content, evolve, cluster)
         if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
             own, told = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
@@ -177,7 +182,9 @@ def _plan(
     _check(cluster)
     if cluster is not None and cluster.collectors is not None:
         spec = replace(spec, workers=cluster.collectors)
-    assign_workers(content["stages"], spec)
+    assign_workers(content["stages"], spec, declared)
+    if cluster is None and any(stage["workers"] > 1 for stage in content["stages"]):
+        _must_not_run_again(spec)
     for stage in content["stages"]:
         acts: Any = action_space
         if stage["decides"] in stage["learns"] and isinstance(declared, Declaration):
@@ -198,6 +205,15 @@ def _surroundings() -> Iterator[None]:
         yield
 
 
+def _must_not_run_again(spec: EnvSpec) -> None:
+    """Raise a SkillweaveError where processes would run the program again that starts them."""
+    if not why_no_processes() and (why := runs_again()):
+        raise SkillweaveError(
+            f"{spec.name} is to be stepped in {spec.workers} processes, but {why}\n"
+            "Or have one process: EnvSpec(workers=1)"
+        )
+
+
 def go_on(
     declared: Hierarchy | Agent,
     run: RunDirectory,
@@ -216,10 +232,12 @@ def go_on(
         stack.enter_context(called_by(caller_of(declared)))
         stack.callback(run.close)
         run.begin()
+        notices = stack.enter_context(collected_notices())
         progress = stack.enter_context(Progress(quiet=quiet))
         progress.plan(run.manifest["stages"])
         if note:
             progress.message(note)
+        notices.tell_by(progress.message)
         trackers = make_trackers(run.manifest.get("track", ()), run)
         for tracker in trackers:
             stack.callback(tracker.close)
@@ -229,7 +247,8 @@ def go_on(
         make = _where(cluster, run, progress, stack)
         learner = make_learner(run.manifest["stages"], evolve, make)
         try:
-            policy = training.train(declared, run, listeners, learner)
+            with global_generators(Seeds(int(run.manifest["seed"])) / "global"):
+                policy = training.train(declared, run, listeners, learner)
         except KeyboardInterrupt:
             raise Interrupted(f"{saved_words(run)}. Continue: {resume_words(run)}") from None
     return Run(declared_of(declared, run), run.path, policy)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,7 +15,7 @@ from skillweave.collecting.restored import check_numbers, opened
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import info_numbers
 from skillweave.experience import Experience
-from skillweave.seeding import Seeds
+from skillweave.seeding import Seeds, seed_global_generators
 from skillweave.skills.info_words import info_keys
 from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
@@ -140,6 +141,8 @@ class Collector:
         Raises:
             SkillweaveError: the state is another collector's.
         """
+        # Environments that draw from global generators go on otherwise than they began.
+        seed_global_generators(Seeds(_checksum(state)) / "global")
         kept = unprefixed("kept", state)
         for name, own in self.kept.items():
             found = kept[name]
@@ -217,6 +220,14 @@ class Collector:
     def memory(self) -> Array | None:
         """(N, M), what the learners remember; None: nothing."""
         return self.kept["memory"] if self.kept["memory"].shape[1] else None
+
+
+def _checksum(state: Mapping[str, Array]) -> int:
+    """Return a number that follows from all arrays of a state."""
+    found = 0
+    for array in state.values():
+        found = zlib.crc32(array.tobytes(), found)
+    return found
 
 
 _OF_LEARNERS = {"memory", "before"}

@@ -8,6 +8,8 @@ import numpy as np
 
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected, Collector, side_by_side
+from skillweave.collecting.start_methods import runs_again, why_no_processes
+from skillweave.notices import notice
 from skillweave.seeding import Seeds
 from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
 
@@ -120,9 +122,14 @@ def make_collectors(
     """
     if workers <= 1:
         return Collectors([make(num_envs, 0)], members)
+    each = share_of(num_envs, workers, members, name)
+    if why := why_no_processes() or runs_again():
+        notice(
+            f"{name}: its {workers} collectors work in this process, one after another, as {why}"
+        )
+        return Collectors([make(each, i * each) for i in range(workers)], members)
     from skillweave.collecting.processes import ProcessCollectors
 
-    each = share_of(num_envs, workers, members, name)
     return ProcessCollectors(make, each, workers, members, name)
 
 

@@ -1,7 +1,7 @@
 """Collectors in processes of their own: environments step and policies act there.
 
-A process is asked for a whole rollout at a time. Parameters go to it as messages, columns come
-back in shared memory. One that dies is made again (``workers``).
+A process is asked for a whole rollout at a time (``channel``). One that dies is made again
+(``workers``). One whose parent dies ends itself (``worker_process``).
 """
 
 from __future__ import annotations
@@ -9,30 +9,34 @@ from __future__ import annotations
 import multiprocessing as mp
 import os
 import signal
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
-from multiprocessing.shared_memory import SharedMemory
+from contextvars import copy_context
+from multiprocessing.connection import wait
 from time import monotonic
 from typing import Any
 
-from skillweave.collecting.shared_columns import ColumnWriter, SharedColumns
+from skillweave.collecting.channel import Channel, channels
 from skillweave.collecting.shipping import packed, unpacked
+from skillweave.collecting.start_methods import GUARD
+from skillweave.collecting.worker_process import work
 from skillweave.collecting.workers import (
     MakeStanding,
-    Station,
     WorkerCollectors,
     WorkerLost,
     Workers,
+    environments_of,
 )
 from skillweave.messages import told
+from skillweave.notices import notice
 from skillweave.types import SkillweaveError
 
 PATIENCE = 1.0
 """Seconds that workers have to end by themselves when they are closed."""
-LOOK = 1.0
-"""Seconds between looks of a waiting worker at whether its parent lives."""
+SILENCE = 60.0
+"""Seconds without an answer after which people are told; twice as long each time."""
 
 
 class _Maker:
@@ -54,47 +58,91 @@ class ProcessWorker:
     Args:
         each: its environments.
         number: of the worker.
+        who: what messages call it.
     """
 
-    def __init__(self, make: MakeStanding, each: int, number: int) -> None:
-        self._make, self._each, self._number = make, each, number
-        self._context = mp.get_context()
+    def __init__(self, make: MakeStanding, each: int, number: int, who: str) -> None:
+        self._make, self._each, self._number, self._who = make, each, number, who
+        self._context: Any = mp.get_context()
         self.process: Any = None
-        self.pipe: Any = None
-        self._memory: SharedMemory | None = None  # where its columns come
+        self.channel: Channel | None = None
+        self._answered = False  # this process, at least once
+        self._asked, self._since = "", 0.0
+        self._silence, self._told = SILENCE, False
 
     def begin(self) -> None:
-        """Start the process, which makes the collector."""
-        ours, theirs = self._context.Pipe()
-        about = self._number, _Maker(self._make), self._each, theirs, ours
-        self.pipe = ours
-        name = f"collector-{self._number}"
-        self.process = self._context.Process(target=_work, args=about, name=name, daemon=True)
-        self.process.start()
-        theirs.close()
+        """Start the process, which makes the collector.
+
+        Raises:
+            SkillweaveError: the system does not let it start.
+        """
+        try:
+            _in_starter(self._start)
+        except OSError as error:
+            raise SkillweaveError(
+                f"{self._who} could not be started: {told(error)}. The system limits descriptors "
+                "(ulimit -n), processes (ulimit -u) and memory: raise the limit, or have fewer "
+                "processes, EnvSpec(workers=...)"
+            ) from error
+        self._answered = False
+        self._expect("making its environments")
+
+    def _start(self) -> None:
+        """Start the process; no other is started meanwhile, which would keep ends of its pipe."""
+        self.channel, theirs = channels(self._context)
+        serves = self._context.get_start_method() == "forkserver"
+        self.process = self._context.Process(
+            target=work,
+            args=(
+                self._number, _Maker(self._make), self._each, theirs, self.channel,
+                None if serves else os.getpid(),
+            ),
+            name=f"collector-{self._number}",
+            daemon=True,
+        )  # fmt: skip
+        try:
+            self.process.start()
+        finally:
+            theirs.close()
 
     def send(self, what: str, task: Any) -> None:
-        """Ask for something."""
+        """Ask for something.
+
+        Raises:
+            WorkerLost: the process has ended.
+            SkillweaveError: it runs, but the task cannot be sent.
+        """
+        assert self.channel is not None
+        self._expect(_described(what, task))
         try:
-            self.pipe.send((what, task))
-        except OSError:
+            self.channel.send((what, task))
+        except (BrokenPipeError, ConnectionResetError):
             raise WorkerLost(self._end()) from None
+        except Exception as error:
+            raise SkillweaveError(
+                f"{self._who}: its next task ({self._asked}) could not be sent: {told(error)}"
+            ) from error
 
     def receive(self) -> Any:
-        """The next answer."""
+        """The next answer; arrays of an experience are good until the next task."""
+        assert self.channel is not None
+        pipe = self.channel.pipe
         try:
-            while not self.pipe.poll():
+            while not pipe.poll():
                 # A pipe whose other end is gone is ready too; another may still hold that end.
-                wait([self.pipe, self.process.sentinel])
-                if not self.pipe.poll() and not self.process.is_alive():
+                until = None if self._told else self._since + self._silence - monotonic()
+                wait([pipe, self.process.sentinel], until)
+                if not pipe.poll() and not self.process.is_alive():
                     raise EOFError
-            error, answer = self.pipe.recv()
+                self._tell_silence()
+            error, answer, notices = self.channel.receive(views=True)
         except (EOFError, OSError):
             raise WorkerLost(self._end()) from None
+        self._answered = True
+        for text in notices:
+            notice(text)
         if error is not None:
             raise SkillweaveError(error)
-        if isinstance(answer, SharedColumns):
-            self._memory, answer = answer.read(self._memory)
         return answer
 
     def release(self) -> None:
@@ -102,31 +150,92 @@ class ProcessWorker:
         close_all([self])
 
     def forget(self) -> None:
-        """Let go of its memory and its pipe."""
-        if self.pipe is not None:
-            self.pipe.close()
-            self.pipe = None
-        if self._memory is not None:
-            with suppress(BufferError):  # somebody still looks at it; it goes with them
-                self._memory.close()
-            self._memory = None
+        """Let go of its pipe and its memory."""
+        if self.channel is not None:
+            self.channel.close()
+            self.channel = None
+
+    def _expect(self, asked: str) -> None:
+        self._asked, self._since, self._told = asked, monotonic(), False
+
+    def _tell_silence(self) -> None:
+        """Tell people once that there is no answer for long."""
+        if self._told or monotonic() - self._since < self._silence:
+            return
+        notice(
+            f"{self._who} (process {self.process.pid}) has not answered for {self._silence:.0f} s; "
+            f"it is {self._asked}. If its environments are not as slow as that, one of them hangs: "
+            f"py-spy dump --pid {self.process.pid} shows where. Ctrl-C stops the run"
+        )
+        self._silence, self._told = 2 * self._silence, True
 
     def _end(self) -> str:
         """How its process ended, as people say it."""
         self.process.join(PATIENCE)
         code = self.process.exitcode
-        if code is None or code >= 0:
-            return f"died with exit code {code}"
-        how = f"died by signal {-code} ({signal.strsignal(-code)})"
-        return how + (", perhaps because memory ran out" if -code == signal.SIGKILL else "")
+        if code is None:
+            return f"closed its connection while it was {self._asked}"
+        if code < 0:
+            return f"{_by_signal(-code)} while it was {self._asked}"
+        died = f"died with exit code {code} while it was {self._asked}"
+        if code and not self._answered and self._context.get_start_method() != "fork":
+            return (
+                f"{died} (its error stands above). A process that is started by "
+                f"{self._context.get_start_method()!r} imports the program: {GUARD}"
+            )
+        return f"{died}, as if something there had called sys.exit or os._exit,"
+
+
+def _by_signal(number: int) -> str:
+    """What a signal did to a process, as people say it."""
+    try:
+        name = signal.Signals(number).name
+    except ValueError:
+        name = "?"
+    how = f"died by signal {number} ({name}, {signal.strsignal(number)})"
+    if number == signal.SIGKILL:
+        how += ", perhaps because memory ran out,"
+    return how
+
+
+def _described(what: str, task: Any) -> str:
+    """What a worker does for a task, after "it is"."""
+    if what == "collect":
+        return f"making {task.rows:,} steps in each of its environments"
+    return {
+        "start": "resetting its environments",
+        "state": "telling where its environments stand",
+        "restore": "playing its open episodes again",
+        "train": "training its members of the population",
+        "fitness": "measuring its members' fitness",
+    }.get(what, what)
+
+
+_STARTER: tuple[int, ThreadPoolExecutor] | None = None
+_STARTER_LOCK = threading.Lock()
+
+
+def _in_starter(start: Callable[[], None]) -> None:
+    """Start a process from a thread that does nothing else.
+
+    A forked process goes on as a copy of the thread that forks. If that thread has computed with
+    several OpenMP threads, the copy believes that it still has them, and waits for ever where the
+    user's code lets torch have several.
+    """
+    global _STARTER
+    with _STARTER_LOCK:
+        if _STARTER is None or _STARTER[0] != os.getpid():  # a fork has no such thread
+            _STARTER = os.getpid(), ThreadPoolExecutor(1, "starter")
+        starter = _STARTER[1]
+    starter.submit(copy_context().run, start).result()
 
 
 def close_all(workers: Sequence[ProcessWorker]) -> None:
     """Let workers close their environments, all at once; end those that do not."""
     for worker in workers:
-        if worker.pipe is not None:
+        if worker.channel is not None:
             with suppress(OSError):
-                worker.pipe.send(("close", None))
+                worker.channel.send(("close", None))
     until = monotonic() + PATIENCE
     for end in ("join", "terminate", "kill"):
         for worker in workers:
@@ -138,7 +247,17 @@ def close_all(workers: Sequence[ProcessWorker]) -> None:
             process.join(max(0.0, until - monotonic()))
         until = monotonic() + PATIENCE / 2
     for worker in workers:
+        _tell_last(worker)
         worker.forget()
+
+
+def _tell_last(worker: ProcessWorker) -> None:
+    """Tell what a worker has said while it closed its environments."""
+    channel = worker.channel
+    with suppress(Exception):  # half a message of one that was ended
+        while channel is not None and channel.pipe.poll():
+            for text in channel.receive()[2]:
+                notice(text)
 
 
 class ProcessWorkers(Workers):
@@ -153,7 +272,8 @@ class ProcessWorkers(Workers):
 
 def process_workers(make: MakeStanding, count: int, name: str) -> Workers:
     """``count`` workers in processes; ``make`` is given 1 and the worker's number."""
-    return ProcessWorkers([ProcessWorker(make, 1, i) for i in range(count)], name)
+    workers = [ProcessWorker(make, 1, i, f"{name}: worker {i}") for i in range(count)]
+    return ProcessWorkers(workers, name)
 
 
 class ProcessCollectors(ProcessWorkers, WorkerCollectors):
@@ -168,56 +288,8 @@ class ProcessCollectors(ProcessWorkers, WorkerCollectors):
     """
 
     def __init__(self, make: MakeStanding, each: int, count: int, members: int, name: str) -> None:
-        resource_tracker.ensure_running()  # one for all, so that memory is released once
-        workers = [ProcessWorker(make, each, i) for i in range(count)]
+        workers = [
+            ProcessWorker(make, each, i, f"{name}: worker {i}{environments_of(i, each)}")
+            for i in range(count)
+        ]
         super().__init__(workers, each, members, name)
-
-
-def _tasks(pipe: Connection, first: int) -> Iterator[tuple[str, Any]]:
-    """What the parent asks for, until it closes, or is no more.
-
-    Args:
-        pipe: where it asks.
-        first: the process whose child this one was at first.
-    """
-    parent = mp.parent_process()
-    assert parent is not None
-    while True:
-        while not pipe.poll(LOOK):
-            # The first is late where later workers were forked with the pipe that tells it; the
-            # second is never true where a server forks.
-            if not parent.is_alive() or os.getppid() != first:
-                return
-        what, task = pipe.recv()
-        if what == "close":
-            return
-        yield what, task
-
-
-def _work(number: int, maker: _Maker, each: int, pipe: Connection, other_end: Connection) -> None:
-    """The life of a worker: answer (error, result) to every (what, task)."""
-    import torch
-
-    first = os.getppid()  # the parent waits for our first answer; after that it may be no more
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, who then closes us
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has the parent's handler
-    torch.set_num_threads(1)
-    other_end.close()
-    station: Station | None = None
-    try:
-        station = Station(maker.make, each, number)
-        pipe.send((None, None))
-        writer = ColumnWriter()
-        for what, task in _tasks(pipe, first):
-            answer = station.answer(what, task)
-            pipe.send((None, writer.write(answer) if what == "collect" else answer))
-    except (EOFError, BrokenPipeError):
-        return  # nobody is left to be told
-    except SkillweaveError as error:
-        pipe.send((str(error), None))
-    except BaseException as error:
-        pipe.send((told(error), None))
-    finally:
-        if station is not None:
-            with suppress(BaseException):
-                station.collector.close()

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from skillweave.collecting.group import MakeCollectors, make_collectors
-from skillweave.collecting.workers import MakeStanding, Workers
+from skillweave.collecting.start_methods import runs_again, why_no_processes
+from skillweave.collecting.workers import LocalWorker, MakeStanding, Workers
+from skillweave.notices import notice
 
 MakeWorkers = Callable[[MakeStanding, int, str], Workers]
 """Given what makes the thing that stands at a worker (of 1 and its number), how many workers, and
@@ -22,6 +24,9 @@ class Where:
 
 
 def _processes(make: MakeStanding, count: int, name: str) -> Workers:
+    if why := why_no_processes() or runs_again():
+        notice(f"{name}: its {count} parts work in this process, one after another, as {why}")
+        return Workers([LocalWorker(make, 1, i) for i in range(count)], name)
     from skillweave.collecting.processes import process_workers
 
     return process_workers(make, count, name)

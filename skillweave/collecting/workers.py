@@ -7,6 +7,7 @@ finds the same.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -84,6 +85,42 @@ class Station:
         about = np.column_stack([kept["age"], kept["sums"]])
         found.stands = checksums(self.collector.obs) + checksums(about)
         return found
+
+
+class LocalWorker:
+    """A worker in this thread: it does a task when it is asked for the answer.
+
+    Args:
+        each: its environments, if it has a collector.
+        number: of the worker.
+    """
+
+    def __init__(self, make: MakeStanding, each: int, number: int) -> None:
+        self._make, self._each, self._number = make, each, number
+        self._station: Station | None = None
+        self._due = deque[tuple[str, Any]]()
+
+    def begin(self) -> None:
+        """Have the collector made; ``receive`` then gives None."""
+        self._due.append(("", None))
+
+    def send(self, what: str, task: Any) -> None:
+        """Ask for something."""
+        self._due.append((what, task))
+
+    def receive(self) -> Any:
+        """The answer to the oldest task that has none."""
+        what, task = self._due.popleft()
+        if self._station is None:
+            self._station = Station(self._make, self._each, self._number)
+            return None
+        return self._station.answer(what, task)
+
+    def release(self) -> None:
+        """Close what stands here."""
+        station, self._station = self._station, None
+        if station is not None:
+            station.collector.close()
 
 
 class Workers:
@@ -265,5 +302,10 @@ class WorkerCollectors(Workers, Collectors):
         return [seeds / number for number in range(len(self._workers))]
 
     def _whose(self, number: int) -> str:
-        first = number * self._each
-        return f" (environments {first} to {first + self._each - 1})"
+        return environments_of(number, self._each)
+
+
+def environments_of(number: int, each: int) -> str:
+    """Return which environments a worker has, for messages."""
+    first = number * each
+    return f" (environments {first} to {first + each - 1})"

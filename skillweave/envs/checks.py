@@ -6,7 +6,6 @@ numbers of all of them at once, which costs a few microseconds a step, whatever 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from skillweave.envs.infos import DISCRETE, MASK, observes_mask
 from skillweave.messages import short, told
+from skillweave.notices import notice
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import (
     LARGEST_REWARD,
@@ -163,12 +163,11 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         found += [f"the observation's {n!r}" for n in names if n in shown]
         found += [f"its {n}" for n in LIKE_METHODS if self.env.has_wrapper_attr(n)]
         if found:
-            warnings.warn(
+            notice(
                 f"{self._name}: {found[0]} looks like an action mask, but is not used as one: "
                 f"every action counts as allowed. Give info['{MASK}'] in reset() and step(), or a "
                 f"method action_masks(): a number for each choice of {actions}, 0 where it is "
-                "forbidden",
-                stacklevel=2,
+                "forbidden"
             )
 
     def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
@@ -180,6 +179,16 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             return {**info, MASK: np.array(self._masks())}
         except Exception as error:
             raise self._wrong(f"action_masks() raised {told(error)}") from error
+
+    def close(self) -> None:
+        """Release it; what goes wrong is told, and costs nothing that was learnt."""
+        try:
+            super().close()
+        except (Exception, SystemExit) as error:
+            notice(
+                f"{self._name}: close() raised {told(error)}. What was learnt is kept; what the "
+                "environment holds may not have been released"
+            )
 
     def _number_of(self, reward: Any) -> float:
         try:
@@ -339,12 +348,11 @@ class Watch:
     def _tell_coarse(self, size: float, place: tuple[str, ...]) -> None:
         """Warn of float64 numbers that networks cannot tell apart."""
         step = float(np.spacing(np.float32(size / 2)) * 2)
-        warnings.warn(
+        notice(
             f"{self._name}: its observation{_named(place)} has a number as large as {size:,.0f}, "
             f"in float64. Networks compute in float32, where numbers of this size are {step:g} "
             "apart: smaller changes cannot be seen. Let the environment subtract what is always "
-            "there, or give it in other units",
-            stacklevel=2,
+            "there, or give it in other units"
         )
 
     def _wrong(self, row: int, ids: Array | None, what: str) -> SkillweaveError:

@@ -25,7 +25,12 @@ from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
 from skillweave.envs.sync import SyncEnvs
+from skillweave.notices import are_collected, notice
+from skillweave.seeding import GlobalDraws
 from skillweave.types import Array
+
+LOOKS = 12
+"""Resets and steps in which it is seen whether environments draw from global generators."""
 
 
 @dataclass(slots=True)
@@ -106,6 +111,7 @@ class GymnasiumEngine:
             self.action_space, num_envs, observation_space=self.observation_space
         )
         self._watch = Watch(name, self.observation_space, num_envs, first)
+        self._name, self._draws = name, GlobalDraws(LOOKS if are_collected() else 0)
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._all = np.arange(num_envs)
         self._root = 0
@@ -177,15 +183,34 @@ class GymnasiumEngine:
 
     def _begin(self, ids: Array) -> Array:
         """Reset environments ``ids`` to their seeds."""
+        if self._draws.looks:
+            self._draws.begin()
         obs, info = self._envs.begin(ids, self._seed[ids])
+        if self._draws.looks:
+            self._tell_draws()
         self._masks.see(info, ids, obs=obs)
         return self._watch.begun(obs, ids)
+
+    def _tell_draws(self) -> None:
+        """Tell people if the environments have just drawn from global generators."""
+        if drawn := self._draws.end():
+            self._draws.looks = 0
+            notice(
+                f"{self._name} draws from {' and '.join(drawn)}, whose generator all of a program "
+                "shares. The run seeds it, so the same seed gives the same weights; but an episode "
+                "that is open when a run is resumed cannot be repeated. Draw from self.np_random "
+                "instead, which super().reset(seed=seed) seeds"
+            )
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
         rows = self._all if ids is None else ids
         # A copy: environments get views of it, and may keep them.
         acted = np.array(action, self.action_space.dtype)
+        if self._draws.looks:
+            self._draws.begin()
         next_obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
+        if self._draws.looks:
+            self._tell_draws()
         self._masks.see(info, ids, terminated | truncated, next_obs)
         raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
         self._watch.stepped(raw, ids)

@@ -23,7 +23,7 @@ from skillweave.collecting.group import joined_states, split_states
 from skillweave.collecting.where import MakeWorkers
 from skillweave.evolution.part import OnGenerationTick, Part
 from skillweave.evolution.stacks import Member
-from skillweave.seeding import Seeds
+from skillweave.seeding import Seeds, seed_global_generators
 from skillweave.training.episodes import EpisodeTally
 from skillweave.training.scene import Scene
 from skillweave.types import Array
@@ -187,6 +187,7 @@ def _stationed(
     each: int,
     number: int,
 ) -> StationedPart:
+    seed_global_generators(seeds / "global" / number)
     first, end = bounds[number], bounds[number + 1]
     return StationedPart(Part(scene, config, seeds, end - first, first), scene, episodes)
 

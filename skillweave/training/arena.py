@@ -9,7 +9,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import RETURN, Collector
 from skillweave.envs.checks import longest_evaluation
 from skillweave.ops.threads import torch_threads
-from skillweave.seeding import Seeds
+from skillweave.seeding import Seeds, global_generators
 from skillweave.types import Array
 
 
@@ -30,8 +30,9 @@ def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
     params = algorithm.acting_params_of(policy.weights)
     gamma = np.array([algorithm.config.gamma])
     request = Request(0, (params,), gamma, seeds / "act", greedy=True)
-    with torch_threads(1):  # several wait for each other, for ever on a busy machine
-        limit = longest_evaluation(arena.engine.time_limit)
+    limit = longest_evaluation(arena.engine.time_limit)
+    # Several threads wait for each other, for ever on a busy machine.
+    with torch_threads(1), global_generators(seeds / "global"):
         found: Array = player.play(request, seeds / "start", limit)
     began: Array = ~np.isnan(found[:, RETURN])
     return found[began]

@@ -5,7 +5,6 @@ Or in a pool, which is faster, and where all episodes begin from one seed.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from dataclasses import replace as replaced
@@ -21,7 +20,9 @@ from skillweave.envs.infos import told_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
+from skillweave.notices import notice
 from skillweave.reading import Count, Positive
+from skillweave.seeding import Seeds, global_generators
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.terminal import printable
@@ -221,6 +222,20 @@ def evaluate(
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = USUAL_ENVS if num_envs is None else whole_number(num_envs, "num_envs", 1)
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
+    with global_generators(Seeds(seed) / "evaluation"):
+        return _evaluate(policy, spec, episodes, seed, deterministic, n, limit, watch)
+
+
+def _evaluate(
+    policy: Policy,
+    spec: EnvSpec,
+    episodes: int,
+    seed: int,
+    deterministic: bool,
+    n: int,
+    limit: int | None,
+    watch: Callable[[Played], None] | None,
+) -> Evaluation:
     longest, threshold, pooled = _about(spec)
     envs = make_engine(spec, episodes if pooled else min(n, episodes))
     try:
@@ -265,13 +280,12 @@ def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> Non
     """
     again = envs.reset_some(np.zeros(1, np.int64), [seed])
     if checksums(again)[0] != checksums(first)[0]:
-        warnings.warn(
+        notice(
             f"{name}: reset(seed={seed}) starts another episode than it did in the same "
             "environment before. Scores depend on how many episodes an environment has played "
             "already, and so on num_envs. Let reset() forget what was, and draw from "
             "self.np_random alone; or give each episode an environment of its own: "
-            "num_envs=episodes",
-            stacklevel=3,
+            "num_envs=episodes"
         )
 
 

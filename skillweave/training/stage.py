@@ -17,8 +17,10 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import own_schedules
 from skillweave.arguments import checked_names
 from skillweave.collecting import levels
-from skillweave.envs.make import EnvSpec, workers_for
+from skillweave.collecting.start_methods import cannot_be_sent, runs_again, why_no_processes
+from skillweave.envs.make import EnvSpec, cores, workers_for
 from skillweave.messages import short
+from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
 from skillweave.reading import LARGEST_FLOAT
 from skillweave.training.checks import check_fields
@@ -277,12 +279,15 @@ ONE = "one collector (EnvSpec(workers=1), --collectors 1, Ray(collectors=1))"
 """What a message advises where a stage cannot have several."""
 
 
-def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
+def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any = None) -> None:
     """Write into each stage's entry how many processes are to step its environments.
 
     Of a population it is the number of parts into which its members are split; where nobody said
     one, they stay in this process. A number that was measured is lowered to one that divides
-    ``num_envs``.
+    ``num_envs``, or to 1 where processes cannot be started.
+
+    Args:
+        sent: what processes get, beside the environment.
 
     Raises:
         SkillweaveError: a number that the user gave does not divide ``num_envs``, or a population
@@ -290,6 +295,15 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec) -> None:
     """
     alone = any(entry.get("evolution") is None for entry in entries)
     workers = workers_for(spec) if alone else 1
+    if workers > 1 and spec.workers is None:
+        why = why_no_processes() or runs_again() or cannot_be_sent((spec, sent))
+        if why:
+            workers = 1
+            notice(
+                f"{spec.name} is slow enough that several processes would step it faster, but "
+                f"{why}. All environments stay in one process; EnvSpec(workers=1) ends this "
+                f"message, EnvSpec(workers={cores()}) asks for processes"
+            )
     for entry in entries:
         num_envs = entry["algorithm"]["num_envs"]
         if entry.get("evolution") is not None:

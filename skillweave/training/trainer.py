@@ -20,7 +20,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.runs.starts import drop_starts, start_of
-from skillweave.seeding import Seeds
+from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.interrupts import deferred
@@ -61,9 +61,8 @@ class OneAgent:
         every, episodes = manifest.get("eval_every"), manifest.get("eval_episodes", 0)
         fresh = self.make_agents()
         workers = int(stage.entry.get("workers", 1))
-        self.collectors = self._make_collectors(
-            self.maker(), config.num_envs, workers, 1, scene.name
-        )
+        make = partial(_seeded, self.maker(), stage.seeds / "global")
+        self.collectors = self._make_collectors(make, config.num_envs, workers, 1, scene.name)
         self._open.callback(self.collectors.close)
         self.evaluation = PeriodicEvaluation(scene, stage.seeds, every, episodes, config.num_envs)
         self._open.callback(self.evaluation.close)
@@ -243,6 +242,12 @@ class OneAgent:
         self._open.close()
 
 
+def _seeded(make: MakeCollector, seeds: Seeds, num_envs: int, first: int) -> Collector:
+    """Make a collector whose process has global generators of its own."""
+    seed_global_generators(seeds / first)
+    return make(num_envs, first)
+
+
 def _collector(scene: Scene, algorithm: Algorithm, num_envs: int, first: int) -> Collector:
     return scene.learners_collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
 
@@ -283,7 +288,10 @@ def train_stage(
         scene = replace(scene, log_info=tuple(keys))
     learner = make_learner(StageRun(entry, run, seeds, scene, known))
     evolves = entry.get("evolution") is not None
-    with deferred("at the end of this generation" if evolves else "after this round"):
+    with (
+        global_generators(seeds / "global"),
+        deferred("at the end of this generation" if evolves else "after this round"),
+    ):
         try:
             fresh = learner.open()
             kind = None if fresh is None else type(fresh)

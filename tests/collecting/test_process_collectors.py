@@ -1,5 +1,6 @@
 """Collectors in processes find what collectors in this thread find, whatever happens to them."""
 
+import gc
 import importlib.util
 import itertools
 import multiprocessing
@@ -15,7 +16,7 @@ import pytest
 from reference_calls import EPISODE, Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, Mortal, requests
 
-from skillweave.collecting import processes
+from skillweave.collecting import processes, worker_process
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.group import Collectors, make_collectors
@@ -169,17 +170,17 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
     for collectors in (ours, theirs):
         collectors.start(Seeds(3))
     for i, request in enumerate(itertools.islice(requests(2), 2)):
-        time.sleep(1.5 * processes.LOOK * i)  # they look whether their parent lives
+        time.sleep(1.5 * worker_process.LOOK * i)  # they look whether their parent lives
         equal(ours.collect(request), theirs.collect(request))
     assert [worker.process.pid for worker in theirs._workers] == pids
 
 
 PARENT = """
 import os, signal, time
-from skillweave.collecting import processes
+from skillweave.collecting import processes, worker_process
 from test_process_collectors import ProcessCollectors, stepping
-tasks = processes._tasks
-processes._tasks = lambda *about: (time.sleep(0.5), tasks(*about))[1]  # the parent is no more then
+tasks = worker_process._tasks
+worker_process._tasks = lambda channel: (time.sleep(0.5), tasks(channel))[1]  # no parent by then
 found = ProcessCollectors(stepping(), 1, 3, 1, "Walk")
 pids = [worker.process.pid for worker in found._workers]
 os.kill(pids[-1], signal.SIGSTOP)
@@ -281,7 +282,7 @@ class Stuck(Again):
 def test_closing_ends_workers_that_are_stuck(in_processes):
     collectors = in_processes(stepping(Stuck))
     collectors.start(Seeds(0))
-    collectors._workers[0].pipe.send(("collect", next(requests(5))))
+    collectors._workers[0].send("collect", next(requests(5)))
     workers = [w.process for w in collectors._workers]
     collectors.close()
     assert not any(w.is_alive() for w in workers)
@@ -336,22 +337,24 @@ def test_large_columns_come_whole_though_the_memory_must_grow(in_processes):
         equal(plain.collect(request), apart.collect(request))
 
 
-def shared_memory():
-    names = os.listdir("/dev/shm") if os.path.isdir("/dev/shm") else []
-    return {n for n in names if n.startswith("psm_")}
+def left_behind():
+    """Names of shared memory, and this process's descriptors."""
+    names = set(os.listdir("/dev/shm")) if os.path.isdir("/dev/shm") else set()
+    return {n for n in names if "psm_" in n or "torch" in n}, len(os.listdir("/dev/fd"))
 
 
-def test_no_shared_memory_is_left_behind(in_processes):
-    assert processes.SharedMemory
-    before = shared_memory()
-    collectors = in_processes(stepping())
-    collectors.start(Seeds(0))
-    collectors.collect(next(requests(30)))
-    os.kill(collectors._workers[1].process.pid, signal.SIGKILL)
-    collectors.collect(next(requests(30)))
-    collectors.close()
-    left, until = shared_memory() - before, time.monotonic() + 20
-    while left and time.monotonic() < until:  # of tests beside this one, which is about to go
-        time.sleep(0.1)
-        left &= shared_memory()
-    assert left == set()
+def test_nothing_is_left_behind():
+    def killed_once():
+        collectors = ProcessCollectors(stepping(), 3, 2, 1, "Walk")
+        collectors.start(Seeds(0))
+        collectors.collect(next(requests(30)))
+        os.kill(collectors._workers[1].process.pid, signal.SIGKILL)
+        collectors.collect(next(requests(30)))
+        collectors.close()
+
+    killed_once()  # what the first processes of a program leave open
+    gc.collect()
+    before = left_behind()
+    killed_once()
+    gc.collect()
+    assert left_behind() == before

@@ -1,0 +1,131 @@
+"""The life of a process in which a worker stands."""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from time import sleep
+from types import FrameType
+from typing import Any, NoReturn
+
+from skillweave.collecting.channel import Channel
+from skillweave.collecting.workers import Station
+from skillweave.messages import told
+from skillweave.notices import Notices, collect_notices
+from skillweave.types import SkillweaveError
+
+LOOK = 1.0
+"""Seconds between looks at whether the parent lives."""
+GRACE = 2.0
+"""Seconds that environments have to close when it does not."""
+
+
+class _Ended(BaseException):
+    """The process is to end: somebody terminates it, or its parent is no more."""
+
+
+def work(
+    number: int, maker: Any, each: int, channel: Channel, other_end: Channel, parent: int | None
+) -> None:
+    """Answer (error, result, notices) to every (what, task).
+
+    Args:
+        number: of the worker.
+        maker: its ``make`` makes what stands here.
+        each: environments.
+        channel: where tasks come from.
+        other_end: the parent's, of which a fork has a copy.
+        parent: the process whose child this one is; None: a server's, which forks.
+    """
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, who then closes us
+    signal.signal(signal.SIGTERM, _end)  # a fork has the parent's handler
+    torch.set_num_threads(1)
+    other_end.close()
+    notices = collect_notices()
+    station: Station | None = None
+    try:
+        try:
+            _end_with(parent)
+            _may_have_processes()
+            station = Station(maker.make, each, number)
+            _send(channel, None, None, notices)
+            for what, task in _tasks(channel):
+                torch.set_num_threads(1)  # the user's code may have changed it
+                _send(channel, None, station.answer(what, task), notices)
+        except _Ended:
+            raise
+        except SkillweaveError as error:
+            _send(channel, str(error), None, notices)
+        except BaseException as error:
+            _send(channel, told(error), None, notices)
+        finally:
+            if station is not None:
+                with suppress(Exception, SystemExit):
+                    station.collector.close()
+            if notices.any:
+                _send(channel, None, None, notices)
+    except _Ended:
+        return
+
+
+def _tasks(channel: Channel) -> Iterator[tuple[str, Any]]:
+    """What the parent asks for, until it closes."""
+    while True:
+        try:
+            what, task = channel.receive()
+        except (EOFError, OSError):
+            raise _Ended from None
+        if what == "close":
+            return
+        yield what, task
+
+
+def _send(channel: Channel, error: str | None, answer: Any, notices: Notices) -> None:
+    """Send an answer, if anybody is left to be told."""
+    try:
+        channel.send((error, answer, notices.take()))
+    except (BrokenPipeError, ConnectionResetError):
+        raise _Ended from None
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    raise _Ended
+
+
+def _end_with(parent: int | None) -> None:
+    """End this process soon after its parent, whatever it does then.
+
+    A thread looks, as the main one may be in a long rollout or in an environment that waits. First
+    environments may close: they may have processes of their own.
+    """
+    started_by = mp.parent_process()
+    assert started_by is not None
+    main = threading.main_thread().ident
+    assert main is not None
+    first = parent or os.getppid()
+
+    def watch() -> None:
+        # The first is late where later workers were forked with the pipe that tells it.
+        while started_by.is_alive() and os.getppid() == first:
+            sleep(LOOK)
+        with suppress(OSError, ValueError):
+            signal.pthread_kill(main, signal.SIGTERM)
+        sleep(GRACE)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+def _may_have_processes() -> None:
+    """Let environments start processes: ``multiprocessing`` forbids it to a daemon.
+
+    It ends daemons when their parent ends, and these end with it in any case.
+    """
+    with suppress(AttributeError):
+        mp.current_process()._config["daemon"] = False  # type: ignore[attr-defined]

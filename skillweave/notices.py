@@ -1,0 +1,85 @@
+"""Sentences that people should read once, from any depth of the library.
+
+Inside a run they go to its progress. Elsewhere they are Python warnings.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+
+class Notices:
+    """Sentences of one run, each told once; they wait until there is somewhere to tell them."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+        self._waiting: list[str] = []
+        self._tell: Callable[[str], None] | None = None
+
+    def add(self, text: str) -> None:
+        """Tell a sentence, unless it was told before."""
+        if text in self._said:
+            return
+        self._said.add(text)
+        if self._tell is None:
+            self._waiting.append(text)
+        else:
+            self._tell(text)
+
+    @property
+    def any(self) -> bool:
+        """Whether sentences wait."""
+        return bool(self._waiting)
+
+    def take(self) -> list[str]:
+        """Return the sentences that wait, and forget them."""
+        found, self._waiting = self._waiting, []
+        return found
+
+    def tell_by(self, tell: Callable[[str], None] | None) -> None:
+        """Tell by this function from now on, first what waits; None: let them wait."""
+        self._tell = tell
+        if tell is not None:
+            for text in self.take():
+                tell(text)
+
+
+_CURRENT: ContextVar[Notices | None] = ContextVar("_CURRENT", default=None)
+
+
+def notice(text: str) -> None:
+    """Tell people a sentence, once in a run."""
+    notices = _CURRENT.get()
+    if notices is None:
+        warnings.warn(text, stacklevel=2)
+    else:
+        notices.add(text)
+
+
+def are_collected() -> bool:
+    """Return whether this is in a run, or in a process of one."""
+    return _CURRENT.get() is not None
+
+
+@contextmanager
+def collected_notices() -> Iterator[Notices]:
+    """Collect notices within the block; within another such block they are that one's."""
+    if (outer := _CURRENT.get()) is not None:
+        yield outer
+        return
+    notices = Notices()
+    before = _CURRENT.set(notices)
+    try:
+        yield notices
+    finally:
+        _CURRENT.reset(before)
+
+
+def collect_notices() -> Notices:
+    """Collect notices from now on: in a process that sends them to another one."""
+    notices = Notices()
+    _CURRENT.set(notices)
+    return notices
