@@ -165,7 +165,10 @@ def test_a_shape_that_says_nothing_is_refused_with_the_setting(tmp_path, shape):
     run = tmp_path / "run"
     with pytest.raises(sw.SkillweaveError) as error:
         sw.train_agent(lambda: Shows(Box(0, 1, shape, BYTES)), settings(), 16, run, quiet=True)
-    assert f"the observation of shape {shape} may have its planes" in str(error.value)
+    assert f"the observation of shape {shape}" in str(error.value)
+    stacked = f", by its first axis a stack of {shape[0]} frames" in str(error.value)
+    assert stacked == (len(shape) == 4)
+    assert "may have its planes (channels) in the first axis or in the last" in str(error.value)
     assert 'PPO(network=Network(planes="first")), or planes="last"' in str(error.value)
     assert not run.exists()
 
