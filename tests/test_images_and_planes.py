@@ -2,6 +2,7 @@
 
 import json
 from itertools import count
+from pathlib import Path
 from typing import ClassVar
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 
 import skillweave as sw
+from skillweave.cli import main
 
 BYTES, REALS = np.uint8, np.float32
 
@@ -133,11 +135,11 @@ SURE = {
     (84, 84, 4): (4, 84, 84),
     (4, 84, 84): (4, 84, 84),
     (7, 7, 3): (3, 7, 7),
-    (210, 160, 3): (3, 210, 160),
-    (3, 210, 160): (3, 210, 160),
-    (64, 48, 1): (1, 64, 48),
-    (84, 96, 12): (12, 84, 96),
-    (4, 64, 64, 3): (12, 64, 64),
+    (63, 48, 3): (3, 63, 48),
+    (3, 63, 48): (3, 63, 48),
+    (32, 24, 1): (1, 32, 24),
+    (42, 48, 12): (12, 42, 48),
+    (4, 32, 32, 3): (12, 32, 32),
     (6, 7, 2): (2, 6, 7),
     (20, 10, 4): (4, 20, 10),
     (4, 4, 6): (6, 4, 4),
@@ -163,7 +165,10 @@ def test_a_shape_that_says_nothing_is_refused_with_the_setting(tmp_path, shape):
     run = tmp_path / "run"
     with pytest.raises(sw.SkillweaveError) as error:
         sw.train_agent(lambda: Shows(Box(0, 1, shape, BYTES)), settings(), 16, run, quiet=True)
-    assert f"the observation of shape {shape} may have its planes" in str(error.value)
+    assert f"the observation of shape {shape}" in str(error.value)
+    stacked = f", by its first axis a stack of {shape[0]} frames" in str(error.value)
+    assert stacked == (len(shape) == 4)
+    assert "may have its planes (channels) in the first axis or in the last" in str(error.value)
     assert 'PPO(network=Network(planes="first")), or planes="last"' in str(error.value)
     assert not run.exists()
 
@@ -266,6 +271,40 @@ class Board(gym.Env):
     def step(self, action):
         reward, self.t = float(action == self.yes), self.t + 1
         return self.see(), reward, False, self.t == 8, {}
+
+
+def test_cells_are_read_one_by_one_wherever_their_axes_are(tmp_path):
+    cells, rest = sw.Network((4,), encoder="cells"), sw.Network((4,))
+    space = Box(0, 5, (3, 4, 5), BYTES)
+
+    def train(critic):
+        how = sw.PPO(num_envs=2, n_steps=8, network=cells, critic=critic)
+        return sw.train_agent(lambda: Shows(space), how, 16, tmp_path / "run", quiet=True)
+
+    with pytest.raises(sw.SkillweaveError, match="may have its planes"):
+        train(rest)
+    train(None)
+
+
+def test_the_command_line_sets_it(tmp_path, capsys):
+    recipe = tmp_path / "recipe.py"
+    recipe.write_text(
+        "import sys\n\nimport numpy as np\nimport skillweave as sw\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from test_images_and_planes import Box, Shows\n\n\n"
+        "class Look(sw.Skill):\n    pass\n\n\n"
+        "settings = sw.PPO(num_envs=2, n_steps=8)\n"
+        "space = Box(0, 1, (3, 4, 5), np.uint8)\n"
+        "hierarchy = sw.Hierarchy(\n    lambda: Shows(space), [Look()], algorithm=settings, "
+        "selector=settings, steps=32\n)\n"
+    )
+    train = ["train", str(recipe), "--out", str(tmp_path / "run"), "--quiet"]
+    assert main(train) == 1
+    assert 'PPO(network=Network(planes="first"))' in capsys.readouterr().err
+    both = [f"--set={who}.network.planes={{}}" for who in ("algorithm", "selector")]
+    assert main([*train, *(word.format("middle") for word in both)]) == 1
+    assert "expected one of first, last, none" in capsys.readouterr().err
+    assert main([*train, *(word.format("last") for word in both)]) == 0
 
 
 @pytest.mark.slow

@@ -113,10 +113,11 @@ def read_by(config: Any, observation_space: gym.Space[Any], where: str = "") -> 
     Raises:
         SkillweaveError: the channels of an image may be in more than one axis.
     """
-    network = getattr(config, "network", None)
-    codec = obs_codec(observation_space, getattr(network, "planes", None))
+    networks = [getattr(config, name, None) for name in ("network", "critic")]
+    codec = obs_codec(observation_space, getattr(networks[0], "planes", None))
     # Cells are read one by one, so the order of their axes makes no difference.
-    if codec.unclear and getattr(network, "encoder", None) != "cells":
+    ordered = any(n is not None and getattr(n, "encoder", None) != "cells" for n in networks)
+    if codec.unclear and ordered:
         raise SkillweaveError(
             f"{where}{codec.unclear[0]} may have its planes (channels) in the first axis or in the "
             f'last: write {type(config).__name__}(network=Network(planes="first")), or '

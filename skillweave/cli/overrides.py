@@ -192,8 +192,11 @@ def _parse(name: str, text: str, hint: Any) -> Any:
     wanted = getattr(hint, "__name__", str(hint).replace("typing.", ""))
     if typing.get_origin(hint) is Sequence:
         wanted = "names with commas between them"
-    if typing.get_origin(hint) is typing.Literal:
-        wanted = "one of " + ", ".join(map(str, typing.get_args(hint)))
+    words = [option for option in options if option is not type(None)]
+    if all(typing.get_origin(option) is typing.Literal for option in words):
+        known = [word for option in words for word in typing.get_args(option)]
+        known += ["none"] if len(words) < len(options) else []
+        wanted = "one of " + ", ".join(map(str, known))
     raise SkillweaveError(f"{name}={text}: expected {wanted}")
 
 

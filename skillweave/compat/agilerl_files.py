@@ -193,7 +193,9 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
     sizes = [tuple(described.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
     cnn, hidden = CNN("plain", *sizes) if sizes[0] else None, described["hidden_size"]
     layer_norm, activation = bool(described.get("layer_norm")), ACTIVATIONS[str(name)]
-    return Network(tuple(int(n) for n in hidden), activation, layer_norm, cnn)  # type: ignore[arg-type]
+    planes: Any = None if cnn is None else "first"  # AgileRL reads all images so
+    widths = tuple(int(n) for n in hidden)
+    return Network(widths, activation, layer_norm, cnn, planes=planes)  # type: ignore[arg-type]
 
 
 def _named(

@@ -302,7 +302,10 @@ def _scale(leaf: _Leaf) -> PixelScale:
 def _described(leaf: _Leaf) -> str:
     """What a message calls a leaf: ``the observation's part board of shape (3, 3, 3)``."""
     what = f"the observation's part {leaf.name}" if leaf.name else "the observation"
-    return f"{what} of shape {leaf.shape}"
+    whole = f"{what} of shape {leaf.shape}"
+    if len(leaf.shape) < 4:
+        return whole
+    return f"{whole}, by its first axis a stack of {leaf.shape[0]} frames {leaf.shape[1:]},"
 
 
 def _leaves(
