@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,11 +12,16 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from skillweave.types import Array, SkillweaveError
 
+if TYPE_CHECKING:
+    _SyncVectorEnv = SyncVectorEnv[Any, Any]
+else:
+    _SyncVectorEnv = SyncVectorEnv  # before Gymnasium 1.4 it is no generic class
+
 _FITS = {float: "fO", int: "iufO", bool: "biufO"}
 """By the type of a number, the kinds of arrays that hold it as it is."""
 
 
-class SyncEnvs(SyncVectorEnv[Any, Any]):
+class SyncEnvs(_SyncVectorEnv):
     """Gymnasium's vector of environments, some of which begin and act.
 
     ``begin`` and ``act`` stand in place of the vector's ``reset`` and ``step``, which are of all
