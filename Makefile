@@ -1,5 +1,6 @@
 # make demo     train, score and film two tasks: where skills pay, and where not (3 minutes)
 # make test     the fast tests                 make test-all  all tests
+# make test-versions  a share of the tests with the lowest and the newest versions of what it needs
 # make check    ruff, mypy, the fast tests     make docs      the documentation, as a site in site/
 # make bench    the benchmarks                 make weights   train the shipped weights again
 # make torture  damaged files, kills, full disks, hostile code: an hour
@@ -21,7 +22,7 @@ CORES := $(BIN)/python -c 'import os; a = getattr(os, "sched_getaffinity", None)
 # processes that import the same ones.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $$(($$($(CORES)) + 1)) --dist worksteal
 
-.PHONY: demo test test-slow test-all check docs torture bench figures weights smoke clean
+.PHONY: demo test test-slow test-all test-versions check docs torture bench figures weights smoke clean
 
 .venv/demo: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("Skillweave needs Python 3.11 or newer, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
@@ -50,6 +51,9 @@ test-slow: .venv/dev
 
 test-all: .venv/dev
 	$(PYTEST)
+
+test-versions: .venv/dev
+	$(BIN)/python -m scripts.versions
 
 check: .venv/dev
 	$(BIN)/ruff check .

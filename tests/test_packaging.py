@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import skillweave
+from scripts import versions
 from skillweave.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -89,3 +90,19 @@ def test_the_wheel_says_that_it_has_types_and_has_every_file_of_the_package(tmp_
     }
     assert "skillweave/py.typed" in files
     assert files == {name for name in names if name.startswith("skillweave/")}
+
+
+def test_the_versions_that_are_tried_are_those_that_are_promised() -> None:
+    core = {re.split(r"[\[>=<]", r)[0] for r in PROJECT["dependencies"]}
+    lowest = dict(pin.split("==") for pin in versions.asked("lowest"))
+    assert core - set(versions.LINKED) <= {name.partition("[")[0] for name in lowest}
+    for requirement in versions.requirements():
+        name, least = re.match(r"([\w.\[\]-]+)>=([\w.]+)", requirement).groups()  # type: ignore[union-attr]
+        assert lowest[name] == least
+        assert requirement in versions.asked("newest")
+
+
+def test_the_tests_of_versions_are_there() -> None:
+    assert [file for file in versions.TESTS if not (ROOT / file).is_file()] == []
+    with pytest.raises(ValueError, match="names no lowest version"):
+        versions.lowest("numpy<3")

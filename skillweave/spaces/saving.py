@@ -184,8 +184,16 @@ def _bounds_to_json(bounds: Array) -> Any:
 
 def _bounds_from_json(data: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
     if isinstance(data, list):
-        return np.array([dtype.type(x) for x in data], dtype).reshape(shape)
-    return np.full(shape, dtype.type(data), dtype)
+        return np.array([_of_type(x, dtype) for x in data], dtype).reshape(shape)
+    return np.full(shape, _of_type(data, dtype), dtype)
+
+
+def _of_type(value: Any, dtype: np.dtype[Any]) -> Any:
+    if dtype.kind in "iu" and isinstance(value, int):  # before NumPy 2 it would become another one
+        limits = np.iinfo(dtype)
+        if not limits.min <= value <= limits.max:
+            raise OverflowError(f"{value} is out of the range of {dtype}")
+    return dtype.type(value)
 
 
 def _number(x: float) -> float | str:
