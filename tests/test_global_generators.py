@@ -1,3 +1,4 @@
+# ruff: noqa: NPY002
 """Environments that draw from the global generators: one seed gives one result."""
 
 import multiprocessing

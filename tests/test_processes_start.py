@@ -85,7 +85,10 @@ def test_a_plain_script_that_forks_trains_in_processes(tmp_path):
 
 @pytest.mark.slow
 def test_what_cannot_be_sent_stays_in_one_process(tmp_path):
-    odd = "\nlock = __import__('threading').Lock()\ndef made():\n    lock.locked()\n    return Slow()\n"
+    odd = (
+        "\nlock = __import__('threading').Lock()\n"
+        "def made():\n    lock.locked()\n    return Slow()\n"
+    )
     guard = "if __name__ == '__main__':\n    "
     text = ENV + odd + guard + method("spawn") + "    " + TRAIN.format(env="made")
     said = run_program(tmp_path, text)
@@ -144,3 +147,42 @@ def test_too_few_descriptors_for_processes_is_a_sentence(tmp_path):
     train = "sw.train_agent(sw.EnvSpec(Slow, workers=4), SMALL, 64, 'run')\n"
     said = run_program(tmp_path, ENV + limit + train)
     assert "ulimit -n" in said.strip().splitlines()[-1]
+
+
+THREADS = """
+import threading
+import torch
+
+class Own(Slow):
+    def __init__(self):
+        torch.set_num_threads(2)
+        self.a = torch.ones(300, 300)
+    def step(self, action):
+        torch.set_num_threads(2)
+        self.a @ self.a
+        (torch.ones(100_000) + 1).sum()
+        return super().step(action)
+
+def train(i):
+    env = sw.EnvSpec(Own if own else Slow, engine="sync", workers=2)
+    sw.train_agent(env, SMALL, 128, f"run-{i}", quiet=True)
+
+if __name__ == "__main__":
+    torch.set_num_threads(2)
+    torch.ones(800, 800) @ torch.ones(800, 800)
+    (torch.ones(1_000_000) + 1).sum()
+    threads = [threading.Thread(target=train, args=(i,)) for i in range(count)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    if count == 0:
+        train(0)
+    print("all well", file=sys.stderr)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("own", "count"), [(True, 0), (False, 4), (True, 4)])
+def test_processes_work_where_the_program_has_threads(own, count, tmp_path, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    said = run_program(tmp_path, ENV + f"own, count = {own}, {count}\n" + THREADS)
+    assert "all well" in said
