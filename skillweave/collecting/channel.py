@@ -165,7 +165,7 @@ class Channel:
                 found[:] = block
             else:
                 for at, size in zip(places, sizes, strict=True):
-                    self.pipe.recv_bytes_into(memoryview(found)[at : at + size])
+                    self.pipe.recv_bytes_into(found.data[at : at + size])
             block = found
         buffers = [block[at : at + size] for at, size in zip(places, sizes, strict=True)]
         return pickle.loads(data[end:], buffers=buffers)
@@ -205,7 +205,7 @@ class _Pickler(pickle.Pickler):
         kind = type(thing)
         if kind is np.ndarray and thing.nbytes and not thing.dtype.hasobject:
             flat = np.ascontiguousarray(thing).reshape(-1).view(np.uint8)
-            return _array, (PickleBuffer(flat), thing.dtype, thing.shape)
+            return _array, (PickleBuffer(flat.data), thing.dtype, thing.shape)
         if kind is Tensor and _is_plain(thing):
             storage = thing.untyped_storage()
             kept = self._storages.setdefault(storage.data_ptr(), _Storage(thing))
@@ -223,7 +223,7 @@ class _Storage:
         self._bytes = whole.numpy()
 
     def __reduce__(self) -> Any:
-        return _storage, (PickleBuffer(self._bytes),)
+        return _storage, (PickleBuffer(self._bytes.data),)
 
 
 def _is_plain(tensor: Tensor) -> bool:

@@ -183,7 +183,7 @@ class ProcessWorker:
                 f"{died} (its error stands above). A process that is started by "
                 f"{self._context.get_start_method()!r} imports the program: {GUARD}"
             )
-        return f"{died}, as if something there had called sys.exit or os._exit,"
+        return f"{died}, as if something there had called sys.exit or os._exit"
 
 
 def _by_signal(number: int) -> str:

@@ -1,0 +1,146 @@
+# ruff: noqa: NPY002
+"""Environments that draw from the global generators: one seed gives one result."""
+
+import multiprocessing
+import os
+import random
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import skillweave as sw
+
+SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((4,)))
+DRAWS = {
+    "random": lambda: random.uniform(-5, 5),
+    "numpy.random": lambda: float(np.random.uniform(-5, 5)),
+    "torch": lambda: float(torch.rand(()) * 10 - 5),
+}
+
+
+class Corridor(gym.Env):
+    """Begins where ``draw`` says; writes down where, if it is told a file."""
+
+    observation_space = gym.spaces.Box(-20, 20, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    draw = None
+    file = None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        draw = type(self).draw
+        self.x, self.t = self.np_random.uniform(-5, 5) if draw is None else draw(), 0
+        if self.file is not None:
+            with open(self.file, "a") as file:
+                file.write(f"{os.getpid()} {self.x}\n")
+        return np.array([self.x], np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        self.x += 1 if action else -1
+        return np.array([self.x], np.float32), -abs(self.x), False, self.t == 5, {}
+
+
+def drawing(name, file=None):
+    return type("Drawing", (Corridor,), {"draw": DRAWS.get(name), "file": file})
+
+
+def train(env, folder, workers=1, steps=128, **how):
+    return sw.train_agent(
+        sw.EnvSpec(env, engine="sync", workers=workers), SMALL, steps, folder, quiet=True, **how
+    )
+
+
+def weights(run):
+    return {k: v.clone() for k, v in run.policy.weights.items()}
+
+
+def same(one, two):
+    return all(torch.equal(one[k], two[k]) for k in one)
+
+
+def disturb(number):
+    """Let the caller's generators stand anywhere."""
+    random.seed(number)
+    np.random.seed(number)
+    torch.manual_seed(number)
+
+
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("name", DRAWS)
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_same_seed_gives_the_same_weights(name, workers, tmp_path):
+    runs = []
+    for i, seed in enumerate((3, 3, 4)):
+        disturb(i)
+        runs.append(weights(train(drawing(name), tmp_path / str(i), workers, seed=seed)))
+    assert same(runs[0], runs[1])
+    assert not same(runs[0], runs[2])
+
+
+def test_two_processes_begin_in_different_places(tmp_path):
+    file = tmp_path / "starts"
+    train(drawing("numpy.random", file), tmp_path / "run", workers=2)
+    starts = {}
+    for line in file.read_text().splitlines():
+        process, x = line.split()
+        starts.setdefault(process, set()).add(x)
+    starts.pop(str(os.getpid()), None)
+    assert len(starts) == 2
+    assert not set.intersection(*starts.values())
+
+
+def test_environments_that_draw_when_they_are_made_differ_between_processes(tmp_path):
+    class Built(Corridor):
+        def __init__(self):
+            self.length = float(np.random.uniform())
+            if multiprocessing.parent_process() is not None:
+                (tmp_path / f"{os.getpid()}-{self.length}").touch()
+
+    train(Built, tmp_path / "run", workers=2)
+    lengths = [f.name.split("-")[1] for f in tmp_path.iterdir() if "-" in f.name]
+    assert len(lengths) == len(set(lengths)) == 4
+
+
+def test_generators_of_the_caller_stand_where_they_stood(tmp_path):
+    disturb(7)
+    expected = random.random(), np.random.random(), torch.rand(())
+    disturb(7)
+    run = train(drawing("random"), tmp_path / "run")
+    sw.evaluate(run.policy, drawing("torch"), episodes=2)
+    assert (random.random(), np.random.random(), torch.rand(())) == expected
+
+
+def test_an_evaluation_gives_the_same_again(tmp_path):
+    run = train(drawing("torch"), tmp_path / "run")
+    one, two, other = (
+        sw.evaluate(run.policy, drawing("torch"), episodes=3, seed=seed) for seed in (1, 1, 2)
+    )
+    assert one.returns == two.returns
+    assert one.returns != other.returns
+
+
+@pytest.mark.parametrize("name", [*DRAWS, "none"])
+def test_it_is_said_once_that_an_environment_draws_from_them(name, tmp_path, capsys):
+    sw.train_agent(
+        sw.EnvSpec(drawing(name), engine="sync", workers=1), SMALL, 128, tmp_path / "run"
+    )
+    said = capsys.readouterr().err
+    assert said.count("self.np_random") == (name != "none")
+    assert (f"Drawing draws from {name}," in said) == (name != "none")
+
+
+def test_it_is_said_of_processes_too(tmp_path, capsys):
+    spec = sw.EnvSpec(drawing("random"), engine="sync", workers=2)
+    sw.train_agent(spec, SMALL, 128, tmp_path / "run")
+    assert capsys.readouterr().err.count("draws from random,") == 1
+
+
+def test_an_evaluation_alone_says_nothing_of_resuming(tmp_path):
+    run = train(drawing("random"), tmp_path / "run")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sw.evaluate(run.policy, drawing("random"), episodes=2)

@@ -1,0 +1,95 @@
+"""Processes end soon after the one that has started them, whatever they are doing."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+PROGRAM = """
+import multiprocessing, os, socket, sys, time
+import gymnasium as gym, numpy as np
+import skillweave as sw
+
+def forever():
+    while True:
+        try:
+            time.sleep(100)
+        except BaseException:
+            pass
+
+def deaf():
+    socket.socketpair()[0].recv(1)
+
+class Env(gym.Env):
+    observation_space = gym.spaces.Box(-20, 20, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    def __init__(self):
+        if multiprocessing.parent_process() is not None:
+            open(f"pid-{os.getpid()}", "w").close()
+            if what == "constructor":
+                time.sleep(1000)
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+    def step(self, action):
+        if multiprocessing.parent_process() is not None:
+            if what in blocks:
+                blocks[what]()
+            time.sleep(0.002)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+    def close(self):
+        if multiprocessing.parent_process() is not None:
+            open(f"closed-{os.getpid()}", "w").close()
+
+what = sys.argv[1]
+blocks = {"sleep": lambda: time.sleep(1000), "socket": deaf, "swallows": forever}
+long = sw.PPO(num_envs=4, n_steps=8192, batch_size=64, update_epochs=1, network=sw.Network((4,)))
+evolve = sw.Evolution(population=2, generations=1, episodes=2) if what == "part" else None
+if __name__ == "__main__":
+    if what == "spawn":
+        multiprocessing.set_start_method("spawn")
+    spec = sw.EnvSpec(Env, engine="sync", workers=2)
+    sw.train_agent(spec, long, 100_000, "run", quiet=True, evolve=evolve)
+"""
+CLOSES = ("rollout", "sleep", "socket", "part", "spawn")
+
+
+def alive(pid: int) -> bool:
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def begun(folder: Path) -> set[int]:
+    return {int(file.name.split("-")[1]) for file in folder.glob("pid-*")}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+@pytest.mark.parametrize("what", [*CLOSES, "constructor", "swallows"])
+def test_processes_end_soon_after_their_parent_was_killed(what, tmp_path):
+    (tmp_path / "program.py").write_text(PROGRAM)
+    paths = {"PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "program.py", what]
+    parent = subprocess.Popen(command, cwd=tmp_path, env=os.environ | paths)
+    until = time.monotonic() + 60
+    while len(begun(tmp_path)) < 2 and time.monotonic() < until:
+        time.sleep(0.1)
+    time.sleep(1.5)  # in their first rollout
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    pids, until = begun(tmp_path), time.monotonic() + 10
+    assert len(pids) == 2
+    try:
+        while any(map(alive, pids)) and time.monotonic() < until:
+            time.sleep(0.1)
+        assert not any(map(alive, pids))
+    finally:
+        for pid in filter(alive, pids):
+            os.kill(pid, signal.SIGKILL)
+    if what in CLOSES:  # environments could release what they hold
+        assert {int(f.name.split("-")[1]) for f in tmp_path.glob("closed-*")} == pids
