@@ -157,7 +157,7 @@ def test_who_is_below_a_skill_is_drawn_as_well(tmp_path):
 def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):
     manifest: dict[str, Any] = dict(RunDirectory.open(run).manifest)
     empty = RunDirectory.create(tmp_path / "empty", manifest)
-    with pytest.raises(SkillweaveError, match="nothing to draw yet"):
+    with pytest.raises(SkillweaveError, match="nothing to draw"):
         plot_run(empty)
     (empty.path / "lineage.jsonl").write_text('{"stage": "left"}\n')
     with pytest.raises(SkillweaveError, match=r"lineage.jsonl, line 1 is damaged"):
