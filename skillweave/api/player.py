@@ -18,7 +18,8 @@ class Player:
     """A policy that acts in one environment and keeps its memory.
 
     ```python
-        import skillweave as sw
+    import gymnasium as gym
+    import skillweave as sw
 
     env = gym.make("CartPole-v1")
     policy = sw.from_function(
