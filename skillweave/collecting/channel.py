@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
-from pickle import PickleBuffer
 from typing import Any
 
 import numpy as np
@@ -125,7 +124,7 @@ class Channel:
             OSError: the other end is closed (``BrokenPipeError``), or the system refuses.
             Exception: it cannot be pickled.
         """
-        buffers: list[PickleBuffer] = []
+        buffers: list[pickle.PickleBuffer] = []
         stream = io.BytesIO()
         _Pickler(stream, 5, buffer_callback=buffers.append).dump(message)
         parts = [b.raw() for b in buffers]
@@ -205,7 +204,7 @@ class _Pickler(pickle.Pickler):
         kind = type(thing)
         if kind is np.ndarray and thing.nbytes and not thing.dtype.hasobject:
             flat = np.ascontiguousarray(thing).reshape(-1).view(np.uint8)
-            return _array, (PickleBuffer(flat.data), thing.dtype, thing.shape)
+            return _array, (pickle.PickleBuffer(flat.data), thing.dtype, thing.shape)
         if kind is Tensor and _is_plain(thing):
             storage = thing.untyped_storage()
             kept = self._storages.setdefault(storage.data_ptr(), _Storage(thing))
@@ -223,7 +222,7 @@ class _Storage:
         self._bytes = whole.numpy()
 
     def __reduce__(self) -> Any:
-        return _storage, (PickleBuffer(self._bytes.data),)
+        return _storage, (pickle.PickleBuffer(self._bytes.data),)
 
 
 def _is_plain(tensor: Tensor) -> bool:

@@ -58,9 +58,10 @@ class EnvSpec:
             is kept after learning together is found out in the pool.
         workers: processes in which environments are stepped, and acted in, while they are trained
             in. None: one, where they stand in a pool; else it is measured when a run begins, one
-            for each core if a step takes long enough to be worth it. The run keeps the choice, as
-            results depend on it. The members of a population are split among them; None: they stay
-            in one.
+            for each core if a step takes long enough to be worth it, and if a process would not run
+            the program again (see ``multiprocessing``'s start methods). The run keeps the choice,
+            as results depend on it. The members of a population are split among them; None: they
+            stay in one.
         obs_names: what the numbers of an observation are called in reports: a name for each, or for
             a Dict such lists by key. None: those of the environment's attribute ``obs_names``.
 
