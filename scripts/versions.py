@@ -28,7 +28,15 @@ EXTRAS = ("video", "tensorboard", "plot", "hub", "report")
 LINKED = ("torch",)
 """What is taken from the environment that runs this, with its parts."""
 PARTS = ("torch", "torchgen", "functorch", "nvidia", "triton")
-TOOLS = ("pytest>=8", "pytest-xdist>=3.5", "jaxtyping", "beartype", "hypothesis", "hatchling>=1.24")
+TOOLS = (
+    "pytest>=8",
+    "pytest-xdist>=3.5",
+    "jaxtyping",
+    "beartype",
+    "hypothesis",
+    "hatchling>=1.24",
+    "gymnasium[classic-control]",
+)
 TESTS = (
     "tests/algorithms/test_ppo.py",
     "tests/cli/test_cli.py",
@@ -124,7 +132,7 @@ def make(kind: str) -> Path:
         (Path(library.stdout.strip()) / path.name).symlink_to(path)
     pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     _run([*pip, "--no-compile", *asked(kind), *_needs_of_linked(), *TOOLS])
-    _run([*pip, "--no-deps", "--no-build-isolation", "-e", str(ROOT)])
+    _run([*pip, "--no-deps", "-e", str(ROOT)])
     return python
 
 

@@ -161,7 +161,8 @@ class Handler(BaseHTTPRequestHandler):
             raise Answer(409, {"error": "You already created this model repo", "url": name})
         if told["organization"] != user:
             raise Answer(403, {"error": "no"}, {"X-Error-Message": "no right to create a model"})
-        self.hub.make(name, {}, told.get("visibility") == "private")
+        private = told.get("visibility") == "private" or told.get("private") is True
+        self.hub.make(name, {}, private)
         raise Answer(200, {"url": f"{self.hub.url}/{name}", "name": name})
 
     def yaml(self, body: bytes) -> None:

@@ -246,7 +246,11 @@ def read_header(path: Path) -> dict[str, Any]:
 def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
     check_file(path)
     try:
-        with safetensors.safe_open(str(path), framework="pt") as file:
+        # Before 0.5 its tensors are made on the default device, which is the user's.
+        with (
+            torch.device("cpu"),
+            safetensors.safe_open(str(path), framework="pt") as file,
+        ):
             metadata = file.metadata() or {}
             names = file.keys() if with_tensors else ()
             tensors = {k: file.get_tensor(k) for k in names}

@@ -148,10 +148,13 @@ def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
     """
     import safetensors
     import safetensors.torch
+    import torch
 
     found = copy.deepcopy(module)
     try:
-        found.load_state_dict(safetensors.torch.load(content))
+        with torch.device("cpu"):  # the default device is the user's
+            weights = safetensors.torch.load(content)
+        found.load_state_dict(weights)
     except (RuntimeError, safetensors.SafetensorError) as error:
         told = shortened(str(error))
         raise SkillweaveError(f"{who}: the weights in the run do not fit it: {told}") from error

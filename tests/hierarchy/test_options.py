@@ -1,5 +1,7 @@
 """OptionsEnv equals a scalar loop, call for call, and is an ordinary Gymnasium vector."""
 
+import inspect
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -647,6 +649,8 @@ def test_a_list_of_seeds_is_an_error_for_people(options):
 
 def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):
     env = RecordEpisodeStatistics(options(skill_set(Left, Zigzag, call_steps=2), gamma=1.0))
+    if "SAME_STEP" not in inspect.getsource(RecordEpisodeStatistics.step):
+        pytest.skip("an older Gymnasium, whose wrapper counts for one mode of resets alone")
     env.reset(seed=0)
     running, counted = np.zeros(N), 0
     for _ in range(30):
