@@ -307,11 +307,11 @@ def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, 
 
 @pytest.mark.parametrize(
     ("steps", "length", "episodes"),
-    [(1_000_000, 200.0, 100), (100_000, 200.0, 50), (100_000, 1_000.0, 20), (500, None, 50)],
+    [(1_000_000, 200.0, 100), (100_000, 200.0, 50), (100_000, 1_000.0, 20), (500, None, 20)],
 )
 def test_fewer_episodes_are_played_where_they_are_long(monkeypatch, steps, length, episodes):
     monkeypatch.setattr(select_best, "MOST", 100)
-    entry = {"steps": steps, "final": {"length": length}}
+    entry = {"steps": steps, "final": {"length": length}, "algorithm": {"num_envs": 4}}
     assert select_best._episodes(entry) == episodes
 
 
