@@ -1,7 +1,9 @@
 """What was learnt elsewhere acts as a skill; no training pretends to continue it."""
 
 import copy
+import warnings
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -182,3 +184,26 @@ def test_a_zip_of_stable_baselines_acts_as_proposed(tmp_path, monkeypatch):
     exec(proposal.replace("): policy", "):\n    policy"), space)
     run = declare(space["Ready"]()).train("run", quiet=True)
     assert run.evaluate(1, quiet=True).mean > 0
+
+
+@pytest.mark.parametrize("part", [np.s_[:, 4:], np.s_[:, :3:-1]], ids=["part", "in reverse"])
+def test_a_run_may_act_in_a_policy_of_ones_own(part, tmp_path):
+    """What a skill's ``policy`` is given cannot be written to; a run takes any part of it."""
+    arm = sw.train_agent("CartPole-v1", SMALL, 64, tmp_path / "arm", quiet=True)
+
+    class Twice(gym.ObservationWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = gym.spaces.Box(-np.inf, np.inf, (8,), np.float32)
+
+        def observation(self, obs):
+            return np.concatenate([obs, obs])
+
+    class Arm(sw.Skill):
+        def policy(self, obs):
+            return arm.policy.act(arm.policy.start(len(obs)), obs[part])[0]
+
+    spec = sw.EnvSpec("CartPole-v1", wrappers=(Twice,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sw.Hierarchy(spec, [Arm()], steps=64, selector=SMALL).train(tmp_path / "run", quiet=True)

@@ -13,6 +13,7 @@ import torch
 from skillweave.algorithms.base import ActingParams, Algorithm
 from skillweave.compat.numpy_mlp import NumpyMLP
 from skillweave.networks.net import Net
+from skillweave.spaces import to_tensor
 from skillweave.types import Array
 
 Sampled = tuple[Array, Array, Array, Array]
@@ -49,12 +50,12 @@ class NumpyActor:
             return self._nets[field](self._vectors(rows) if self._one_hot else rows)
         with torch.inference_mode():
             actor = ActingParams({}, *self.algorithm.scaling(self.state))
-            inputs = self.algorithm.inputs(actor, torch.from_numpy(rows)[None])
+            inputs = self.algorithm.inputs(actor, to_tensor(rows)[None])
             found: Array = self._all[field](self._views, inputs)[0].numpy()
         return found
 
     def _vectors(self, rows: Array) -> Array:
-        vector, _ = self.algorithm.obs.split(torch.from_numpy(rows))
+        vector, _ = self.algorithm.obs.split(to_tensor(rows))
         found: Array = vector.numpy()
         return found
 

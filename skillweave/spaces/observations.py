@@ -22,10 +22,12 @@ _PICTURE = 36  # sides of what is a picture, and no board
 
 
 def to_tensor(array: Array) -> Tensor:
-    """A batch of observations as a tensor, without a copy where the array is contiguous.
+    """A batch of observations as a tensor, without a copy where PyTorch can have the array itself.
 
     A structured array (*lead,) becomes its bytes, uint8 (*lead, itemsize).
     """
+    if not array.flags.writeable or min(array.strides, default=0) < 0:
+        array = array.copy()
     if array.dtype.fields is None:
         return torch.from_numpy(array)
     raw = np.ascontiguousarray(array).view(np.uint8)
