@@ -272,16 +272,16 @@ def escapes(rng: random.Random, run: Path) -> None:
 def bad_stderr(rng: random.Random, run: Path) -> None:
     """Nothing can be written to standard error."""
     how = rng.choice(("closed", "full", "gone", "none"))
-    if how == "closed":
-        os.close(2)
-    elif how == "full":
-        os.dup2(os.open("/dev/full", os.O_WRONLY), 2)
-    elif how == "gone":
+    stream: Any = None
+    if how == "gone":
         reader, writer = os.pipe()
         os.close(reader)
-        os.dup2(writer, 2)
-    else:
-        sys.stderr = None  # type: ignore[assignment]
+        stream = os.fdopen(writer, "w")
+    elif how != "none":
+        stream = open("/dev/full", "w")  # noqa: SIM115
+        if how == "closed":
+            stream.close()
+    sys.stderr = stream
     trained(rng, run)
 
 
@@ -451,6 +451,7 @@ class Surroundings:
 
 def guarded(function: Callable[[random.Random, Path], None], rng: random.Random, run: Path) -> int:
     """Do it; the exit code says how it ended."""
+    stderr = sys.stderr
     try:
         function(rng, run)
     except SkillweaveError as error:
@@ -459,4 +460,6 @@ def guarded(function: Callable[[random.Random, Path], None], rng: random.Random,
     except AssertionError as error:
         print(f"wrong: {error}")
         return WRONG
+    finally:
+        sys.stderr = stderr
     return 0
