@@ -54,9 +54,14 @@ def notice(text: str) -> None:
     """Tell people a sentence, once in a run."""
     notices = _CURRENT.get()
     if notices is None:
-        warnings.warn(text, stacklevel=2)
+        warn(text)
     else:
         notices.add(text)
+
+
+def warn(text: str) -> None:
+    """Tell people a sentence as a Python warning."""
+    warnings.warn(text, stacklevel=2)
 
 
 def are_collected() -> bool:

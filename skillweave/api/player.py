@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.envs.infos import MASK, observes_mask
+from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
 
@@ -74,7 +74,8 @@ class Player:
                 None: what ``info`` says, or the part ``action_mask`` of the observation; else all.
 
         Raises:
-            SkillweaveError: the observation is none of the policy's; the message says what is.
+            SkillweaveError: the observation is none of the policy's, or the mask none of its
+                actions'; the message says what is.
         """
         seen = self._seen(obs)
         if self._before is not None:
@@ -85,12 +86,24 @@ class Player:
             mask = (info or {}).get(MASK)
         if mask is None and observes_mask(self._space, self.policy.action_space):
             mask = seen[MASK].reshape(-1)
-        allowed = None if mask is None else np.asarray(mask, bool)[None]
+        allowed = None if mask is None else self._allowed(mask)
         action, self.memory = self.policy.act(
             self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
         )
         self._before = seen, action
         return action[0]
+
+    def _allowed(self, mask: Any) -> Array:
+        """A mask as a batch of one."""
+        if not isinstance(self.policy.action_space, DISCRETE):
+            return np.ones((1, 1), bool)
+        try:
+            allowed = checked_mask(mask, self.policy.action_space)
+        except ValueError as error:
+            raise SkillweaveError(f"act(): {error}") from error
+        if not allowed.any():
+            raise SkillweaveError("act(): its action_mask allows no action")
+        return allowed[None]
 
     def _step(self, seen: Array, reward: float, info: Mapping[str, Any]) -> Step:
         """The step that led to an observation."""

@@ -23,7 +23,7 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import copied, every_hierarchy
 from skillweave.messages import absolute, as_path, short, shown_path
-from skillweave.notices import collected_notices
+from skillweave.notices import collected_notices, warn
 from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
@@ -237,7 +237,7 @@ def go_on(
         progress.plan(run.manifest["stages"])
         if note:
             progress.message(note)
-        notices.tell_by(progress.message)
+        notices.tell_by(warn if quiet else progress.message)
         trackers = make_trackers(run.manifest.get("track", ()), run)
         for tracker in trackers:
             stack.callback(tracker.close)

@@ -6,16 +6,18 @@ numbers of all of them at once, which costs a few microseconds a step, whatever 
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.infos import DISCRETE, MASK, observes_mask
+from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
 from skillweave.messages import short, told
 from skillweave.notices import notice
-from skillweave.spaces import obs_dtype, obs_shape
+from skillweave.spaces import obs_shape
+from skillweave.spaces.packing import parts
 from skillweave.types import (
     LARGEST_REWARD,
     Array,
@@ -48,6 +50,8 @@ _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners
 def is_batched(env: object) -> bool:
     """Whether it is a simulator that steps many environments at once, or its class."""
     kind = env if isinstance(env, type) else type(env)
+    if issubclass(kind, gym.Env):
+        return False
     return issubclass(kind, gym.vector.VectorEnv) or (
         hasattr(env, "num_envs") and hasattr(env, "step_async")  # Stable-Baselines3's
     )
@@ -93,10 +97,10 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         self._fits = _fits(env.observation_space)
         for wrapper in _wrappers(env):
             _refuse_changing(wrapper, name)
-        has_masks = env.has_wrapper_attr("action_masks")
-        masks = env.get_wrapper_attr("action_masks") if has_masks else None
         self._looked = number != 0  # the first of several speaks for all
-        self._masks = masks if callable(masks) else None
+        self._chooses = isinstance(env.action_space, DISCRETE)
+        masks = _attribute(env, "action_masks") if self._chooses else None
+        self._masks = masks if _takes_nothing(masks) else None
         """As sb3-contrib's MaskablePPO asks environments for masks."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -117,7 +121,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if not self._looked:
             self._looked = True
             self._look_for_masks(info)
-        return obs, info if self._masks is None else self._with_mask(info)
+        return obs, self._with_mask(info) if self._chooses else info
 
     def step(self, action: Any) -> Any:
         """Act."""
@@ -146,14 +150,14 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             truncated = self._flag(truncated, "truncated")
         if type(info) is not dict:
             self._check_info(info)
-        if self._masks is not None:
-            info = self._with_mask(info)
+        if self._chooses:
+            info = self._with_mask(info, over=terminated or truncated)
         return obs, reward, terminated, truncated, info
 
     def _look_for_masks(self, info: dict[str, Any]) -> None:
         """Warn where something else than a mask that is used looks like one."""
         space, actions = self.env.observation_space, self.env.action_space
-        if not isinstance(actions, DISCRETE) or self._masks is not None or MASK in info:
+        if not self._chooses or self._masks is not None or MASK in info:
             return
         if observes_mask(space, actions):
             return
@@ -161,7 +165,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         names = (MASK, *LIKE_MASKS)
         found = [f"info[{n!r}]" for n in names if n in info]
         found += [f"the observation's {n!r}" for n in names if n in shown]
-        found += [f"its {n}" for n in LIKE_METHODS if self.env.has_wrapper_attr(n)]
+        found += [f"its {n}" for n in LIKE_METHODS if _attribute(self.env, n) is not None]
         if found:
             notice(
                 f"{self._name}: {found[0]} looks like an action mask, but is not used as one: "
@@ -170,15 +174,28 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
                 "forbidden"
             )
 
-    def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
-        """The info with what ``action_masks()`` says, unless it has a mask of its own."""
+    def _with_mask(self, info: dict[str, Any], *, over: bool = False) -> dict[str, Any]:
+        """The info with its mask (A,) bool, or else the one that ``action_masks()`` gives.
+
+        Args:
+            over: the episode is, so that nothing needs to be allowed.
+        """
         if MASK in info:
+            mask = info[MASK]
+        elif self._masks is None or over:
             return info
-        assert self._masks is not None
+        else:
+            try:
+                mask = self._masks()
+            except Exception as error:
+                raise self._wrong(f"action_masks() raised {told(error)}") from error
+        others = {key: value for key, value in info.items() if key != MASK}
+        if mask is None:  # everything is allowed
+            return others
         try:
-            return {**info, MASK: np.array(self._masks())}
-        except Exception as error:
-            raise self._wrong(f"action_masks() raised {told(error)}") from error
+            return {**others, MASK: checked_mask(mask, self.env.action_space)}
+        except ValueError as error:
+            raise self._wrong(str(error)) from error
 
     def close(self) -> None:
         """Release it; what goes wrong is told, and costs nothing that was learnt."""
@@ -221,6 +238,28 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
     def _wrong(self, what: str) -> SkillweaveError:
         where = f"environment {self._number}, " if self._number is not None else ""
         return SkillweaveError(f"{self._name}: {where}step {self._elapsed} of its episode: {what}")
+
+
+def _attribute(env: gym.Env[Any, Any], name: str) -> Any:
+    """What an environment or one of its wrappers has under a name; None: nothing.
+
+    An environment that passes any name on to a server is not asked.
+    """
+    for layer in (*_wrappers(env), env.unwrapped):
+        if inspect.getattr_static(layer, name, None) is not None:
+            return getattr(layer, name)
+    return None
+
+
+def _takes_nothing(method: Any) -> bool:
+    """Whether something can be called without arguments."""
+    if not callable(method):
+        return False
+    try:
+        inspect.signature(method).bind()
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def _wrappers(env: gym.Env[Any, Any]) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
@@ -279,7 +318,7 @@ class Watch:
 
     def __init__(self, name: str, space: gym.Space[Any], num_envs: int, first: int = 0) -> None:
         self._name, self._num_envs, self._first = name, num_envs, first
-        self._places = tuple(_real(obs_dtype(space)))
+        self._places = tuple(_numbers_in(space))
         self._elapsed = np.zeros(num_envs, np.int64)
         self._told_coarse = first != 0  # the first of several speaks for all
 
@@ -319,14 +358,17 @@ class Watch:
             part = obs
             for name in place:
                 part = part[name]
-            coarse = part.dtype.itemsize > 4
-            size = np.abs(part) if coarse else part
-            fits = size <= LARGEST_SEEN if coarse else np.isfinite(part)
-            if b"\0" in fits.tobytes():  # for small arrays half the time of all()
-                raise self._out_of_range(part, place, ids)
-            if coarse and not self._told_coarse and size.max(initial=0.0) > COARSE:
+            coarse, real = part.dtype.itemsize > 4, part.dtype.kind == "f"
+            if not real and self._told_coarse:
+                continue
+            size = np.abs(part) if coarse or not real else part
+            if real:
+                fits = size <= LARGEST_SEEN if coarse else np.isfinite(part)
+                if b"\0" in fits.tobytes():  # for small arrays half the time of all()
+                    raise self._out_of_range(part, place, ids)
+            if (coarse or not real) and not self._told_coarse and size.max(initial=0) > COARSE:
                 self._told_coarse = True
-                self._tell_coarse(float(size.max()), place)
+                self._tell_coarse(float(size.max()), place, part.dtype)
 
     def _out_of_range(
         self, part: Array, place: tuple[str, ...], ids: Array | None
@@ -345,12 +387,12 @@ class Watch:
             "or wrap it",
         )
 
-    def _tell_coarse(self, size: float, place: tuple[str, ...]) -> None:
-        """Warn of float64 numbers that networks cannot tell apart."""
+    def _tell_coarse(self, size: float, place: tuple[str, ...], dtype: np.dtype[Any]) -> None:
+        """Warn of numbers that networks cannot tell apart."""
         step = float(np.spacing(np.float32(size / 2)) * 2)
         notice(
             f"{self._name}: its observation{_named(place)} has a number as large as {size:,.0f}, "
-            f"in float64. Networks compute in float32, where numbers of this size are {step:g} "
+            f"in {dtype}. Networks compute in float32, where numbers of this size are {step:g} "
             "apart: smaller changes cannot be seen. Let the environment subtract what is always "
             "there, or give it in other units"
         )
@@ -367,13 +409,16 @@ def _named(place: tuple[str, ...]) -> str:
     return f" ({'.'.join(place)})" if place else ""
 
 
-def _real(dtype: np.dtype[Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Where the floats of an observation are: names of the parts."""
-    if dtype.fields is not None:
-        for name, (part, *_) in dtype.fields.items():
-            yield from _real(part.base, (*place, name))
-    elif dtype.kind == "f":
-        yield place
+def _numbers_in(space: gym.Space[Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Where an observation has floats, or whole numbers that float32 may not hold: part names."""
+    inner = parts(space)
+    if inner is not None:
+        for name, part in inner.items():
+            yield from _numbers_in(part, (*place, name))
+    elif isinstance(space, gym.spaces.Box):
+        dtype = np.dtype(space.dtype)
+        if dtype.kind == "f" or (dtype.kind in "iu" and dtype.itemsize >= 4):
+            yield place
 
 
 def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:

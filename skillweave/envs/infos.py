@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.messages import short
-from skillweave.skills.info_words import NUMBERS
+from skillweave.skills.info_words import NUMBERS, info_keys
 from skillweave.spaces import action_codec
 from skillweave.types import Array, SkillweaveError
 
@@ -47,7 +47,7 @@ def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _column(rows: list[int], values: list[Any], n: int) -> Any:
     """What n environments give under one key, of which ``rows`` give something."""
     kinds = set(map(type, values))
-    if kinds == {dict}:
+    if all(issubclass(kind, dict) for kind in kinds):
         inner: list[dict[str, Any]] = [{}] * n
         for row, value in zip(rows, values, strict=True):
             inner[row] = value
@@ -85,7 +85,10 @@ def _stacked(values: list[Array]) -> Array | None:
     first = values[0]
     if any(v.shape != first.shape for v in values):
         return None
-    stacked = np.stack(values)
+    try:
+        stacked = np.stack(values)
+    except TypeError:  # dates and numbers, for example
+        return None
     if any(v.dtype != stacked.dtype for v in values):
         same = all(
             np.array_equal(a, v, equal_nan=v.dtype.kind == "f")
@@ -93,6 +96,39 @@ def _stacked(values: list[Array]) -> Array | None:
         )
         return stacked if same else None
     return stacked
+
+
+def joined_infos(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> dict[str, Any]:
+    """Batched infos of several groups of so many environments each, as one of all of them."""
+    first = infos[0]
+    plain = all(isinstance(v, np.ndarray) and v.ndim and v.dtype != object for v in first.values())
+    if plain and all(_alike(info, first) for info in infos):
+        return {key: np.concatenate([info[key] for info in infos]) for key in first}
+    return batched_infos(
+        [one for info, n in zip(infos, counts, strict=True) for one in _single(info, n)]
+    )
+
+
+def _alike(info: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two batched infos have the same keys, with arrays of one kind and shape."""
+    return info.keys() == other.keys() and all(
+        isinstance(value := info[key], np.ndarray)
+        and value.dtype == like.dtype
+        and value.shape[1:] == like.shape[1:]
+        for key, like in other.items()
+    )
+
+
+def _single(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
+    """A batched info of n environments as the info of each: the inverse of ``batched_infos``."""
+    each: list[dict[str, Any]] = [{} for _ in range(n)]
+    for key in info_keys(info):
+        column = info[key]
+        values = _single(column, n) if isinstance(column, dict) else column
+        here = info.get(f"_{key}", np.ones(n, bool))
+        for row in np.flatnonzero(here):
+            each[row][key] = values[row]
+    return each
 
 
 def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
@@ -124,6 +160,30 @@ def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> b
         return False
     shape = observation_space.spaces[MASK].shape or ()
     return int(np.prod(shape)) == sum(action_codec(space).parts)
+
+
+def checked_mask(told: Any, space: gym.Space[Any]) -> Array:
+    """The mask (A,) bool that an environment or a user gives for the choices of a space.
+
+    Several choices may have a list each.
+
+    Raises:
+        ValueError: it is no number for each choice; the message says what it is.
+    """
+    size = sum(action_codec(space).parts)
+    try:
+        mask = np.asarray(told)
+        if mask.dtype == object:
+            mask = np.concatenate([np.ravel(part) for part in told])
+    except (TypeError, ValueError):
+        mask = np.array(None)
+    if mask.size != size or mask.dtype.kind not in "iubf":
+        raise ValueError(
+            f"its action_mask is {short(told)}; it must be a number for each choice of {space}, "
+            f"{size} in all, 0 where it is forbidden"
+        )
+    allowed: Array = mask.reshape(-1) != 0
+    return allowed
 
 
 class ActionMasks:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import info_rows
+from skillweave.envs.infos import info_rows, joined_infos
 from skillweave.types import Array
 
 
@@ -86,50 +85,5 @@ def _joined(steps: Sequence[RawStep], counts: Sequence[int]) -> RawStep:
         np.concatenate([s.reward for s in steps]),
         np.concatenate([s.terminated for s in steps]),
         np.concatenate([s.truncated for s in steps]),
-        _infos([s.info for s in steps], counts),
+        joined_infos([s.info for s in steps], counts),
     )
-
-
-def _infos(infos: Sequence[dict[str, Any]], counts: Sequence[int]) -> dict[str, Any]:
-    """What parts of so many environments tell, array by array, nested dicts included.
-
-    Where a part tells nothing stand zeros, or None among objects, as Gymnasium has them.
-    """
-    found: dict[str, Any] = {}
-    for name in dict.fromkeys(name for info in infos for name in info):
-        values = [info.get(name) for info in infos]
-        told = [value for value in values if value is not None]
-        if all(isinstance(value, dict) for value in told):
-            found[name] = _infos([value or {} for value in values], counts)
-            continue
-        if not all(isinstance(value, np.ndarray) and value.ndim for value in told):
-            continue
-        shapes = {value.shape[1:] for value in told}
-        kinds = {value.dtype.kind for value in told}
-        whole = len(shapes) == 1 and "O" not in kinds
-        found[name] = np.concatenate(
-            [
-                _nothing(count, told[0], whole)
-                if value is None
-                else value
-                if whole
-                else _each(value)
-                for value, count in zip(values, counts, strict=True)
-            ]
-        )
-    return found
-
-
-def _nothing(count: int, example: Array, whole: bool) -> Array:
-    """Rows of a part that tells nothing."""
-    if not whole:
-        return np.full(count, None, object)
-    return np.zeros((count, *example.shape[1:]), example.dtype)
-
-
-def _each(value: Array) -> Array:
-    """The rows of an array as objects."""
-    rows = np.full(len(value), None, object)
-    for row, one in enumerate(value):
-        rows[row] = one
-    return rows

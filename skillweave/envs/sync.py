@@ -28,7 +28,7 @@ class SyncEnvs:
         self.envs: list[gym.Env[Any, Any]] = []
         try:
             for make in makers:
-                self.envs.append(make())
+                self.envs.append(self._made(make))
             self._check_alike(name)
         except BaseException:
             self.close()
@@ -88,6 +88,17 @@ class SyncEnvs:
         """Close all of them."""
         for env in self.envs:
             env.close()
+
+    def _made(self, make: Callable[[], gym.Env[Any, Any]]) -> gym.Env[Any, Any]:
+        try:
+            return make()
+        except SkillweaveError as error:
+            if not (made := len(self.envs)):
+                raise
+            raise SkillweaveError(
+                f"{error}. {made} could be made: if there can be no more at once, set "
+                f"num_envs={made} in each algorithm, the selector's too"
+            ) from error
 
     def _empty(self, n: int) -> Array:
         # Zeros: bytes between the parts of an observation are written to files.

@@ -6,7 +6,7 @@ Generators stay on the CPU, so that a seed gives the same numbers on every devic
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import torch
@@ -73,14 +73,18 @@ def all_false(flags: Tensor) -> bool:
 
 @contextmanager
 def normal_tensors() -> Iterator[None]:
-    """Leave ``torch.inference_mode``, whose tensors cannot be learnt with; no gradients are made.
+    """Leave ``torch.inference_mode``, whose tensors cannot be learnt with, and ``torch.autocast``.
 
-    The mode is one of this thread, and of the user: it may surround the whole training.
+    The modes are of this thread, and of the user: they may surround the whole training. After
+    inference mode no gradients are made.
     """
-    if not torch.is_inference_mode_enabled():
-        yield
-        return
-    with torch.inference_mode(False), torch.no_grad():
+    with ExitStack() as stack:
+        for device in ("cpu", "cuda"):
+            if torch.is_autocast_enabled(device):
+                stack.enter_context(torch.autocast(device, enabled=False))
+        if torch.is_inference_mode_enabled():
+            stack.enter_context(torch.inference_mode(False))
+            stack.enter_context(torch.no_grad())
         yield
 
 

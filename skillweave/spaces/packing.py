@@ -76,9 +76,19 @@ def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...])
         if isinstance(space, gym.spaces.Box | gym.spaces.Discrete | kinds):
             dtype = np.dtype(space.dtype)
             if dtype.kind == "f" and dtype.itemsize > 8:
+                wrapper = "lambda env: gymnasium.wrappers.DtypeObservation(env, numpy.float64)"
+                what = (
+                    f"the part {'.'.join(place)} of the observation space"
+                    if place
+                    else (f"observation space {short(space)}")
+                )
+                advice = (
+                    "let the environment give float64 there"
+                    if place
+                    else f"convert it: EnvSpec(env, wrappers=({wrapper},))"
+                )
                 raise SkillweaveError(
-                    f"observation space {short(space)} is of {dtype}, which PyTorch does not have: "
-                    "wrappers=(lambda env: gymnasium.wrappers.DtypeObservation(env, np.float64),)"
+                    f"{what} is of {dtype}, which PyTorch does not have; {advice}"
                 )
             return dtype
         raise SkillweaveError(_unsupported(space, whole, place))

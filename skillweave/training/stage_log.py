@@ -10,6 +10,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
 from skillweave.messages import close_matches
+from skillweave.notices import notice
 from skillweave.reading import shown
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory
@@ -90,7 +91,7 @@ class StageLog:
         for listener in listeners:
             listener.stage(name, int(self.entry["budget"]))
         for file in lack:
-            self.tell(f"{run.path / file} was removed or shortened: curves begin where it does")
+            self.tell(f"{run.path / file} was removed or shortened: curves lack what stood there")
 
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """An update was made."""
@@ -172,7 +173,7 @@ class StageLog:
         if tally.longest < LONG_EPISODE or self.run.reported_endless:
             return
         self.run.reported_endless = True
-        self.tell(
+        notice(
             f"an episode has run {tally.longest:,} steps without an end, and no time limit is "
             "known: it is truncated only after "
             f"{LONGEST_EPISODE:,} steps, and evaluations cut theirs after {LONG_EPISODE:,}. If it "

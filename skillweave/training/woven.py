@@ -165,7 +165,7 @@ class WovenAgents(OneAgent):
         if latest and latest.get("evolution") is None and kept != "before" and not path.exists():
             log.tell(
                 f"{path} is not there any more, so {name!r} goes on with its weights alone, and "
-                "the end is another one"
+                "learns otherwise than without the interruption"
             )
 
     def _as_before(

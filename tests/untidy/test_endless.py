@@ -57,6 +57,11 @@ def test_it_is_said_once_in_a_run(learn, workers, tmp_path, capsys):
     assert said(capsys) == 1
 
 
+def test_a_quiet_run_says_it_as_a_python_warning(tmp_path):
+    with pytest.warns(UserWarning, match="steps without an end"):
+        sw.train_agent(sw.EnvSpec(Endless, workers=1), SMALL, 400, tmp_path / "run", quiet=True)
+
+
 @pytest.mark.parametrize(
     "spec",
     [

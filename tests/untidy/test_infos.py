@@ -1,5 +1,7 @@
 """Infos of several environments: a skill reads exactly what each environment gave."""
 
+from collections import Counter, OrderedDict
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -83,6 +85,8 @@ KINDS = {
     "arrays of several shapes": [np.array([1, 2]), np.array([1.0, 2.0, 3.0])],
     "an array or a number": [np.array([1, 2]), 7],
     "a list or a text": [[1, 2], "goal"],
+    "arrays of dates and of numbers": [np.array(["2026-01-01"], "M8[D]"), np.array([3])],
+    "arrays of records and of numbers": [np.array([(1, 2)], "i4,i4"), np.array([3.0])],
 }
 
 
@@ -93,6 +97,30 @@ def test_each_environment_is_read_exactly(values, tmp_path):
     agents = {"algorithm": SMALL, "selector": SMALL}
     sw.Hierarchy(spec, [Reads(values)], steps=256, **agents).train(tmp_path / "run", quiet=True)
     assert len(READ) > 50
+
+
+def test_dicts_of_any_kind_are_read_by_their_keys(tmp_path):
+    class Nested(sw.Skill):
+        max_steps = 5
+
+        def reward(self, step):
+            np.testing.assert_array_equal(step.info["told"]["x"], step.next_obs[:, 0])
+            READ.append(1)
+            return step.info["told"]["x"]
+
+    READ.clear()
+    kinds = [OrderedDict(x=0), {"x": 1.0}, Counter(x=2)]
+    agents = {"algorithm": SMALL, "selector": SMALL}
+    sw.Hierarchy(telling(kinds), [Nested()], steps=256, **agents).train(
+        tmp_path / "run", quiet=True
+    )
+    assert READ
+
+
+def test_members_of_a_population_may_tell_other_kinds(tmp_path):
+    values = [0, 2**60 + 1, 0.5, {"a": 1}, np.arange(3), "goal", ABSENT]
+    evolve = sw.Evolution(population=2, generations=2)
+    sw.train_agent(telling(values), SMALL, 1_500, tmp_path / "run", evolve=evolve, quiet=True)
 
 
 class Scores(sw.Skill):

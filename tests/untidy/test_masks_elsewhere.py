@@ -115,6 +115,87 @@ def test_what_looks_like_a_mask_and_is_not_used_is_said_once(where, says, tmp_pa
     assert said.count("looks like an action mask") == 1
 
 
+class Own(Slots):
+    """Gives masks in its own way."""
+
+    def __init__(self, mask, action_space=None):
+        super().__init__("none")
+        self.mask, self.over = mask, False
+        self.action_space = action_space or self.action_space
+
+    def reset(self, *, seed=None, options=None):
+        self.over = False
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        self.over = truncated
+        return obs, reward, terminated, truncated, info
+
+
+class Told(Own):
+    def deal(self):
+        obs, info = super().deal()
+        return obs, info | {"action_mask": self.mask(self)}
+
+
+class Asked(Own):
+    def action_masks(self):
+        assert not self.over, "the episode is over"
+        return self.mask(self)
+
+
+MASKS = {
+    "a list": lambda env: [int(x) for x in env.free],
+    "bool": lambda env: env.free.astype(bool),
+    "a column": lambda env: env.free[:, None],
+    "None, for all": lambda env: None if env.t % 2 else env.free,
+}
+
+
+@pytest.mark.parametrize("kind", [Told, Asked])
+@pytest.mark.parametrize("mask", MASKS.values(), ids=MASKS)
+def test_masks_may_be_given_in_many_ways(kind, mask, tmp_path):
+    ILLEGAL.clear()
+    spec = sw.EnvSpec(lambda: kind(mask), workers=1)
+    run = sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
+    run.evaluate(3)
+    assert mask is MASKS["None, for all"] or not ILLEGAL
+
+
+@pytest.mark.parametrize("kind", [Told, Asked])
+@pytest.mark.parametrize("mask", [[1, 0], "all", np.ones(7)])
+def test_a_mask_that_is_none_names_environment_and_step(kind, mask, tmp_path):
+    spec = sw.EnvSpec(lambda: kind(lambda env: mask), workers=1)
+    with pytest.raises(sw.SkillweaveError, match=r"environment 0, step 0 .*6 in all"):
+        sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
+
+
+def test_where_nothing_is_chosen_masks_are_not_asked_for(tmp_path):
+    def fails(env):
+        raise NotImplementedError
+
+    box = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    class Moves(Asked):
+        def step(self, action):
+            return super().step(0)
+
+    spec = sw.EnvSpec(lambda: Moves(fails, box), workers=1)
+    sw.train_agent(spec, SMALL, 64, tmp_path / "run", quiet=True)
+
+
+@pytest.mark.parametrize("mask", [[1, 0], "all", np.zeros(6)])
+def test_a_player_is_not_given_a_wrong_mask(mask):
+    policy = sw.from_function(
+        lambda obs: np.zeros(len(obs), int),
+        observation_space=Slots("none").observation_space,
+        action_space=Slots("none").action_space,
+    )
+    with pytest.raises(sw.SkillweaveError, match="action_mask"):
+        sw.Player(policy).act(np.zeros(6, np.int8), mask=mask)
+
+
 def test_a_method_that_fails_is_named(tmp_path):
     class Broken(Slots):
         def action_masks(self):
