@@ -26,7 +26,7 @@ KINDS = ("lowest", "newest")
 EXTRAS = ("video", "tensorboard", "plot", "hub", "report")
 """Extras that are quickly installed; what needs another one is not tried here."""
 LINKED = ("torch",)
-"""What is taken from the environment that runs this, with its parts."""
+"""Packages that are taken from the environment that runs this, with their parts."""
 PARTS = ("torch", "torchgen", "functorch", "nvidia", "triton")
 TOOLS = (
     "pytest>=8",

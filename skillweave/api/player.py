@@ -94,7 +94,7 @@ class Player:
         return action[0]
 
     def _allowed(self, mask: Any) -> Array:
-        """A mask as a batch of one."""
+        """Return a mask as a batch of one."""
         if not isinstance(self.policy.action_space, DISCRETE):
             return np.ones((1, 1), bool)
         try:

@@ -79,7 +79,7 @@ def _place(run: OneRun, argument: str) -> Path:
 
 
 def _use_of(value: Any) -> tuple[str, str] | None:
-    """What a value is that was learnt elsewhere, and how it can be used; None: it is none."""
+    """Return words on a value that was learnt elsewhere, and on its use; None for other values."""
 
     def as_skill(policy: str) -> str:
         return (

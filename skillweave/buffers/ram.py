@@ -1,4 +1,4 @@
-"""Whether something fits into memory, before it is made."""
+"""Checks of free memory before something large is made."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 PROCESSES, GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
-"""Where Linux tells of memory, and of the limits of groups of processes."""
+"""Files of Linux with its memory, and with the limits of groups of processes."""
 FILES = {
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     2: ("memory.max", "memory.current", "inactive_file"),
@@ -71,7 +71,7 @@ def _of_groups() -> Iterator[int]:
 
 
 def _of_group(group: Path, names: tuple[str, str, str]) -> int | None:
-    """What a group can still give: its limit less its use, but for files that can be dropped."""
+    """Return the memory that a group has left: its limit less its use without droppable files."""
     limit, used = (_text(group / name).strip() for name in names[:2])
     if not limit.isdecimal() or not used.isdecimal():  # "max": no limit
         return None

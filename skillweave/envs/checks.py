@@ -48,7 +48,7 @@ _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners
 
 
 def is_batched(env: object) -> bool:
-    """Whether it is a simulator that steps many environments at once, or its class."""
+    """Return whether it is a simulator that steps many environments at once, or its class."""
     kind = env if isinstance(env, type) else type(env)
     if issubclass(kind, gym.Env):
         return False
@@ -175,7 +175,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             )
 
     def _with_mask(self, info: dict[str, Any], *, over: bool = False) -> dict[str, Any]:
-        """The info with its mask (A,) bool, or else the one that ``action_masks()`` gives.
+        """Return the info with its mask (A,) bool, or with the one of ``action_masks()``.
 
         Args:
             over: the episode is, so that nothing needs to be allowed.
@@ -241,7 +241,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _attribute(env: gym.Env[Any, Any], name: str) -> Any:
-    """What an environment or one of its wrappers has under a name; None: nothing.
+    """Return the attribute of an environment or of one of its wrappers; None: there is none.
 
     An environment that passes any name on to a server is not asked.
     """
@@ -252,7 +252,7 @@ def _attribute(env: gym.Env[Any, Any], name: str) -> Any:
 
 
 def _takes_nothing(method: Any) -> bool:
-    """Whether something can be called without arguments."""
+    """Return whether an object can be called without arguments."""
     if not callable(method):
         return False
     try:
@@ -410,7 +410,7 @@ def _named(place: tuple[str, ...]) -> str:
 
 
 def _numbers_in(space: gym.Space[Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Where an observation has floats, or whole numbers that float32 may not hold: part names."""
+    """Yield the places of floats, and of whole numbers that float32 may not hold, by part names."""
     inner = parts(space)
     if inner is not None:
         for name, part in inner.items():

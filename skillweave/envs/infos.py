@@ -15,7 +15,7 @@ from skillweave.types import Array, SkillweaveError
 
 
 def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The infos of n environments as one, as Gymnasium's vectors have it.
+    """Batch the infos of n environments, as Gymnasium's vectors have them.
 
     Gymnasium casts the values of all environments to the type of the first, 0.5 to 0 for example.
     Here an array has a type that holds all of them as they are.
@@ -45,7 +45,7 @@ def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _column(rows: list[int], values: list[Any], n: int) -> Any:
-    """What n environments give under one key, of which ``rows`` give something."""
+    """Return the values of n environments under one key as a column; ``rows`` give one."""
     kinds = set(map(type, values))
     if all(issubclass(kind, dict) for kind in kinds):
         inner: list[dict[str, Any]] = [{}] * n
@@ -70,7 +70,7 @@ def _column(rows: list[int], values: list[Any], n: int) -> Any:
 
 
 def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
-    """Numbers as an array; None: no type holds all of them as they are."""
+    """Return numbers as an array; None: no type holds all of them as they are."""
     array = np.array(values)
     if array.dtype.kind not in "biufc":
         return None  # whole numbers that are too large
@@ -81,7 +81,7 @@ def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
 
 
 def _stacked(values: list[Array]) -> Array | None:
-    """Arrays of one shape as one; None: no array holds all of them as they are."""
+    """Stack arrays; None: no array holds all of them as they are."""
     first = values[0]
     if any(v.shape != first.shape for v in values):
         return None
@@ -99,7 +99,7 @@ def _stacked(values: list[Array]) -> Array | None:
 
 
 def joined_infos(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> dict[str, Any]:
-    """Batched infos of several groups of so many environments each, as one of all of them."""
+    """Join the batched infos of several groups, of ``counts`` environments each."""
     first = infos[0]
     plain = all(isinstance(v, np.ndarray) and v.ndim and v.dtype != object for v in first.values())
     if plain and all(_alike(info, first) for info in infos):
@@ -110,7 +110,7 @@ def joined_infos(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> d
 
 
 def _alike(info: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two batched infos have the same keys, with arrays of one kind and shape."""
+    """Return whether two batched infos have the same keys, with arrays of one type and shape."""
     return info.keys() == other.keys() and all(
         isinstance(value := info[key], np.ndarray)
         and value.dtype == like.dtype
@@ -120,7 +120,7 @@ def _alike(info: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _single(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
-    """A batched info of n environments as the info of each: the inverse of ``batched_infos``."""
+    """Return the info of each of n environments: the inverse of ``batched_infos``."""
     each: list[dict[str, Any]] = [{} for _ in range(n)]
     for key in info_keys(info):
         column = info[key]
@@ -153,7 +153,7 @@ MASK = "action_mask"
 
 
 def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> bool:
-    """Whether observations have a part that says which actions are allowed."""
+    """Return whether observations have a part that says which actions are allowed."""
     if not isinstance(observation_space, gym.spaces.Dict) or MASK not in observation_space.spaces:
         return False
     if not isinstance(space, DISCRETE):
@@ -163,7 +163,7 @@ def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> b
 
 
 def checked_mask(told: Any, space: gym.Space[Any]) -> Array:
-    """The mask (A,) bool that an environment or a user gives for the choices of a space.
+    """Return the mask (A,) bool that an environment or a user gives for the choices of a space.
 
     Several choices may have a list each.
 

@@ -222,7 +222,7 @@ class EnvSpec:
 
     @property
     def _called(self) -> str:
-        """What a message calls the function that makes the environment."""
+        """Return the name for messages of the function that makes the environment."""
         return self.name if self.name.isidentifier() else "your_function"
 
     @property

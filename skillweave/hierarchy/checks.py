@@ -69,7 +69,7 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
 
 
 _OF_TRAINING = ("algorithm", "steps", "task_weight", "target_return", "target_success")
-"""What of a skill says how it is trained."""
+"""Attributes of a skill that say how it is trained."""
 
 
 def _check_untrained(skill: Skill) -> None:
@@ -95,7 +95,7 @@ def _check_untrained(skill: Skill) -> None:
 
 
 def _distance(skill: Skill, field: str) -> int:
-    """Where a skill's field is set: 0 on the object, 1 in its class, more in those above."""
+    """Return the place of a skill's field: 0 on the object, 1 in its class, more in those above."""
     places = [vars(skill), *map(vars, type(skill).__mro__)]
     return next((i for i, names in enumerate(places) if field in names), len(places))
 

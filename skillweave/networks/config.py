@@ -138,8 +138,8 @@ class Network:
     the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without images,
     which are seen in any case. For a skill that is not to know of the task around it."""
     planes: Literal["first", "last"] | None = None
-    """Which axis of an image holds its channels, or a board's planes; None: the shape says it, as
-    (8, 8, 111) and (3, 210, 160) do. For the images whose shape does not say it, (3, 3, 3) for
+    """The axis of an image that holds its channels, or a board's planes; None: the shape says it,
+    as (8, 8, 111) and (3, 210, 160) do. For the images whose shape does not say it, (3, 3, 3) for
     example; where each shape does, for all."""
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ from skillweave.types import SkillweaveError
 FLOAT: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
 INT: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
 BOOL: dict[str, Any] = {"dtype": torch.bool, "device": "cpu"}
-"""What new tensors are: the defaults of PyTorch are the user's (``torch.set_default_dtype``)."""
+"""Types of new tensors: the defaults of PyTorch are the user's (``torch.set_default_dtype``)."""
 DEVICES = ("cpu", "cuda", "auto")
 """Names of devices that settings know."""
 

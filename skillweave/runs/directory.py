@@ -66,7 +66,7 @@ LINES = ("metrics_bytes", "lineage_bytes")
 LONGEST_NAME = 255
 """Bytes of a file's name, on nearly all file systems."""
 MORE = 14
-"""How much longer a file's name is while it is written."""
+"""Characters that a file's name has more while it is written."""
 
 
 def _check_file_names(manifest: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from skillweave.runs.files import write_bytes
 from skillweave.types import SkillweaveError
 
 ABOVE = 2
-"""How many folders above a file its run is looked for: ``<run>/policies/<file>``."""
+"""Folders above a file in which its run is looked for: ``<run>/policies/<file>``."""
 TRACKERS = ("wandb",)
 """Folders of trackers that make links there, to other files of the same folder."""
 

@@ -1,4 +1,4 @@
-"""What a batched info holds, in words: for errors of all that read infos."""
+"""Words on a batched info, for errors of code that reads infos."""
 
 from __future__ import annotations
 

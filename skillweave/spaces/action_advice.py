@@ -28,7 +28,7 @@ def unsupported_action(space: gym.Space[Any]) -> SkillweaveError:
 
 
 def _way(space: gym.Space[Any]) -> str:
-    """What to do about a space: the lines of a wrapper where they can be written."""
+    """Return advice about a space: the lines of a wrapper where they can be written."""
     leaves = list(_leaves(space))
     if not leaves or not all(_is_plain(leaf) for leaf in leaves):
         return _wrapped("Let a function make its actions", "function", "gymnasium.spaces.Box(...)")
@@ -70,7 +70,7 @@ def _leaves(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:
 
 
 def _is_plain(leaf: gym.Space[Any]) -> bool:
-    """Whether a space without parts is of numbers or choices, of which there is one."""
+    """Return whether a space without parts is of numbers or choices, at least one."""
     if isinstance(leaf, gym.spaces.Box):
         return bool(np.prod(leaf.shape)) and (_is_real(leaf) or leaf.is_bounded())
     kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary

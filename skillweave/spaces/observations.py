@@ -77,7 +77,7 @@ def image_layout(space: gym.Space[Any]) -> ImageLayout | None:
 
 
 def _has_bounds(space: gym.spaces.Box) -> bool:
-    """Whether the bounds of a Box are those of its numbers, not of their data type."""
+    """Return whether the bounds of a Box are of its numbers, not of their data type."""
     if not space.is_bounded():
         return False
     span = space.high.astype(np.float64) - space.low.astype(np.float64)
@@ -85,7 +85,7 @@ def _has_bounds(space: gym.spaces.Box) -> bool:
 
 
 def _channels_last(a: int, b: int, c: int) -> bool | None:
-    """Whether images (a, b, c) have their channels last, by their shape; None: it does not say.
+    """Return whether images (a, b, c) have their channels last; None: their shape does not say it.
 
     Of two equal axes and another one, the other one is the channels'. Of three different ones it is
     the shorter outer one if there are few channels, or if the image is too large for a board.
@@ -302,7 +302,7 @@ def _scale(leaf: _Leaf) -> PixelScale:
 
 
 def _described(leaf: _Leaf) -> str:
-    """What a message calls a leaf: ``the observation's part board of shape (3, 3, 3)``."""
+    """Return a leaf's name for messages: ``the observation's part board of shape (3, 3, 3)``."""
     what = f"the observation's part {leaf.name}" if leaf.name else "the observation"
     whole = f"{what} of shape {leaf.shape}"
     if len(leaf.shape) < 4:

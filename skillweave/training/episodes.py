@@ -20,7 +20,7 @@ INFO = "info/"
 
 @dataclass
 class EpisodeTally:
-    """What was noticed of episodes: logged keys of ``info`` at their ends, and the longest."""
+    """Counts of episodes: logged keys of ``info`` at their ends, and the longest."""
 
     keys: tuple[str, ...] = ()
     """Those that are logged."""

@@ -309,7 +309,7 @@ class CallTally:
         return {self._path: report} | below
 
     def _asked(self, method: str, played: Played, rows: Array) -> Array:
-        """What a method of the skill says about a step of ``rows`` (m,) of those that act."""
+        """Return the answer of a skill's method about the step of ``rows`` (m,)."""
         elapsed = self._elapsed[played.episode[rows]]
         step = skill_step(played.step, rows, elapsed, self._skill.max_steps)
         return asked(self._skill, method, step, len(rows), elapsed, played.rows[rows])
