@@ -80,7 +80,7 @@ def test_lines_of_metrics(tmp_path, capsys):
     file.unlink()
     agent().resume(run)
     said = capsys.readouterr().err
-    assert f"{file} was removed or shortened: curves begin where it does" in said
+    assert f"{file} was removed or shortened: curves lack what stood there" in said
     agent().train(tmp_path / "reference", quiet=True, checkpoint_every=32)
     assert policies(run) == policies(tmp_path / "reference")
     file.unlink()
