@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from time import sleep
+from time import monotonic, sleep
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -16,12 +16,15 @@ from skillweave.collecting.channel import Channel
 from skillweave.collecting.workers import Station
 from skillweave.messages import told
 from skillweave.notices import Notices, collect_notices
+from skillweave.signals import handle_here
 from skillweave.types import SkillweaveError
 
 LOOK = 1.0
 """Seconds between looks at whether the parent lives."""
 GRACE = 2.0
 """Seconds that environments have to close when it does not."""
+LEFT = 0.3
+"""Seconds that processes of environments have to end, first by themselves and then by SIGTERM."""
 
 
 class _Ended(BaseException):
@@ -43,8 +46,8 @@ def work(
     """
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, who then closes us
-    signal.signal(signal.SIGTERM, _end)  # a fork has the parent's handler
+    handle_here(signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C the parent closes its workers
+    handle_here(signal.SIGTERM, _end)
     torch.set_num_threads(1)
     other_end.close()
     notices = collect_notices()
@@ -68,6 +71,7 @@ def work(
             if station is not None:
                 with suppress(Exception, SystemExit):
                     station.collector.close()
+            _end_children()
             if notices.any:
                 _send(channel, None, None, notices)
     except _Ended:
@@ -123,9 +127,26 @@ def _end_with(parent: int | None) -> None:
 
 
 def _may_have_processes() -> None:
-    """Let environments start processes: ``multiprocessing`` forbids it to a daemon.
+    """Let environments start processes, which ``multiprocessing`` forbids to a daemon.
 
-    It ends daemons when their parent ends, and these end with it in any case.
+    The parent still has this process as a daemon: it does not wait for it at its own end.
     """
     with suppress(AttributeError):
         mp.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+
+
+def _end_children() -> None:
+    """End processes that environments have started and not ended when they were closed.
+
+    ``multiprocessing`` would wait for them, until the parent kills this process and they stay.
+    """
+    children = mp.active_children()
+    for child in children:
+        if child.daemon:
+            child.terminate()
+    for seconds, end in ((LEFT, "terminate"), (LEFT, "kill")):
+        until = monotonic() + seconds
+        for child in children:
+            child.join(max(0.0, until - monotonic()))
+            if child.is_alive():
+                getattr(child, end)()
