@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 import skillweave as sw
 
@@ -137,6 +138,36 @@ def test_it_is_said_of_processes_too(tmp_path, capsys):
     spec = sw.EnvSpec(drawing("random"), engine="sync", workers=2)
     sw.train_agent(spec, SMALL, 128, tmp_path / "run")
     assert capsys.readouterr().err.count("draws from random,") == 1
+
+
+class Left(sw.Skill):
+    name = "left"
+
+
+class Right(sw.Skill):
+    name = "right"
+
+
+@pytest.mark.parametrize("learn", ["together", "apart", "flat"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("name", DRAWS)
+def test_weights_do_not_depend_on_how_often_a_run_is_evaluated(name, learn, tmp_path):
+    found = []
+    for i, every in enumerate((None, 64)):
+        defaults = sw.TrainDefaults(eval_every=every, eval_episodes=2)
+        spec, folder = sw.EnvSpec(drawing(name), engine="sync", workers=1), tmp_path / str(i)
+        if learn == "flat":
+            plain = sw.Agent(spec, SMALL, 256, train_defaults=defaults)
+            found.append(weights(plain.train(folder, seed=0, quiet=True)))
+            continue
+        hierarchy = sw.Hierarchy(
+            spec, [Left(), Right()], algorithm=SMALL, selector=SMALL, steps=256,
+            learn=learn, train_defaults=defaults,
+        )  # fmt: skip
+        hierarchy.train(folder, seed=0, quiet=True)
+        files = sorted((folder / "policies").glob("*.safetensors"))
+        found.append({f"{f.name} {k}": v for f in files for k, v in load_file(f).items()})
+    assert same(*found)
 
 
 def test_an_evaluation_alone_says_nothing_of_resuming(tmp_path):
