@@ -4,6 +4,7 @@
 import multiprocessing
 import os
 import random
+import threading
 import warnings
 
 import gymnasium as gym
@@ -112,6 +113,40 @@ def test_generators_of_the_caller_stand_where_they_stood(tmp_path):
     disturb(7)
     run = train(drawing("random"), tmp_path / "run")
     sw.evaluate(run.policy, drawing("torch"), episodes=2)
+    assert (random.random(), np.random.random(), torch.rand(())) == expected
+
+
+def test_they_stand_where_they_stood_after_trainings_in_threads(tmp_path):
+    first_step, second_began = threading.Event(), threading.Event()
+
+    class Waiting(Corridor):
+        """Lets one training begin within the other, and end after it."""
+
+        def step(self, action):
+            first_step.set()
+            second_began.wait(20)
+            return super().step(action)
+
+    class Late(drawing("numpy.random")):
+        def reset(self, *, seed=None, options=None):
+            second_began.set()
+            one.join(20)
+            return super().reset(seed=seed)
+
+    disturb(7)
+    expected = random.random(), np.random.random(), torch.rand(())
+    disturb(7)
+    runs = []
+    one, two = (
+        threading.Thread(target=lambda env=env: runs.append(train(env, tmp_path / env.__name__)))
+        for env in (Waiting, Late)
+    )
+    one.start()
+    assert first_step.wait(20)
+    two.start()
+    one.join()
+    two.join()
+    assert [run.path.name for run in runs] == ["Waiting", "Late"]
     assert (random.random(), np.random.random(), torch.rand(())) == expected
 
 
