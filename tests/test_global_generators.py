@@ -116,6 +116,71 @@ def test_generators_of_the_caller_stand_where_they_stood(tmp_path):
     assert (random.random(), np.random.random(), torch.rand(())) == expected
 
 
+class Everywhere(Corridor):
+    """Draws wherever it can: when it is made, in each step, and in each picture."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    draw = DRAWS["numpy.random"]
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self.weight = np.random.uniform() + random.random()
+
+    def step(self, action):
+        obs, reward, *end, info = super().step(action)
+        return obs, reward + random.random() * self.weight, *end, info
+
+    def render(self):
+        shade = np.random.randint(255) + int(torch.randint(0, 2, ()))
+        return np.full((16, 16, 3), shade, np.uint8)
+
+
+def hierarchy(**how):
+    skills = [Left(), Right()]
+    return sw.Hierarchy(Everywhere, skills, algorithm=SMALL, selector=SMALL, steps=128, **how)
+
+
+@pytest.fixture(scope="module")
+def everywhere(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("everywhere")
+    return hierarchy().train(folder / "run", seed=0, quiet=True)
+
+
+USES = {
+    "train_agent": lambda run, to: sw.train_agent(Everywhere, SMALL, 128, to / "run", quiet=True),
+    "train": lambda run, to: hierarchy().train(to / "run", quiet=True),
+    "train apart": lambda run, to: hierarchy(learn="apart").train(to / "run", quiet=True),
+    "continue": lambda run, to: hierarchy().train(run.path, resume=True, quiet=True),
+    "load": lambda run, to: hierarchy().load(run.path),
+    "weights": lambda run, to: hierarchy().load_weights(run.save_weights(to / "w.safetensors")),
+    "evaluate": lambda run, to: run.evaluate(2, quiet=True),
+    "evaluate a skill": lambda run, to: run.evaluate(2, skill="left", quiet=True),
+    "render": lambda run, to: run.render(to / "film.gif", quiet=True),
+    "report": lambda run, to: run.report(to / "report.html", episodes=2, films=0, quiet=True),
+}
+
+
+SLOW = {"report": pytest.mark.slow}
+
+
+@pytest.mark.parametrize("use", [pytest.param(u, marks=SLOW.get(u, ())) for u in USES])
+def test_generators_of_the_caller_stand_where_they_stood_after(use, everywhere, tmp_path):
+    disturb(7)
+    expected = random.random(), np.random.random(), torch.rand(())
+    disturb(7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        USES[use](everywhere, tmp_path)
+    assert (random.random(), np.random.random(), torch.rand(())) == expected
+
+
+def test_two_films_of_a_run_are_the_same(everywhere, tmp_path):
+    for number in (1, 2):
+        disturb(number)
+        everywhere.render(tmp_path / f"{number}.gif", episodes=2, quiet=True)
+    assert (tmp_path / "1.gif").read_bytes() == (tmp_path / "2.gif").read_bytes()
+
+
 def test_they_stand_where_they_stood_after_trainings_in_threads(tmp_path):
     first_step, second_began = threading.Event(), threading.Event()
 
