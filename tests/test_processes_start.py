@@ -77,6 +77,22 @@ def test_a_guarded_script_trains_in_processes(name, where, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["spawn", "forkserver"])
+def test_started_processes_need_no_shared_memory(name, tmp_path):
+    none = (
+        "import tempfile\ndef full(*_):\n    raise OSError(28, 'No space left on device')\n"
+        "tempfile.TemporaryFile = full\n"
+        "if hasattr(os, 'memfd_create'):\n    del os.memfd_create\n"
+    )
+    guard = "if __name__ == '__main__':\n    "
+    said = run_program(
+        tmp_path, ENV + none + guard + method(name) + "    " + TRAIN.format(env="Slow")
+    )
+    assert "64 of 64 steps (100%)" in said
+    assert processes_in(tmp_path) == 3
+
+
+@pytest.mark.slow
 def test_a_plain_script_that_forks_trains_in_processes(tmp_path):
     said = run_program(tmp_path, ENV + method("fork") + TRAIN.format(env="Slow"))
     assert "64 of 64 steps (100%)" in said

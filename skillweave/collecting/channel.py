@@ -35,11 +35,15 @@ class Block:
         self._file, self._reserved = _unnamed_file(), 0
         self._map: mmap.mmap | None = None
 
-    def __getstate__(self) -> Any:
-        """Return what a process gets that is started, and not forked."""
-        return None if self._file is None else reduction.DupFd(self._file)
+    def __getstate__(self) -> tuple[Any]:
+        """Return the descriptor for a process that is not forked.
 
-    def __setstate__(self, file: Any) -> None:
+        It stands in a tuple because pickle does not restore a state of None.
+        """
+        return (None if self._file is None else reduction.DupFd(self._file),)
+
+    def __setstate__(self, state: tuple[Any]) -> None:
+        (file,) = state
         self._file, self._reserved = None if file is None else file.detach(), 0
         self._map = None
 
