@@ -202,3 +202,17 @@ def test_processes_work_where_the_program_has_threads(own, count, tmp_path, monk
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     said = run_program(tmp_path, ENV + f"own, count = {own}, {count}\n" + THREADS)
     assert "all well" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fork", "spawn"])
+def test_a_thread_trains_in_processes_after_the_main_thread_has_ended(name, tmp_path):
+    text = (
+        "\nimport threading\n\ndef later():\n    threading.main_thread().join()\n    "
+        "sw.train_agent(Slow, SMALL, 64, 'run')\n\nif __name__ == '__main__':\n    "
+    )
+    said = run_program(
+        tmp_path, ENV + text + method(name) + "    threading.Thread(target=later).start()\n"
+    )
+    assert "64 of 64 steps (100%)" in said
+    assert processes_in(tmp_path) == 3

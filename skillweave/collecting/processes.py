@@ -11,7 +11,6 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from contextvars import copy_context
 from multiprocessing.connection import wait
@@ -211,23 +210,41 @@ def _described(what: str, task: Any) -> str:
     }.get(what, what)
 
 
-_STARTER: tuple[int, ThreadPoolExecutor] | None = None
-_STARTER_LOCK = threading.Lock()
+_start_lock = threading.Lock()
 
 
 def _in_starter(start: Callable[[], None]) -> None:
-    """Start a process from a thread that does nothing else.
+    """Start a process from a new thread, one process at a time.
 
-    A forked process goes on as a copy of the thread that forks. If that thread has computed with
-    several OpenMP threads, the copy believes that it still has them, and waits for ever where the
-    user's code lets torch have several.
+    A forked process continues as a copy of the thread that forks. If that thread has computed with
+    several OpenMP threads, the copy still counts on them, and waits forever where the user's code
+    lets torch use several.
     """
-    global _STARTER
-    with _STARTER_LOCK:
-        if _STARTER is None or _STARTER[0] != os.getpid():  # a fork has no such thread
-            _STARTER = os.getpid(), ThreadPoolExecutor(1, "starter")
-        starter = _STARTER[1]
-    starter.submit(copy_context().run, start).result()
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            with _start_lock:
+                start()
+        except BaseException as error:
+            errors.append(error)
+
+    # No pool of threads: those start no work once the main thread has ended.
+    thread = threading.Thread(target=copy_context().run, args=(run,), name="starter")
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]
+
+
+def _forget_start() -> None:
+    """Let a forked process start others: the lock it has copied is held."""
+    global _start_lock
+    _start_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_start)
 
 
 def close_all(workers: Sequence[ProcessWorker]) -> None:
