@@ -1,4 +1,4 @@
-"""The life of a process in which a worker stands."""
+"""The main function of a worker process."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from skillweave.signals import handle_here
 from skillweave.types import SkillweaveError
 
 LOOK = 1.0
-"""Seconds between looks at whether the parent lives."""
+"""Seconds between checks that the parent lives."""
 GRACE = 2.0
-"""Seconds that environments have to close when it does not."""
+"""Seconds that environments have to close after the parent has ended."""
 LEFT = 0.3
 """Seconds that processes of environments have to end, first by themselves and then by SIGTERM."""
 
 
 class _Ended(BaseException):
-    """The process is to end: somebody terminates it, or its parent is no more."""
+    """The process must end: it received SIGTERM, or its parent has ended."""
 
 
 def work(
     number: int, maker: Any, each: int, channel: Channel, other_end: Channel, parent: int | None
 ) -> None:
-    """Answer (error, result, notices) to every (what, task).
+    """Answer every (what, task) with (error, result, notices), until the parent closes.
 
     Args:
-        number: of the worker.
-        maker: its ``make`` makes what stands here.
-        each: environments.
-        channel: where tasks come from.
-        other_end: the parent's, of which a fork has a copy.
-        parent: the process whose child this one is; None: a server's, which forks.
+        number: the worker's number.
+        maker: its ``make`` returns the collector that works here.
+        each: number of environments.
+        channel: the connection to the parent.
+        other_end: the parent's end of it, of which a fork has a copy.
+        parent: id of the parent process; None if a fork server started this process.
     """
     import torch
 
@@ -79,7 +79,7 @@ def work(
 
 
 def _tasks(channel: Channel) -> Iterator[tuple[str, Any]]:
-    """What the parent asks for, until it closes."""
+    """Yield the parent's requests (what, task), until it closes the worker."""
     while True:
         try:
             what, task = channel.receive()
@@ -91,7 +91,7 @@ def _tasks(channel: Channel) -> Iterator[tuple[str, Any]]:
 
 
 def _send(channel: Channel, error: str | None, answer: Any, notices: Notices) -> None:
-    """Send an answer, if anybody is left to be told."""
+    """Send an answer; end this process if the parent has closed the connection."""
     try:
         channel.send((error, answer, notices.take()))
     except (BrokenPipeError, ConnectionResetError):
@@ -103,10 +103,10 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _end_with(parent: int | None) -> None:
-    """End this process soon after its parent, whatever it does then.
+    """End this process soon after its parent, also during a rollout.
 
-    A thread looks, as the main one may be in a long rollout or in an environment that waits. First
-    environments may close: they may have processes of their own.
+    A thread checks the parent, because the main thread may be in a long rollout or in an
+    environment that waits. Environments get time to close: they may have processes of their own.
     """
     started_by = mp.parent_process()
     assert started_by is not None
@@ -115,7 +115,7 @@ def _end_with(parent: int | None) -> None:
     first = parent or os.getppid()
 
     def watch() -> None:
-        # The first is late where later workers were forked with the pipe that tells it.
+        # is_alive() is late where workers forked later hold copies of its pipe.
         while started_by.is_alive() and os.getppid() == first:
             sleep(LOOK)
         with suppress(OSError, ValueError):
