@@ -167,6 +167,8 @@ class GlobalDraws:
     def end(self) -> list[str]:
         """Return the generators that were drawn from since ``begin``, by their modules' names."""
         self.looks -= 1
+        if _threads > 1:  # another thread may have drawn
+            return []
         now = _fingerprints()
         return [name for name, before in self._before.items() if now[name] != before]
 

@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 
 import skillweave as sw
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*whose generator all of a program shares")
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((4,)))
 DRAWS = {
     "random": lambda: random.uniform(-5, 5),
