@@ -3,6 +3,8 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -99,3 +101,52 @@ def test_processes_that_environments_leave_in_workers_are_ended(env, tmp_path, c
     assert len(pids) > len(left)
     assert not any(map(alive, pids))
     assert capfd.readouterr().err == ""
+
+
+PROGRAM = """
+import sys, time
+sys.path.insert(0, {tests!r})
+import test_processes_of_environments as made
+import skillweave as sw
+
+class Asking(made.Simulated):
+    folder = made.Path(".")
+    def __init__(self):
+        self.ours, self.theirs = made.FORK.Pipe()
+        super().__init__()
+    def simulate(self):
+        while True:
+            self.theirs.send(self.theirs.recv() + 1)
+    def step(self, action):
+        self.ours.send(self.t)
+        assert self.ours.recv() == self.t + 1
+        time.sleep(0.002)
+        return super().step(action)
+    def close(self):
+        self.simulator.terminate()
+
+spec = sw.EnvSpec(Asking, engine="sync", workers={workers})
+sw.train_agent(spec, made.SMALL, 100_000, "run")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_run_is_saved_at_ctrl_c_though_it_has_simulators(workers, tmp_path):
+    text = PROGRAM.format(tests=str(Path(__file__).parent), workers=workers)
+    (tmp_path / "program.py").write_text(text)
+    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    program = subprocess.Popen(
+        [sys.executable, "program.py"], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path},
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    until = time.monotonic() + 60
+    while len(list(tmp_path.glob("[0-9]*"))) < 2 and time.monotonic() < until:
+        time.sleep(0.1)
+    time.sleep(1.5)
+    os.killpg(program.pid, signal.SIGINT)  # as a terminal does
+    said = program.communicate(timeout=30)[1]
+    assert said.count("stopping after this round, and saving") == 1
+    assert "Continue: " in said
+    assert "SkillweaveError" not in said
+    assert "Process " not in said
