@@ -1,6 +1,6 @@
-"""Sentences that people should read once, from any depth of the library.
+"""Notices: sentences that people should read once, from any depth of the library.
 
-Inside a run they go to its progress. Elsewhere they are Python warnings.
+In a run its progress prints them. Elsewhere they are Python warnings.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from contextvars import ContextVar
 
 
 class Notices:
-    """Sentences of one run, each told once; they wait until there is somewhere to tell them."""
+    """Notices of one run, each given once; they wait until a function is set that prints them."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()
@@ -20,7 +20,7 @@ class Notices:
         self._tell: Callable[[str], None] | None = None
 
     def add(self, text: str) -> None:
-        """Tell a sentence, unless it was told before."""
+        """Give a notice, unless it was given before."""
         if text in self._said:
             return
         self._said.add(text)
@@ -31,16 +31,16 @@ class Notices:
 
     @property
     def any(self) -> bool:
-        """Whether sentences wait."""
+        """True if notices wait."""
         return bool(self._waiting)
 
     def take(self) -> list[str]:
-        """Return the sentences that wait, and forget them."""
+        """Return the notices that wait, and remove them."""
         found, self._waiting = self._waiting, []
         return found
 
     def tell_by(self, tell: Callable[[str], None] | None) -> None:
-        """Tell by this function from now on, first what waits; None: let them wait."""
+        """Print notices by this function from now on, first those that wait; None: they wait."""
         self._tell = tell
         if tell is not None:
             for text in self.take():
@@ -51,7 +51,7 @@ _CURRENT: ContextVar[Notices | None] = ContextVar("_CURRENT", default=None)
 
 
 def notice(text: str) -> None:
-    """Tell people a sentence, once in a run."""
+    """Give people a notice, once in a run."""
     notices = _CURRENT.get()
     if notices is None:
         warn(text)
@@ -60,18 +60,18 @@ def notice(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Tell people a sentence as a Python warning."""
+    """Give people a notice as a Python warning."""
     warnings.warn(text, stacklevel=2)
 
 
 def are_collected() -> bool:
-    """Return whether this is in a run, or in a process of one."""
+    """Return True in a run, and in a process of one."""
     return _CURRENT.get() is not None
 
 
 @contextmanager
 def collected_notices() -> Iterator[Notices]:
-    """Collect notices within the block; within another such block they are that one's."""
+    """Collect notices within the block; in a nested block the outer one collects them."""
     if (outer := _CURRENT.get()) is not None:
         yield outer
         return
@@ -84,7 +84,7 @@ def collected_notices() -> Iterator[Notices]:
 
 
 def collect_notices() -> Notices:
-    """Collect notices from now on: in a process that sends them to another one."""
+    """Collect notices from now on, in a process that sends them to another one."""
     notices = Notices()
     _CURRENT.set(notices)
     return notices

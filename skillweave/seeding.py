@@ -6,8 +6,10 @@ so no generator's state has to be saved for a run to resume exactly.
 
 from __future__ import annotations
 
+import os
 import random
 import sys
+import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -82,18 +84,72 @@ def global_generators_state() -> dict[str, Any]:
     return found
 
 
+class _Blocks(threading.local):
+    """The blocks of ``global_generators`` that a thread is in."""
+
+    depth = 0
+
+
+_blocks = _Blocks()
+_lock = threading.Lock()
+_threads = 0  # in a block
+_users: dict[str, Any] = {}  # the states before the first of them began
+
+
 @contextmanager
 def global_generators(seeds: Seeds) -> Iterator[None]:
-    """Seed the global generators; after the block they stand where they stood before it."""
-    before = global_generators_state()
+    """Seed the global generators; after the block they stand where they stood before it.
+
+    Threads share them: while blocks of several threads overlap, the states from before the first
+    block return after the last one.
+    """
+    before = _enter_block()
     seed_global_generators(seeds)
     try:
         yield
     finally:
-        random.setstate(before["random"])
-        np.random.set_state(before["numpy.random"])  # noqa: NPY002
-        if "torch" in before:
-            sys.modules["torch"].default_generator.set_state(before["torch"])
+        _leave_block(before)
+
+
+def _enter_block() -> dict[str, Any]:
+    global _threads, _users
+    with _lock:
+        before = global_generators_state()
+        if not _blocks.depth:
+            if not _threads:
+                _users = before
+            _threads += 1
+        _blocks.depth += 1
+    return before
+
+
+def _leave_block(before: dict[str, Any]) -> None:
+    global _threads
+    with _lock:
+        _blocks.depth -= 1
+        if _blocks.depth:
+            _set_states(before)
+            return
+        _threads -= 1
+        if not _threads:
+            _set_states(_users)
+
+
+def _set_states(states: dict[str, Any]) -> None:
+    random.setstate(states["random"])
+    np.random.set_state(states["numpy.random"])  # noqa: NPY002
+    if "torch" in states:
+        sys.modules["torch"].default_generator.set_state(states["torch"])
+
+
+def _forget_threads() -> None:
+    """Let a forked process begin without the blocks of its parent's threads."""
+    global _blocks, _lock, _threads
+    _blocks, _lock, _threads = _Blocks(), threading.Lock(), 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_threads)
 
 
 class GlobalDraws:
@@ -111,6 +167,8 @@ class GlobalDraws:
     def end(self) -> list[str]:
         """Return the generators that were drawn from since ``begin``, by their modules' names."""
         self.looks -= 1
+        if _threads > 1:  # another thread may have drawn
+            return []
         now = _fingerprints()
         return [name for name, before in self._before.items() if now[name] != before]
 

@@ -4,15 +4,18 @@
 import multiprocessing
 import os
 import random
+import threading
 import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 import skillweave as sw
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*whose generator all of a program shares")
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((4,)))
 DRAWS = {
     "random": lambda: random.uniform(-5, 5),
@@ -114,6 +117,105 @@ def test_generators_of_the_caller_stand_where_they_stood(tmp_path):
     assert (random.random(), np.random.random(), torch.rand(())) == expected
 
 
+class Everywhere(Corridor):
+    """Draws wherever it can: when it is made, in each step, and in each picture."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    draw = DRAWS["numpy.random"]
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self.weight = np.random.uniform() + random.random()
+
+    def step(self, action):
+        obs, reward, *end, info = super().step(action)
+        return obs, reward + random.random() * self.weight, *end, info
+
+    def render(self):
+        shade = np.random.randint(255) + int(torch.randint(0, 2, ()))
+        return np.full((16, 16, 3), shade, np.uint8)
+
+
+def hierarchy(**how):
+    skills = [Left(), Right()]
+    return sw.Hierarchy(Everywhere, skills, algorithm=SMALL, selector=SMALL, steps=128, **how)
+
+
+@pytest.fixture(scope="module")
+def everywhere(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("everywhere")
+    return hierarchy().train(folder / "run", seed=0, quiet=True)
+
+
+USES = {
+    "train_agent": lambda run, to: sw.train_agent(Everywhere, SMALL, 128, to / "run", quiet=True),
+    "train": lambda run, to: hierarchy().train(to / "run", quiet=True),
+    "train apart": lambda run, to: hierarchy(learn="apart").train(to / "run", quiet=True),
+    "continue": lambda run, to: hierarchy().train(run.path, resume=True, quiet=True),
+    "load": lambda run, to: hierarchy().load(run.path),
+    "weights": lambda run, to: hierarchy().load_weights(run.save_weights(to / "w.safetensors")),
+    "evaluate": lambda run, to: run.evaluate(2, quiet=True),
+    "evaluate a skill": lambda run, to: run.evaluate(2, skill="left", quiet=True),
+    "render": lambda run, to: run.render(to / "film.gif", quiet=True),
+    "report": lambda run, to: run.report(to / "report.html", episodes=2, films=0, quiet=True),
+}
+
+
+SLOW = {"report": pytest.mark.slow}
+
+
+@pytest.mark.parametrize("use", [pytest.param(u, marks=SLOW.get(u, ())) for u in USES])
+def test_generators_of_the_caller_stand_where_they_stood_after(use, everywhere, tmp_path):
+    disturb(7)
+    expected = random.random(), np.random.random(), torch.rand(())
+    disturb(7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        USES[use](everywhere, tmp_path)
+    assert (random.random(), np.random.random(), torch.rand(())) == expected
+
+
+def test_two_films_of_a_run_are_the_same(everywhere, tmp_path):
+    for number in (1, 2):
+        disturb(number)
+        everywhere.render(tmp_path / f"{number}.gif", episodes=2, quiet=True)
+    assert (tmp_path / "1.gif").read_bytes() == (tmp_path / "2.gif").read_bytes()
+
+
+def test_they_stand_where_they_stood_after_trainings_in_threads(tmp_path):
+    first_step, second_began = threading.Event(), threading.Event()
+
+    class Waiting(Corridor):
+        """Lets one training begin within the other, and end after it."""
+
+        def step(self, action):
+            first_step.set()
+            second_began.wait(20)
+            return super().step(action)
+
+    class Late(drawing("numpy.random")):
+        def reset(self, *, seed=None, options=None):
+            second_began.set()
+            one.join(20)
+            return super().reset(seed=seed)
+
+    disturb(7)
+    expected = random.random(), np.random.random(), torch.rand(())
+    disturb(7)
+    runs = []
+    one, two = (
+        threading.Thread(target=lambda env=env: runs.append(train(env, tmp_path / env.__name__)))
+        for env in (Waiting, Late)
+    )
+    one.start()
+    assert first_step.wait(20)
+    two.start()
+    one.join()
+    two.join()
+    assert [run.path.name for run in runs] == ["Waiting", "Late"]
+    assert (random.random(), np.random.random(), torch.rand(())) == expected
+
+
 def test_an_evaluation_gives_the_same_again(tmp_path):
     run = train(drawing("torch"), tmp_path / "run")
     one, two, other = (
@@ -137,6 +239,36 @@ def test_it_is_said_of_processes_too(tmp_path, capsys):
     spec = sw.EnvSpec(drawing("random"), engine="sync", workers=2)
     sw.train_agent(spec, SMALL, 128, tmp_path / "run")
     assert capsys.readouterr().err.count("draws from random,") == 1
+
+
+class Left(sw.Skill):
+    name = "left"
+
+
+class Right(sw.Skill):
+    name = "right"
+
+
+@pytest.mark.parametrize("learn", ["together", "apart", "flat"])
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("name", DRAWS)
+def test_weights_do_not_depend_on_how_often_a_run_is_evaluated(name, learn, tmp_path):
+    found = []
+    for i, every in enumerate((None, 64)):
+        defaults = sw.TrainDefaults(eval_every=every, eval_episodes=2)
+        spec, folder = sw.EnvSpec(drawing(name), engine="sync", workers=1), tmp_path / str(i)
+        if learn == "flat":
+            plain = sw.Agent(spec, SMALL, 256, train_defaults=defaults)
+            found.append(weights(plain.train(folder, seed=0, quiet=True)))
+            continue
+        hierarchy = sw.Hierarchy(
+            spec, [Left(), Right()], algorithm=SMALL, selector=SMALL, steps=256,
+            learn=learn, train_defaults=defaults,
+        )  # fmt: skip
+        hierarchy.train(folder, seed=0, quiet=True)
+        files = sorted((folder / "policies").glob("*.safetensors"))
+        found.append({f"{f.name} {k}": v for f in files for k, v in load_file(f).items()})
+    assert same(*found)
 
 
 def test_an_evaluation_alone_says_nothing_of_resuming(tmp_path):

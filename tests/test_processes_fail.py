@@ -52,7 +52,6 @@ def train(env, folder, workers=2, quiet=True, **how):
 @pytest.mark.parametrize(
     ("what", "says"),
     [
-        (lambda: sys.exit("enough"), r"SystemExit: enough \(test_processes_fail\.py, line \d+\)"),
         (lambda: os._exit(7), r"died with exit code 7 while it was making 16 steps.*os\._exit"),
         (lambda: ctypes.string_at(0), r"SIGSEGV"),
         (os.abort, r"SIGABRT"),
@@ -63,6 +62,42 @@ def test_a_process_that_ends_says_why(what, says, tmp_path):
     with pytest.raises(sw.SkillweaveError, match=r"worker 0 |in worker 0") as found:
         train(does(what), tmp_path / "run")
     assert found.match(says)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("call", ["step", "reset", "__init__"])
+def test_an_environment_that_calls_sys_exit_is_an_error(call, workers, tmp_path):
+    class Exits(Ramp):
+        def __init__(self):
+            self.at("__init__")
+
+        def reset(self, *, seed=None, options=None):
+            self.at("reset")
+            return super().reset(seed=seed)
+
+        def step(self, action):
+            if self.t == 3:
+                self.at("step")
+            return super().step(action)
+
+        def at(self, here):
+            if here == call and (workers == 1 or multiprocessing.parent_process() is not None):
+                sys.exit("enough")
+
+    says = {"step": "environment 0, step 4 of its episode: step", "reset": "reset", "__init__": ""}
+    with pytest.raises(sw.SkillweaveError) as found:
+        train(Exits, tmp_path / "run", workers)
+    assert found.match(r"Exits.* SystemExit: enough \(test_processes_fail\.py, line \d+\)")
+    assert found.match(says[call])
+
+
+def test_ctrl_c_in_an_environment_stops_the_run(tmp_path):
+    class Interrupts(Ramp):
+        def step(self, action):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(Interrupts, tmp_path / "run", workers=1)
 
 
 @pytest.mark.parametrize("workers", [1, 2])

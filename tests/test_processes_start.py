@@ -77,6 +77,22 @@ def test_a_guarded_script_trains_in_processes(name, where, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["spawn", "forkserver"])
+def test_started_processes_need_no_shared_memory(name, tmp_path):
+    none = (
+        "import tempfile\ndef full(*_):\n    raise OSError(28, 'No space left on device')\n"
+        "tempfile.TemporaryFile = full\n"
+        "if hasattr(os, 'memfd_create'):\n    del os.memfd_create\n"
+    )
+    guard = "if __name__ == '__main__':\n    "
+    said = run_program(
+        tmp_path, ENV + none + guard + method(name) + "    " + TRAIN.format(env="Slow")
+    )
+    assert "64 of 64 steps (100%)" in said
+    assert processes_in(tmp_path) == 3
+
+
+@pytest.mark.slow
 def test_a_plain_script_that_forks_trains_in_processes(tmp_path):
     said = run_program(tmp_path, ENV + method("fork") + TRAIN.format(env="Slow"))
     assert "64 of 64 steps (100%)" in said
@@ -186,3 +202,17 @@ def test_processes_work_where_the_program_has_threads(own, count, tmp_path, monk
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     said = run_program(tmp_path, ENV + f"own, count = {own}, {count}\n" + THREADS)
     assert "all well" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fork", "spawn"])
+def test_a_thread_trains_in_processes_after_the_main_thread_has_ended(name, tmp_path):
+    text = (
+        "\nimport threading\n\ndef later():\n    threading.main_thread().join()\n    "
+        "sw.train_agent(Slow, SMALL, 64, 'run')\n\nif __name__ == '__main__':\n    "
+    )
+    said = run_program(
+        tmp_path, ENV + text + method(name) + "    threading.Thread(target=later).start()\n"
+    )
+    assert "64 of 64 steps (100%)" in said
+    assert processes_in(tmp_path) == 3

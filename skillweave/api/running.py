@@ -171,6 +171,7 @@ def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDir
     return run
 
 
+@global_generators(Seeds(0) / "plan")  # environments are made, and timed
 def _plan(
     declared: Hierarchy | Agent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
 ) -> Spaces:

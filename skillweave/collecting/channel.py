@@ -1,7 +1,7 @@
-"""Messages between this process and a worker: a pipe, and memory for the arrays in them.
+"""Messages between this process and a worker: a pipe, and shared memory for their arrays.
 
 Arrays and tensors go as one block of bytes in memory that both processes map. The block has no name
-in a file system and two descriptors, however many tensors there are. Where the system gives no such
+in a file system, and two descriptors for any number of tensors. Where the system gives no such
 memory, the bytes go through the pipe.
 """
 
@@ -24,34 +24,38 @@ import torch
 from torch import Tensor
 
 ALIGNED = 64
-"""Where each array begins: a multiple of so many bytes, as in memory that torch has allocated."""
+"""Each array begins at a multiple of this many bytes, as in memory that torch allocates."""
 _ZEROS = bytes(2**20)
 
 
 class Block:
-    """Memory that two processes share; the one that writes makes it larger where it must."""
+    """Memory that two processes share; the process that writes it makes it larger if needed."""
 
     def __init__(self) -> None:
         self._file, self._reserved = _unnamed_file(), 0
         self._map: mmap.mmap | None = None
 
-    def __getstate__(self) -> Any:
-        """Return what a process gets that is started, and not forked."""
-        return None if self._file is None else reduction.DupFd(self._file)
+    def __getstate__(self) -> tuple[Any]:
+        """Return the descriptor for a process that is not forked.
 
-    def __setstate__(self, file: Any) -> None:
+        It stands in a tuple because pickle does not restore a state of None.
+        """
+        return (None if self._file is None else reduction.DupFd(self._file),)
+
+    def __setstate__(self, state: tuple[Any]) -> None:
+        (file,) = state
         self._file, self._reserved = None if file is None else file.detach(), 0
         self._map = None
 
     def reserve(self, size: int) -> bool:
-        """Return whether ``size`` bytes can be written, after making the block larger."""
+        """Make the block large enough for ``size`` bytes; return False if there is no room."""
         if self._file is None:
             return False
         if size > self._reserved:
             for more in (size + size // 4, size):
                 try:
                     _allocate(self._file, self._reserved, more)
-                except OSError:  # no room for so many
+                except OSError:  # no room for that size
                     continue
                 self._reserved = more
                 return True
@@ -62,14 +66,14 @@ class Block:
         """Return the first ``size`` bytes, which are reserved."""
         assert self._file is not None
         if self._map is None or len(self._map) < size:
-            # Whoever still looks at the former map keeps it.
+            # Views of the former map keep it alive.
             self._map = mmap.mmap(self._file, os.fstat(self._file).st_size)
         return memoryview(self._map)[:size]
 
     def close(self) -> None:
-        """Release the memory, once nobody looks at it any more."""
+        """Release the memory; where views of it remain, it is freed with the last one."""
         if self._map is not None:
-            with suppress(BufferError):  # somebody does: it goes with them
+            with suppress(BufferError):  # it has views
                 self._map.close()
             self._map = None
         if self._file is not None:
@@ -78,7 +82,7 @@ class Block:
 
 
 def _unnamed_file() -> int | None:
-    """Return a descriptor of a file in memory, or else of a temporary one; None: there is none."""
+    """Return a descriptor of a file in memory, or of a temporary file; None if neither opens."""
     with suppress(OSError):
         if hasattr(os, "memfd_create"):  # not in /dev/shm, which may be small or read-only
             return os.memfd_create("skillweave", os.MFD_CLOEXEC)
@@ -88,9 +92,9 @@ def _unnamed_file() -> int | None:
 
 
 def _allocate(file: int, before: int, size: int) -> None:
-    """Let a file have ``size`` bytes that can be written for certain.
+    """Reserve ``size`` bytes for a file.
 
-    A file that only says that it is so long ends the process that writes where no room is left.
+    Writing to a file that is long but has no reserved room ends the process.
 
     Raises:
         OSError: there is no room.
@@ -118,7 +122,7 @@ class Channel:
     def send(self, message: Any) -> None:
         """Send anything that can be pickled.
 
-        What was sent before must have been received: its arrays are overwritten.
+        The other end must have received the message before: its arrays are overwritten.
 
         Raises:
             OSError: the other end is closed (``BrokenPipeError``), or the system refuses.
@@ -145,7 +149,8 @@ class Channel:
         """Return the next message.
 
         Args:
-            views: its arrays are views of the shared memory, good until this end sends again.
+            views: return arrays that are views of the shared memory, valid until this end sends
+                again; else copies.
 
         Raises:
             EOFError, OSError: the other end is closed.
@@ -184,7 +189,7 @@ def channels(context: Any) -> tuple[Channel, Channel]:
 
 
 def _places(sizes: Sequence[int]) -> tuple[list[int], int]:
-    """Return where arrays of these many bytes begin, and the bytes of all together."""
+    """Return the offsets of arrays of these sizes, and the size of all together, in bytes."""
     places, at = [], 0
     for size in sizes:
         places.append(at)
@@ -193,14 +198,14 @@ def _places(sizes: Sequence[int]) -> tuple[list[int], int]:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles, but for the bytes of arrays and tensors, which it hands over as buffers."""
+    """A pickler that returns the bytes of arrays and tensors as separate buffers."""
 
     def __init__(self, *about: Any, **how: Any) -> None:
         super().__init__(*about, **how)
         self._storages: dict[int, _Storage] = {}
 
     def reducer_override(self, thing: Any) -> Any:
-        """Return how an array or a tensor is made again; else leave it to pickle."""
+        """Return the function and arguments that rebuild an array or a tensor; else use pickle."""
         kind = type(thing)
         if kind is np.ndarray and thing.nbytes and not thing.dtype.hasobject:
             flat = np.ascontiguousarray(thing).reshape(-1).view(np.uint8)
@@ -215,7 +220,7 @@ class _Pickler(pickle.Pickler):
 
 
 class _Storage:
-    """The bytes of which tensors are views; sent once for all of them."""
+    """The bytes that several tensors view, sent once for all of them."""
 
     def __init__(self, tensor: Tensor) -> None:
         whole = torch.empty(0, dtype=torch.uint8).set_(tensor.untyped_storage())
@@ -226,7 +231,7 @@ class _Storage:
 
 
 def _is_plain(tensor: Tensor) -> bool:
-    """Return whether a tensor is numbers in this process's memory, and nothing more."""
+    """Return True for a tensor of plain numbers in this process's memory."""
     return (
         tensor.device.type == "cpu"
         and tensor.layout is torch.strided

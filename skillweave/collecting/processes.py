@@ -1,7 +1,7 @@
 """Collectors in processes of their own: environments step and policies act there.
 
-A process is asked for a whole rollout at a time (``channel``). One that dies is made again
-(``workers``). One whose parent dies ends itself (``worker_process``).
+Each request is for a whole rollout (``channel``). A process that dies is started again
+(``workers``). A process whose parent dies ends itself (``worker_process``).
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from contextvars import copy_context
 from multiprocessing.connection import wait
@@ -36,11 +35,11 @@ from skillweave.types import SkillweaveError
 PATIENCE = 1.0
 """Seconds that workers have to end by themselves when they are closed."""
 SILENCE = 60.0
-"""Seconds without an answer after which people are told; twice as long each time."""
+"""Seconds without an answer until a notice; they double with each notice."""
 
 
 class _Maker:
-    """What makes a collector; a process that is not forked gets it with the user's own code."""
+    """A function that makes a collector; it is sent with the user's code to unforked processes."""
 
     def __init__(self, make: MakeStanding) -> None:
         self.make = make
@@ -56,9 +55,10 @@ class ProcessWorker:
     """A collector in a process.
 
     Args:
-        each: its environments.
-        number: of the worker.
-        who: what messages call it.
+        make: makes the collector.
+        each: number of its environments.
+        number: the worker's number.
+        who: its name in messages.
     """
 
     def __init__(self, make: MakeStanding, each: int, number: int, who: str) -> None:
@@ -106,11 +106,11 @@ class ProcessWorker:
             theirs.close()
 
     def send(self, what: str, task: Any) -> None:
-        """Ask for something.
+        """Send a request.
 
         Raises:
             WorkerLost: the process has ended.
-            SkillweaveError: it runs, but the task cannot be sent.
+            SkillweaveError: the process runs, but the task cannot be sent.
         """
         assert self.channel is not None
         self._expect(_described(what, task))
@@ -124,12 +124,17 @@ class ProcessWorker:
             ) from error
 
     def receive(self) -> Any:
-        """The next answer; arrays of an experience are good until the next task."""
+        """Return the next answer; arrays of an experience are valid until the next task.
+
+        Raises:
+            WorkerLost: the process has ended.
+            SkillweaveError: the request failed there.
+        """
         assert self.channel is not None
         pipe = self.channel.pipe
         try:
             while not pipe.poll():
-                # A pipe whose other end is gone is ready too; another may still hold that end.
+                # A pipe whose other end is closed is ready too; another process may hold that end.
                 until = None if self._told else self._since + self._silence - monotonic()
                 wait([pipe, self.process.sentinel], until)
                 if not pipe.poll() and not self.process.is_alive():
@@ -150,7 +155,7 @@ class ProcessWorker:
         close_all([self])
 
     def forget(self) -> None:
-        """Let go of its pipe and its memory."""
+        """Close its pipe and release its shared memory."""
         if self.channel is not None:
             self.channel.close()
             self.channel = None
@@ -159,7 +164,7 @@ class ProcessWorker:
         self._asked, self._since, self._told = asked, monotonic(), False
 
     def _tell_silence(self) -> None:
-        """Tell people once that there is no answer for long."""
+        """Give a notice once if there is no answer for a long time."""
         if self._told or monotonic() - self._since < self._silence:
             return
         notice(
@@ -170,7 +175,7 @@ class ProcessWorker:
         self._silence, self._told = 2 * self._silence, True
 
     def _end(self) -> str:
-        """How its process ended, as people say it."""
+        """Return words for how its process ended."""
         self.process.join(PATIENCE)
         code = self.process.exitcode
         if code is None:
@@ -187,7 +192,7 @@ class ProcessWorker:
 
 
 def _by_signal(number: int) -> str:
-    """What a signal did to a process, as people say it."""
+    """Return words for a process that a signal has ended."""
     try:
         name = signal.Signals(number).name
     except ValueError:
@@ -199,35 +204,53 @@ def _by_signal(number: int) -> str:
 
 
 def _described(what: str, task: Any) -> str:
-    """What a worker does for a task, after "it is"."""
+    """Return words for what a worker does for a task, to follow "it is"."""
     if what == "collect":
         return f"making {task.rows:,} steps in each of its environments"
     return {
         "start": "resetting its environments",
-        "state": "telling where its environments stand",
+        "state": "sending the state of its environments",
         "restore": "playing its open episodes again",
         "train": "training its members of the population",
         "fitness": "measuring its members' fitness",
     }.get(what, what)
 
 
-_STARTER: tuple[int, ThreadPoolExecutor] | None = None
-_STARTER_LOCK = threading.Lock()
+_start_lock = threading.Lock()
 
 
 def _in_starter(start: Callable[[], None]) -> None:
-    """Start a process from a thread that does nothing else.
+    """Start a process from a new thread, one process at a time.
 
-    A forked process goes on as a copy of the thread that forks. If that thread has computed with
-    several OpenMP threads, the copy believes that it still has them, and waits for ever where the
-    user's code lets torch have several.
+    A forked process continues as a copy of the thread that forks. If that thread has computed with
+    several OpenMP threads, the copy still counts on them, and waits forever where the user's code
+    lets torch use several.
     """
-    global _STARTER
-    with _STARTER_LOCK:
-        if _STARTER is None or _STARTER[0] != os.getpid():  # a fork has no such thread
-            _STARTER = os.getpid(), ThreadPoolExecutor(1, "starter")
-        starter = _STARTER[1]
-    starter.submit(copy_context().run, start).result()
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            with _start_lock:
+                start()
+        except BaseException as error:
+            errors.append(error)
+
+    # No pool of threads: those start no work once the main thread has ended.
+    thread = threading.Thread(target=copy_context().run, args=(run,), name="starter")
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]
+
+
+def _forget_start() -> None:
+    """Let a forked process start others: the lock it has copied is held."""
+    global _start_lock
+    _start_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_start)
 
 
 def close_all(workers: Sequence[ProcessWorker]) -> None:
@@ -252,9 +275,9 @@ def close_all(workers: Sequence[ProcessWorker]) -> None:
 
 
 def _tell_last(worker: ProcessWorker) -> None:
-    """Tell what a worker has said while it closed its environments."""
+    """Give the notices that a worker sent while it closed its environments."""
     channel = worker.channel
-    with suppress(Exception):  # half a message of one that was ended
+    with suppress(Exception):  # a process that was ended may leave half a message
         while channel is not None and channel.pipe.poll():
             for text in channel.receive()[2]:
                 notice(text)
@@ -271,7 +294,7 @@ class ProcessWorkers(Workers):
 
 
 def process_workers(make: MakeStanding, count: int, name: str) -> Workers:
-    """``count`` workers in processes; ``make`` is given 1 and the worker's number."""
+    """Return ``count`` workers in processes; ``make`` is called with 1 and the worker's number."""
     workers = [ProcessWorker(make, 1, i, f"{name}: worker {i}") for i in range(count)]
     return ProcessWorkers(workers, name)
 
@@ -281,10 +304,10 @@ class ProcessCollectors(ProcessWorkers, WorkerCollectors):
 
     Args:
         make: makes one.
-        each: environments of a worker.
+        each: number of environments of a worker.
         count: W.
         members: P.
-        name: what messages call the environment.
+        name: the environment's name in messages.
     """
 
     def __init__(self, make: MakeStanding, each: int, count: int, members: int, name: str) -> None:

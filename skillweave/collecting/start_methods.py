@@ -1,4 +1,4 @@
-"""Whether this program may start processes, and why not."""
+"""Reasons why this program cannot start processes."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ GUARD = "put what trains inside a block that begins with: if __name__ == '__main
 
 
 def why_no_processes() -> str:
-    """Return why no process can be started here; empty where one can."""
+    """Return why no process can be started here; empty if one can."""
     if mp.current_process().daemon:
         return "this process is a daemon of multiprocessing, which may not have processes"
     return ""
 
 
 def start_method() -> str:
-    """Return how processes are started here; a program that has not chosen yet still may."""
+    """Return the start method of processes, without fixing it if the program has not chosen."""
     return mp.get_start_method(allow_none=True) or mp.get_all_start_methods()[0]
 
 
 def runs_again() -> str:
-    """Return why processes would run the program again that starts them; empty: they do not.
+    """Return why processes would run this program again; empty if they would not.
 
-    Processes that are not forked import the program's main file. Where that trains outside of a
+    Processes that are not forked import the program's main file. If that trains outside of a
     guard, each of them would train again, which Python refuses.
     """
     method, main = start_method(), sys.modules.get("__main__")
     if method == "fork" or not isinstance(main, ModuleType) or not _is_imported(main):
         return ""
-    if main.__name__ == "__mp_main__":  # this process has imported it so itself
+    if main.__name__ == "__mp_main__":  # this process has itself imported it
         return ""
     line = _line_of(main)
     if line is not None and _is_guarded(str(main.__file__), line):
@@ -49,7 +49,7 @@ def runs_again() -> str:
 
 
 def cannot_be_sent(things: Any) -> str:
-    """Return why things cannot be sent to a process that is not forked; empty: they can."""
+    """Return why things cannot be sent to a process that is not forked; empty if they can."""
     if start_method() == "fork":
         return ""
     try:
@@ -60,14 +60,14 @@ def cannot_be_sent(things: Any) -> str:
 
 
 def _is_imported(main: ModuleType) -> bool:
-    """Return whether a process that is not forked imports the main module."""
+    """Return True if a process that is not forked imports the main module."""
     file = getattr(main, "__file__", None)
     named = getattr(getattr(main, "__spec__", None), "name", None)
     return bool(named or (isinstance(file, str) and Path(file).is_file()))
 
 
 def _line_of(main: ModuleType) -> int | None:
-    """Return the line of the main module that runs now; None where it has ended."""
+    """Return the line of the main module that runs now; None if it has ended."""
     frame: FrameType | None = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:
         if frame.f_globals is vars(main) and frame.f_code.co_name == "<module>":
@@ -77,7 +77,7 @@ def _line_of(main: ModuleType) -> int | None:
 
 
 def _is_guarded(file: str, line: int) -> bool:
-    """Return whether a line of a file is in a block that only the program itself runs."""
+    """Return True if a line of a file is in a block that only the program itself runs."""
     try:
         tree = ast.parse(Path(file).read_bytes())
     except (OSError, SyntaxError, ValueError):
@@ -91,7 +91,7 @@ def _is_guarded(file: str, line: int) -> bool:
 
 
 def _asks_for_main(test: ast.expr) -> bool:
-    """Return whether a condition holds only in the program itself."""
+    """Return True if a condition holds only in the program itself."""
     if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And):
         return any(map(_asks_for_main, test.values))
     return (

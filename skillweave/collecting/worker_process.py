@@ -1,4 +1,4 @@
-"""The life of a process in which a worker stands."""
+"""The main function of a worker process."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from time import sleep
+from time import monotonic, sleep
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -16,35 +16,38 @@ from skillweave.collecting.channel import Channel
 from skillweave.collecting.workers import Station
 from skillweave.messages import told
 from skillweave.notices import Notices, collect_notices
+from skillweave.signals import handle_here
 from skillweave.types import SkillweaveError
 
 LOOK = 1.0
-"""Seconds between looks at whether the parent lives."""
+"""Seconds between checks that the parent lives."""
 GRACE = 2.0
-"""Seconds that environments have to close when it does not."""
+"""Seconds that environments have to close after the parent has ended."""
+LEFT = 0.3
+"""Seconds that processes of environments have to end, first by themselves and then by SIGTERM."""
 
 
 class _Ended(BaseException):
-    """The process is to end: somebody terminates it, or its parent is no more."""
+    """The process must end: it received SIGTERM, or its parent has ended."""
 
 
 def work(
     number: int, maker: Any, each: int, channel: Channel, other_end: Channel, parent: int | None
 ) -> None:
-    """Answer (error, result, notices) to every (what, task).
+    """Answer every (what, task) with (error, result, notices), until the parent closes.
 
     Args:
-        number: of the worker.
-        maker: its ``make`` makes what stands here.
-        each: environments.
-        channel: where tasks come from.
-        other_end: the parent's, of which a fork has a copy.
-        parent: the process whose child this one is; None: a server's, which forks.
+        number: the worker's number.
+        maker: its ``make`` returns the collector that works here.
+        each: number of environments.
+        channel: the connection to the parent.
+        other_end: the parent's end of it, of which a fork has a copy.
+        parent: id of the parent process; None if a fork server started this process.
     """
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, who then closes us
-    signal.signal(signal.SIGTERM, _end)  # a fork has the parent's handler
+    handle_here(signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C the parent closes its workers
+    handle_here(signal.SIGTERM, _end)
     torch.set_num_threads(1)
     other_end.close()
     notices = collect_notices()
@@ -68,6 +71,7 @@ def work(
             if station is not None:
                 with suppress(Exception, SystemExit):
                     station.collector.close()
+            _end_children()
             if notices.any:
                 _send(channel, None, None, notices)
     except _Ended:
@@ -75,7 +79,7 @@ def work(
 
 
 def _tasks(channel: Channel) -> Iterator[tuple[str, Any]]:
-    """What the parent asks for, until it closes."""
+    """Yield the parent's requests (what, task), until it closes the worker."""
     while True:
         try:
             what, task = channel.receive()
@@ -87,7 +91,7 @@ def _tasks(channel: Channel) -> Iterator[tuple[str, Any]]:
 
 
 def _send(channel: Channel, error: str | None, answer: Any, notices: Notices) -> None:
-    """Send an answer, if anybody is left to be told."""
+    """Send an answer; end this process if the parent has closed the connection."""
     try:
         channel.send((error, answer, notices.take()))
     except (BrokenPipeError, ConnectionResetError):
@@ -99,10 +103,10 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _end_with(parent: int | None) -> None:
-    """End this process soon after its parent, whatever it does then.
+    """End this process soon after its parent, also during a rollout.
 
-    A thread looks, as the main one may be in a long rollout or in an environment that waits. First
-    environments may close: they may have processes of their own.
+    A thread checks the parent, because the main thread may be in a long rollout or in an
+    environment that waits. Environments get time to close: they may have processes of their own.
     """
     started_by = mp.parent_process()
     assert started_by is not None
@@ -111,7 +115,7 @@ def _end_with(parent: int | None) -> None:
     first = parent or os.getppid()
 
     def watch() -> None:
-        # The first is late where later workers were forked with the pipe that tells it.
+        # is_alive() is late where workers forked later hold copies of its pipe.
         while started_by.is_alive() and os.getppid() == first:
             sleep(LOOK)
         with suppress(OSError, ValueError):
@@ -123,9 +127,26 @@ def _end_with(parent: int | None) -> None:
 
 
 def _may_have_processes() -> None:
-    """Let environments start processes: ``multiprocessing`` forbids it to a daemon.
+    """Let environments start processes, which ``multiprocessing`` forbids to a daemon.
 
-    It ends daemons when their parent ends, and these end with it in any case.
+    The parent still has this process as a daemon: it does not wait for it at its own end.
     """
     with suppress(AttributeError):
         mp.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+
+
+def _end_children() -> None:
+    """End processes that environments have started and not ended when they were closed.
+
+    ``multiprocessing`` would wait for them, until the parent kills this process and they stay.
+    """
+    children = mp.active_children()
+    for child in children:
+        if child.daemon:
+            child.terminate()
+    for seconds, end in ((LEFT, "terminate"), (LEFT, "kill")):
+        until = monotonic() + seconds
+        for child in children:
+            child.join(max(0.0, until - monotonic()))
+            if child.is_alive():
+                getattr(child, end)()

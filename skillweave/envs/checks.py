@@ -110,7 +110,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             found = self.env.reset(seed=seed, options=options)
         except SkillweaveError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._wrong(f"reset() raised {told(error)}") from error
         if not isinstance(found, tuple) or len(found) != 2:
             raise self._wrong(f"reset() returned {_many(found)}; Gymnasium asks for obs, info")
@@ -130,7 +130,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             found = self.env.step(action)
         except SkillweaveError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._wrong(f"step() raised {told(error)}") from error
         if not isinstance(found, tuple) or len(found) != 5:
             raise self._wrong(

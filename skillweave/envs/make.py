@@ -131,7 +131,7 @@ class EnvSpec:
                 env = wrapper(env)
         except SkillweaveError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             which = "" if number is None else f" (environment {number})"
             raise SkillweaveError(f"{self.name}{which} could not be made: {told(error)}") from error
         return CheckedEnv(env, self.name, number)

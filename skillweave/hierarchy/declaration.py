@@ -29,6 +29,7 @@ from skillweave.hierarchy.nesting import (
 from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
+from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill
@@ -245,6 +246,7 @@ class Declaration(Nestable):
         """The selector that is not trained; None: it is."""
         return ready_selector(self.selector, tuple(s.name for s in self.skills))
 
+    @global_generators(Seeds(0) / "spaces")
     def ready_selectors(self) -> dict[str, Policy]:
         """By path, the selectors that are not trained, on the environment's observations."""
         hierarchies = (self, *(inner_of(s) for _, s in every_skill(self.skills)))
@@ -253,6 +255,7 @@ class Declaration(Nestable):
         with closing(self.spec.make()) as env:
             return fitted_selectors(self, env.observation_space)
 
+    @global_generators(Seeds(0) / "spaces")
     def ready_policies(self) -> dict[str, Policy]:
         """By path, the policies of skills that are not trained, on the environment's spaces."""
         if all(s.policy is None for s in self.skills):

@@ -19,7 +19,7 @@ from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
-from skillweave.seeding import Seeds
+from skillweave.seeding import Seeds, global_generators
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.types import Array, Memory, Policy, SkillweaveError
 
@@ -69,23 +69,24 @@ def render_policy(
     seed = whole_number(seed, "seed", 0)
     limit = LONG_EPISODE if max_steps is None else whole_number(max_steps, "max_steps", 1)
     rng = rng or (Seeds(seed) / "render").numpy()
-    env = env_spec.make(render_mode="rgb_array")
-    # Observations, infos and masks are those of an evaluation.
-    engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
-    try:
-        rate = (fps or env.metadata.get("render_fps") or 30) / every
-        with (
-            VideoWriter(path, rate) as video,
-            EpisodeProgress(episodes, quiet=quiet, name="film") as progress,
-        ):
-            film = _Film(env, video, every, label)
-            whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
-            how: Any = {"deterministic": deterministic, "rng": rng}
-            for played in play(policy, whole, before_step=film.before_step, **how):
-                film.after_step(played)
-                progress.watch(played)
-    finally:
-        engine.close()
+    with global_generators(Seeds(seed) / "render" / "global"):
+        env = env_spec.make(render_mode="rgb_array")
+        # Observations, infos and masks are those of an evaluation.
+        engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
+        try:
+            rate = (fps or env.metadata.get("render_fps") or 30) / every
+            with (
+                VideoWriter(path, rate) as video,
+                EpisodeProgress(episodes, quiet=quiet, name="film") as progress,
+            ):
+                film = _Film(env, video, every, label)
+                whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
+                how: Any = {"deterministic": deterministic, "rng": rng}
+                for played in play(policy, whole, before_step=film.before_step, **how):
+                    film.after_step(played)
+                    progress.watch(played)
+        finally:
+            engine.close()
     return {"path": str(path), "frames": video.frames, "episodes": film.episodes}
 
 

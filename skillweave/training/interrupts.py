@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
+from skillweave.signals import handle_here, stop_handling
 from skillweave.terminal import say
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -43,14 +44,14 @@ def deferred(until: str) -> Iterator[None]:
     before = {s: signal.getsignal(s) for s in SIGNALS}
     replaced = [s for s in SIGNALS if before[s] in _DEFAULTS]
     for number in replaced:
-        signal.signal(number, on_signal)
+        handle_here(number, on_signal)
     try:
         yield
         if _received:
             stop()
     finally:
         for number in replaced:
-            signal.signal(number, before[number])
+            stop_handling(number, before[number])
         _received.clear()
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from skillweave.collecting.group import Collectors
 from skillweave.ops.device import INT
-from skillweave.ops.threads import torch_threads
+from skillweave.ops.threads import WorkThread, torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training import interrupts
@@ -181,8 +181,7 @@ class _Loop:
         self.episodes, self.seeds = episodes, seeds
         self.at, self._on_tick = at, on_tick
         self._started = time.perf_counter() - at.seconds
-        set_threads = torch.set_num_threads  # torch counts threads for each thread
-        self._thread = ThreadPoolExecutor(1, "learner", set_threads, (learner.threads,))
+        self._thread = WorkThread("learner", learner.threads)
         self._pending: Future[dict[str, Tensor]] | None = None
         self._saved_at, self._saving_took = time.perf_counter(), 0.0
 
@@ -247,7 +246,7 @@ class _Loop:
 
     def close(self) -> None:
         """Stop; a pending update is finished first, as it changes states in place."""
-        self._thread.shutdown(wait=True)
+        self._thread.close()
 
     def _progress(self, steps: int) -> float:
         return min(1.0, steps / self.schedule_steps)

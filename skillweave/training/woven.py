@@ -26,7 +26,7 @@ from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.starts import start_of
 from skillweave.runs.states import load_state, state_path
-from skillweave.seeding import Seeds
+from skillweave.seeding import Seeds, global_generators
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.replay_learner import ReplayLearner, store_of
 from skillweave.training.scene import WovenScene
@@ -285,7 +285,7 @@ class WovenAgents(OneAgent):
         }  # fmt: skip
         ready = Request(0, (), np.ones(1), seeds / self.first, greedy=True)
         asked = replace(requests.pop(self.first, ready), parts=tuple(requests.values()))
-        with torch_threads(1):
+        with torch_threads(1), global_generators(seeds / "global"):
             limit = longest_evaluation(arena.engine.time_limit)
             return player.play(asked, seeds / "start", limit)
 

@@ -43,6 +43,7 @@ from skillweave.reporting.report.skills_table import (
 from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
+from skillweave.seeding import Seeds, global_generators
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
@@ -74,6 +75,7 @@ class Played:
     """Names of the numbers in an observation."""
 
 
+@global_generators(Seeds(0) / "report")
 def play_episodes(
     policy: Policy,
     spec: EnvSpec,
