@@ -20,6 +20,7 @@ from skillweave import (
     TD3,
     Agent,
     Apart,
+    EnvSpec,
     Evolution,
     Hierarchy,
     Network,
@@ -165,19 +166,22 @@ def test_hierarchies_and_populations_learn_the_same(mode, tmp_path):
         assert all_of(tmp_path / "here") == usual
 
 
-def test_an_environment_keeps_the_modes_of_the_user(tmp_path):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_environment_keeps_the_modes_of_the_user(workers, tmp_path):
     """A simulator in PyTorch computes as it does without this library."""
     seen = set()
 
     class Simulator(gym.Wrapper):
         def step(self, action):
+            assert torch.get_default_dtype() == torch.float64
             seen.add((torch.get_default_dtype(), torch.is_grad_enabled(), torch.ones(1).dtype))
             weight = torch.ones(1, requires_grad=True)
             (weight * 2).numpy()  # refused where gradients are on
             return super().step(action)
 
     with doubles(), no_gradients():
-        agent = Agent(lambda: Simulator(gym.make("CartPole-v1")), PPO(network=NETWORK, **ON), 96)
+        spec = EnvSpec(lambda: Simulator(gym.make("CartPole-v1")), workers=workers)
+        agent = Agent(spec, PPO(network=NETWORK, **ON), 96)
         agent.train(tmp_path / "run", quiet=True).evaluate(1, quiet=True)
     assert seen == {(torch.float64, False, torch.float64)}
 

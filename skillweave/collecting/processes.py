@@ -20,7 +20,7 @@ from typing import Any
 from skillweave.collecting.channel import Channel, channels
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.collecting.start_methods import GUARD
-from skillweave.collecting.worker_process import work
+from skillweave.collecting.worker_process import TorchModes, work
 from skillweave.collecting.workers import (
     MakeStanding,
     WorkerCollectors,
@@ -64,6 +64,7 @@ class ProcessWorker:
     def __init__(self, make: MakeStanding, each: int, number: int, who: str) -> None:
         self._make, self._each, self._number, self._who = make, each, number, who
         self._context: Any = mp.get_context()
+        self._modes = TorchModes.here()
         self.process: Any = None
         self.channel: Channel | None = None
         self._answered = False  # this process, at least once
@@ -95,7 +96,7 @@ class ProcessWorker:
             target=work,
             args=(
                 self._number, _Maker(self._make), self._each, theirs, self.channel,
-                None if serves else os.getpid(),
+                None if serves else os.getpid(), self._modes,
             ),
             name=f"collector-{self._number}",
             daemon=True,

@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from time import monotonic, sleep
 from types import FrameType
 from typing import Any, NoReturn
@@ -31,8 +32,37 @@ class _Ended(BaseException):
     """The process must end: it received SIGTERM, or its parent has ended."""
 
 
+@dataclass(frozen=True)
+class TorchModes:
+    """PyTorch's modes where a program trains: environments in other processes have them, too."""
+
+    gradients: bool
+    dtype: Any
+    """The default type of tensors."""
+
+    @classmethod
+    def here(cls) -> TorchModes:
+        """Return those of this thread."""
+        import torch
+
+        return cls(torch.is_grad_enabled(), torch.get_default_dtype())
+
+    def set(self) -> None:
+        """Set them in this thread."""
+        import torch
+
+        torch.set_grad_enabled(self.gradients)
+        torch.set_default_dtype(self.dtype)
+
+
 def work(
-    number: int, maker: Any, each: int, channel: Channel, other_end: Channel, parent: int | None
+    number: int,
+    maker: Any,
+    each: int,
+    channel: Channel,
+    other_end: Channel,
+    parent: int | None,
+    modes: TorchModes,
 ) -> None:
     """Answer every (what, task) with (error, result, notices), until the parent closes.
 
@@ -43,12 +73,14 @@ def work(
         channel: the connection to the parent.
         other_end: the parent's end of it, of which a fork has a copy.
         parent: id of the parent process; None if a fork server started this process.
+        modes: of the thread that trains.
     """
     import torch
 
     handle_here(signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C the parent closes its workers
     handle_here(signal.SIGTERM, _end)
     torch.set_num_threads(1)
+    modes.set()
     other_end.close()
     notices = collect_notices()
     station: Station | None = None

@@ -82,7 +82,7 @@ def _check_untrained(skill: Skill) -> None:
     ignored = [
         field
         for field in _OF_TRAINING
-        if getattr(skill, field) is not None and _distance(skill, field) <= given
+        if given and getattr(skill, field) is not None and _distance(skill, field) <= given
     ]
     if ignored:
         fields = " and ".join(ignored)
