@@ -97,6 +97,7 @@ def test_evaluations_that_take_longer_than_training_are_said_once(tmp_path, caps
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*steps without an end")
 def test_evaluations_during_training_and_after_it_end(tmp_path):
     """Choosing between greedy and sampling plays no episode longer than those of training."""
     how = {"algorithm": SMALL, "selector": SMALL, "learn": "together"}
