@@ -17,11 +17,12 @@ from skillweave.arguments import checked_names
 from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.envs.infos import ActionMasks, random_actions
+from skillweave.envs.infos import ActionMasks, batched_infos, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
 from skillweave.messages import close_matches, short, shortened, told, whole_number
 from skillweave.reading import as_json
+from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import MissingExtra, SkillweaveError
 
 MOST = 65_536
@@ -326,24 +327,26 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
 
 def _step_seconds(env: gym.Env[Any, Any]) -> float:
     """Seconds of a step with random actions: the least of several means, so load does not count."""
-    masks, rng = ActionMasks(env.action_space, 1), np.random.default_rng(0)
+    space, rng = env.observation_space, np.random.default_rng(0)
+    masks = ActionMasks(env.action_space, 1, observation_space=space)
     discrete = isinstance(env.action_space, gym.spaces.Discrete)
     means = []
 
-    def seen(info: dict[str, Any], ended: bool = False) -> None:
-        told = {k: np.asarray(v)[None] for k, v in info.items() if k == "action_mask"}
-        masks.see(told, ended=np.array([ended]))
+    def seen(obs: Any, info: dict[str, Any], ended: bool = False) -> None:
+        batch = np.zeros((1, *obs_shape(space)), obs_dtype(space))
+        put_observation(space, batch, 0, obs)
+        masks.see(batched_infos([info]), ended=np.array([ended]), obs=batch)
 
-    seen(env.reset(seed=0)[1])
+    seen(*env.reset(seed=0))
     for _ in range(PIECES):
         spent, steps, until = 0.0, 0, time.perf_counter() + PIECE_SECONDS
         while steps == 0 or (steps < STEPS and time.perf_counter() < until):
             action = random_actions(env.action_space, 1, rng, masks.now)[0]
             began = time.perf_counter()
-            _, _, terminated, truncated, info = env.step(int(action) if discrete else action)
+            obs, _, terminated, truncated, info = env.step(int(action) if discrete else action)
             spent, steps = spent + time.perf_counter() - began, steps + 1
-            seen(info, terminated or truncated)
+            seen(obs, info, terminated or truncated)
             if terminated or truncated:
-                seen(env.reset()[1])
+                seen(*env.reset())
         means.append(spent / steps)
     return min(means)

@@ -196,6 +196,17 @@ def test_a_player_is_not_given_a_wrong_mask(mask):
         sw.Player(policy).act(np.zeros(6, np.int8), mask=mask)
 
 
+@pytest.mark.parametrize("where", ["info", "observation", "method"])
+def test_forbidden_actions_are_not_tried_either_to_measure_speed(where, tmp_path):
+    class Strict(Slots):
+        def step(self, action):
+            if not self.free[action]:
+                raise ValueError("forbidden")
+            return super().step(action)
+
+    sw.train_agent(lambda: Strict(where), SMALL, 64, tmp_path / "run", quiet=True)
+
+
 def test_a_method_that_fails_is_named(tmp_path):
     class Broken(Slots):
         def action_masks(self):
