@@ -108,8 +108,6 @@ class RunDirectory:
         self._lock: Lock | None = None
         self.reported_absent: set[str] = set()
         """Logged keys of ``info`` of which users know already that they do not occur."""
-        self.reported_endless = False
-        """Users know already that an episode seems to have no end."""
         self.reported_slow = False
         """Users know already that evaluations take longer than training."""
 

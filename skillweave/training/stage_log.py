@@ -170,11 +170,10 @@ class StageLog:
 
     def tell_endless(self, tally: EpisodeTally) -> None:
         """Say once in a run that an episode has gone on for ``LONG_EPISODE`` steps."""
-        if tally.longest < LONG_EPISODE or self.run.reported_endless:
+        if tally.longest < LONG_EPISODE:
             return
-        self.run.reported_endless = True
         notice(
-            f"an episode has run {tally.longest:,} steps without an end, and no time limit is "
+            f"an episode has run {LONG_EPISODE:,} steps without an end, and no time limit is "
             "known: it is truncated only after "
             f"{LONGEST_EPISODE:,} steps, and evaluations cut theirs after {LONG_EPISODE:,}. If it "
             "should end sooner, or be evaluated for longer, give the environment a limit: "
