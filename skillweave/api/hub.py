@@ -88,7 +88,7 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
         raise SkillweaveError(f"{path} is there already; choose another folder")
     found = hub.download(hub.check_name(name), revision)
     manifest = hub.public(RunDirectory.open(found).manifest)  # others may have pushed all of it
-    # A name that nobody can know: a link that waits there would lead elsewhere.
+    # A name that cannot be guessed: a link that waits there would lead elsewhere.
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """Links inside a run: nothing is written there, since what they lead to is no part of the run.
 
-A run may come from somebody else. Training appends to its files, shortens them, and deletes what a
+A run may come from another person. Training appends to its files, shortens them, and deletes what a
 killed process has left; through a link all of that would happen to the user's other files. The
 directory of the run itself may be reached through a link.
 """

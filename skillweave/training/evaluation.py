@@ -35,7 +35,7 @@ from skillweave.types import Array, Policy, SkillweaveError
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
 USUAL_ENVS = 16
-"""Environments side by side in an evaluation, if nobody says how many."""
+"""Environments side by side in an evaluation where ``num_envs`` is not given."""
 POOL_SEEDS = 2**30
 """A pool has the first episode's seed, modulo this: EnvPool takes seeds below twice as much."""
 
