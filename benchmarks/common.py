@@ -20,7 +20,8 @@ from unittest import mock
 
 from skillweave.cli.processes import processes
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.types import Array, SkillweaveError
+from skillweave.errors import SkillweaveError
+from skillweave.types import Array
 
 workers = processes
 """A pool of fresh processes that end when this one does, however it ends."""

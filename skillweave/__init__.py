@@ -19,6 +19,17 @@ if TYPE_CHECKING:
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
     from skillweave.envs.pool import PoolWrapper, envpool
+    from skillweave.errors import (
+        DeclarationError,
+        EnvError,
+        Interrupted,
+        MissingExtra,
+        PolicyError,
+        RunError,
+        SkillError,
+        SkillweaveError,
+        TrainingError,
+    )
     from skillweave.evolution.config import Evolution, Mutations, Range, Tournament, Truncation
     from skillweave.evolution.selection import Heir, ParentSelection
     from skillweave.experience import Report, Rollout, Sample
@@ -43,7 +54,7 @@ if TYPE_CHECKING:
     from skillweave.training.defaults import TrainDefaults
     from skillweave.training.evaluation import Evaluation, evaluate
     from skillweave.training.stage import Together
-    from skillweave.types import Array, Policy, SkillweaveError, Step
+    from skillweave.types import Array, Policy, Step
 
 __version__ = "0.1.0"
 
@@ -58,7 +69,9 @@ _HOME = {
     "Automaton": "selectors",
     "CNN": "networks.config",
     "DQN": "algorithms.config",
+    "DeclarationError": "errors",
     "Encoder": "networks.encoders",
+    "EnvError": "errors",
     "EnvSpec": "envs.make",
     "Evaluation": "training.evaluation",
     "Evolution": "evolution.config",
@@ -67,10 +80,12 @@ _HOME = {
     "Heir": "evolution.selection",
     "Hierarchy": "api",
     "HierarchyPolicy": "hierarchy.policy",
+    "Interrupted": "errors",
     "LastCall": "selectors",
     "Layout": "networks.stacked",
     "Lengths": "collecting.lengths",
     "Linear": "algorithms.schedules",
+    "MissingExtra": "errors",
     "Mutations": "evolution.config",
     "Net": "networks.net",
     "Network": "networks.config",
@@ -81,6 +96,7 @@ _HOME = {
     "ParentSelection": "evolution.selection",
     "Player": "api.player",
     "Policy": "types",
+    "PolicyError": "errors",
     "PoolWrapper": "envs.pool",
     "RNN": "networks.config",
     "Range": "evolution.config",
@@ -89,19 +105,22 @@ _HOME = {
     "Report": "experience",
     "Rollout": "experience",
     "Run": "api",
+    "RunError": "errors",
     "SAC": "algorithms.config",
     "Sample": "experience",
     "Seeds": "seeding",
     "Selection": "hierarchy.settings",
     "SelfImitationPPO": "algorithms.config",
     "Skill": "skills",
-    "SkillweaveError": "types",
+    "SkillError": "errors",
+    "SkillweaveError": "errors",
     "Step": "types",
     "TD3": "algorithms.config",
     "Together": "training.stage",
     "Tournament": "evolution.config",
     "TrainDefaults": "training.defaults",
     "TrainEvent": "training.callback",
+    "TrainingError": "errors",
     "Truncation": "evolution.config",
     "adam_": "ops.optim",
     "clip_grad_norm_": "ops.optim",
@@ -140,7 +159,9 @@ __all__ = [
     "Apart",
     "Array",
     "Automaton",
+    "DeclarationError",
     "Encoder",
+    "EnvError",
     "EnvSpec",
     "Evaluation",
     "Evolution",
@@ -149,10 +170,12 @@ __all__ = [
     "Heir",
     "Hierarchy",
     "HierarchyPolicy",
+    "Interrupted",
     "LastCall",
     "Layout",
     "Lengths",
     "Linear",
+    "MissingExtra",
     "Mutations",
     "Net",
     "Network",
@@ -162,6 +185,7 @@ __all__ = [
     "ParentSelection",
     "Player",
     "Policy",
+    "PolicyError",
     "PoolWrapper",
     "Range",
     "Ray",
@@ -169,17 +193,20 @@ __all__ = [
     "Report",
     "Rollout",
     "Run",
+    "RunError",
     "Sample",
     "Seeds",
     "Selection",
     "SelfImitationPPO",
     "Skill",
+    "SkillError",
     "SkillweaveError",
     "Step",
     "Together",
     "Tournament",
     "TrainDefaults",
     "TrainEvent",
+    "TrainingError",
     "Truncation",
     "adam_",
     "clip_grad_norm_",

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
-from skillweave.types import SkillweaveError
 
 T = TypeVar("T", bound=Callable[..., Any])
 

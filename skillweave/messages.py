@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.tracebacks import place
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 MOST = 10**12
 """The largest whole number that an argument may be: a million times it fits into 64 bits."""

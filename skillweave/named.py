@@ -14,8 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
-from skillweave.types import SkillweaveError
 
 _PLAIN = (bool, int, float, str, type(None))
 _RECIPE = "skillweave_recipe_"

@@ -31,8 +31,8 @@ from typing import (
 
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
-from skillweave.types import SkillweaveError
 
 DEEPEST = 100
 """How deep JSON may be nested; what reads it may then be recursive."""

@@ -1,7 +1,6 @@
 """Words that every room shares: steps, and what acts and what learns.
 
-This module imports nothing of the library but ``terminal`` and ``tracebacks``, and no torch when it
-runs.
+This module imports nothing of the library, and no torch when it runs.
 """
 
 from __future__ import annotations
@@ -13,9 +12,6 @@ from typing import Any, Protocol, TypeAlias, TypeVar
 import numpy as np
 from gymnasium import Space
 from numpy.typing import NDArray
-
-from skillweave.terminal import printable
-from skillweave.tracebacks import ShortTraceback
 
 T = TypeVar("T")
 Array: TypeAlias = NDArray[Any]
@@ -42,27 +38,6 @@ def flat(prefix: str, value: Any) -> dict[str, Any]:
     for k, v in value.items():
         found |= flat(f"{prefix}.{k}", v)
     return found
-
-
-class SkillweaveError(ShortTraceback, Exception):
-    """An error made for people: it says what was wrong, where, and what to do about it."""
-
-    def __init__(self, message: str = "") -> None:
-        super().__init__(printable(message))
-
-
-class Interrupted(ShortTraceback, KeyboardInterrupt):
-    """Training was interrupted; the message says what is saved and how to go on."""
-
-    def __init__(self, message: str = "") -> None:
-        super().__init__(printable(message))
-
-
-class MissingExtra(SkillweaveError, ImportError):
-    """A feature needs an optional dependency; the message names the extra to install."""
-
-    def __init__(self, feature: str, extra: str) -> None:
-        super().__init__(f"{feature} needs the extra '{extra}': pip install 'skillweave[{extra}]'")
 
 
 def read_only(array: Array) -> Array:

@@ -23,7 +23,7 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, EnvSpec, Hierarchy, Network, Reflex, Skill
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 TINY = Network((4,))
 PPO_TINY = PPO(num_envs=2, n_steps=4, batch_size=8, update_epochs=1, network=TINY)

@@ -14,7 +14,7 @@ import pytest
 
 import skillweave as sw
 from skillweave.arguments import checked_names
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 
 @checked_names

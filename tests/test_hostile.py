@@ -5,7 +5,7 @@ import pytest
 from hostile import Case, Plain, Ramp, run_hostile, train, tried
 
 from skillweave import Skill
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 
 @pytest.mark.slow

@@ -20,8 +20,8 @@ import torch
 from safetensors.torch import load_file
 
 import skillweave as sw
+from skillweave.errors import SkillweaveError
 from skillweave.selectors.function import FunctionSelector
-from skillweave.types import SkillweaveError
 
 SMALL = sw.PPO(num_envs=4, n_steps=32, batch_size=32)
 FAST: dict[str, Any] = {"steps": 256, "learn": "apart", "algorithm": SMALL, "selector": SMALL}

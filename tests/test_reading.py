@@ -10,6 +10,7 @@ from typing import Any, Literal, NotRequired, TypedDict
 import pytest
 
 from skillweave.algorithms.config import DQN, PPO, config_from_json, config_to_json
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_from_json, evolution_to_json
 from skillweave.reading import (
     DEEPEST,
@@ -22,7 +23,6 @@ from skillweave.reading import (
     read_file,
     shown,
 )
-from skillweave.types import SkillweaveError
 
 
 class Inner(TypedDict):

@@ -8,6 +8,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Te
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skillweave.errors import SkillweaveError
 from skillweave.spaces import (
     action_codec,
     obs_codec,
@@ -19,7 +20,6 @@ from skillweave.spaces import (
     space_to_json,
     to_tensor,
 )
-from skillweave.types import SkillweaveError
 
 
 def encode(space: gym.Space, obs) -> list[float]:

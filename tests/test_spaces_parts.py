@@ -10,6 +10,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skillweave.errors import SkillweaveError
 from skillweave.spaces import (
     obs_codec,
     obs_dtype,
@@ -21,7 +22,6 @@ from skillweave.spaces import (
     to_tensor,
     unpack,
 )
-from skillweave.types import SkillweaveError
 
 BYTES = np.uint8
 

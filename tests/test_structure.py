@@ -20,6 +20,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 # The table of docs/architecture.md: what a room may import. `seeding` is open to all.
 BASE = {
+    "errors",
     "types",
     "terminal",
     "tracebacks",
@@ -42,14 +43,15 @@ ROOMS: dict[str, set[str]] = {
     "terminal": set(),
     "tracebacks": set(),
     "notebooks": set(),
-    "types": {"terminal", "tracebacks"},
+    "errors": {"terminal", "tracebacks"},
+    "types": set(),
     "shapes": set(),
-    "messages": {"types", "tracebacks"},
+    "messages": {"errors", "types", "tracebacks"},
     "notices": set(),
     "signals": set(),
-    "arguments": {"types", "messages"},
-    "named": {"types", "messages"},
-    "reading": {"types", "messages"},
+    "arguments": {"errors", "types", "messages"},
+    "named": {"errors", "types", "messages"},
+    "reading": {"errors", "types", "messages"},
     "experience": {"types"},
     "ops": BASE,
     "spaces": BASE,
@@ -76,9 +78,10 @@ ROOMS: dict[str, set[str]] = {
 }
 # Modules that are stricter than their room: settings, which help and errors read, need no torch.
 LEAVES: dict[str, set[str]] = {
-    "networks.config": {"types", "messages", "arguments", "named"},
-    "reading": {"types", "messages"},
+    "networks.config": {"errors", "types", "messages", "arguments", "named"},
+    "reading": {"errors", "types", "messages"},
     "algorithms.config": {
+        "errors",
         "types",
         "messages",
         "arguments",
@@ -89,10 +92,11 @@ LEAVES: dict[str, set[str]] = {
         "algorithms.config_off_policy",
         "algorithms.config_on_policy",
     },
-    "algorithms.schedules": {"types", "messages", "arguments", "named"},
-    "algorithms.config_checks": {"types", "messages", "networks.config"},
+    "algorithms.schedules": {"errors", "types", "messages", "arguments", "named"},
+    "algorithms.config_checks": {"errors", "types", "messages", "networks.config"},
     "algorithms.config_off_policy": {
         "algorithms.schedules",
+        "errors",
         "types",
         "arguments",
         "named",
@@ -101,6 +105,7 @@ LEAVES: dict[str, set[str]] = {
     },
     "algorithms.config_on_policy": {
         "algorithms.schedules",
+        "errors",
         "types",
         "arguments",
         "named",
@@ -108,6 +113,7 @@ LEAVES: dict[str, set[str]] = {
         "algorithms.config_checks",
     },
     "evolution.config": {
+        "errors",
         "types",
         "messages",
         "arguments",

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from skillweave import PPO, EnvSpec, Hierarchy, Skill, evaluate
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
 from skillweave.skills.outputs import blame
 from skillweave.tracebacks import LIBRARY, place
-from skillweave.types import Memoryless, SkillweaveError
+from skillweave.types import Memoryless
 
 HERE = Path(__file__).name
 

@@ -25,7 +25,7 @@ from benchmarks.pay.agents import CHAINS
 from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.jobs import SUITES, run_all, suite_of
 from benchmarks.pay.results import Results, hours, of_other_code
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 
 def chosen(asked: list[str]) -> dict[str, list[str] | None]:

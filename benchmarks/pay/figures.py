@@ -13,8 +13,8 @@ from benchmarks.pay.agents import BONUS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_
 from benchmarks.pay.results import Result
 from benchmarks.pay.statistics import interval, mean_of_all, solved_over_steps
 from benchmarks.pay.suite import Suite
+from skillweave.errors import MissingExtra
 from skillweave.training.evaluation import interquartile_mean
-from skillweave.types import MissingExtra
 
 LEARNERS = (HIERARCHY, FLAT, SHAPED, BONUS, TUNED)
 COLORS = ("#b3261e", "#1f4e79", "#5b8a3c", "#8a6d1f", "#6a4c93")

@@ -12,8 +12,8 @@ from typing import Any
 
 import benchmarks
 import skillweave
+from skillweave.errors import SkillweaveError
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import SkillweaveError
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ from scripts.torture.kills import PATIENCE, SORTS, go_on, log_of, train_whole
 from scripts.torture.kinds import KINDS, Kind
 from scripts.torture.processes import fork, kill_group, wait
 from scripts.torture.report import EQUAL, FINISHED, HANG, LOST, TRACEBACK, Outcome
+from skillweave.errors import SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
-from skillweave.types import SkillweaveError
 
 NAMES = (
     "skills and selector", "replay of continuous actions", "population, replay",

@@ -41,7 +41,7 @@ from scripts.torture.report import (
 )
 from scripts.torture.samples import SAMPLES, Play, Sample
 from skillweave.compat import pickles
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 SECONDS = 4
 """Of the processor's time, what a case may take; then an exception ends it."""

@@ -32,8 +32,8 @@ from scripts.torture.processes import fork, group_is_gone, kill_group, wait
 from scripts.torture.report import FILES, FINISHED, HANG, LEFT, LOST, REFUSED, TRACEBACK, Outcome
 from skillweave import DQN, PPO, SAC, Apart, EnvSpec, Evolution, Hierarchy, Network, Skill, load
 from skillweave.api import Agent
+from skillweave.errors import SkillweaveError
 from skillweave.runs.files import write_json
-from skillweave.types import SkillweaveError
 
 PATIENCE = 120.0
 """Seconds that a training of about one second may take."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from skillweave.algorithms.config import check_spaces
 from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Report
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -22,7 +23,7 @@ from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import ObsCodec, action_codec, obs_codec
-from skillweave.types import Array, SkillweaveError, prefixed
+from skillweave.types import Array, prefixed
 
 S = TypeVar("S")
 Device = torch.device | str

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 PROGRAMS = 64
 """The most programs of one gradient step: for other sizes, for rows with gaps, with an anchor."""

@@ -13,9 +13,9 @@ import gymnasium as gym
 
 from skillweave.algorithms.config_off_policy import DQN, SAC, TD3, OffPolicy
 from skillweave.algorithms.config_on_policy import PPO, OnPolicy, SelfImitationPPO, SkillCritic
+from skillweave.errors import SkillweaveError
 from skillweave.named import Named
 from skillweave.reading import as_json, fit, shown
-from skillweave.types import SkillweaveError
 
 AlgorithmConfig: TypeAlias = OnPolicy | OffPolicy
 """Any algorithm's settings, those of users' own algorithms included."""

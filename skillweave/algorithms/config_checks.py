@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.networks.config import Network, from_dict
-from skillweave.types import SkillweaveError
 
 INFINITY = float("inf")
 HUGE = 1e38

@@ -22,8 +22,8 @@ from skillweave.algorithms.config_checks import (
 )
 from skillweave.algorithms.schedules import Linear, check_rate, is_schedule
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import Network
-from skillweave.types import SkillweaveError
 
 Schedule = Literal["constant", "linear"]
 

@@ -15,9 +15,10 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.registry import make_algorithm
+from skillweave.errors import SkillweaveError
 from skillweave.reading import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
-from skillweave.types import Array, Memory, Memoryless, SkillweaveError
+from skillweave.types import Array, Memory, Memoryless
 
 S = TypeVar("S")
 

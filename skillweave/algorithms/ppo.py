@@ -22,6 +22,7 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.ppo_samples import Terms, epsilon_now, samples_of
 from skillweave.algorithms.rollouts import Samples, minibatches
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Report, Rollout
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -33,7 +34,7 @@ from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
 from skillweave.ops.moments import masked_mean
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
 from skillweave.seeding import Seeds
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""

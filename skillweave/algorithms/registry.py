@@ -17,7 +17,7 @@ from skillweave.algorithms.config import (
     registration_of,
 )
 from skillweave.arguments import checked_names
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 _SETTINGS: dict[str, type[Any]] = {"rollout": OnPolicy, "replay": OffPolicy}
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, told
 from skillweave.named import Named, known_names, named
-from skillweave.types import SkillweaveError
 
 
 @checked_names

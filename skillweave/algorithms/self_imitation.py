@@ -20,6 +20,7 @@ from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.algorithms.ppo import State as PPOState
 from skillweave.algorithms.ppo_samples import Terms
 from skillweave.algorithms.rollouts import Cells, first_true
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Report, Rollout
 from skillweave.networks.stacked import Views, take_rows
 from skillweave.ops.device import BOOL, FLOAT, all_false
@@ -27,7 +28,6 @@ from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
-from skillweave.types import SkillweaveError
 
 
 @dataclass

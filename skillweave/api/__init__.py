@@ -21,6 +21,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.plan import Evolve
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -32,7 +33,6 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.callback import Callback
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.types import SkillweaveError
 
 
 class Agent(PlainAgent):

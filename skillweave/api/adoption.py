@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import adopt_guide
 from skillweave.hierarchy.nesting import copied, every_hierarchy, every_skill, inner_of
@@ -15,7 +16,6 @@ from skillweave.hierarchy.weights import adopt_calls, check_selector
 from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy

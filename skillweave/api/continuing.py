@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skillweave.api.adoption import adopted, check_run, differences
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.plan import Evolve, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -14,7 +15,6 @@ from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub
 from skillweave.training.stage import decides
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy

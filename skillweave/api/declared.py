@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from skillweave import recipes
 from skillweave.api import Agent, Hierarchy
+from skillweave.errors import SkillweaveError
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import SkillweaveError
 
 ASK = "Point to the file that defines it, if you trust it: --recipe FILE.py"
 

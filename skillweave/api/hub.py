@@ -11,13 +11,13 @@ from typing import Any
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.loading import check_declared, load_from
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import as_path
 from skillweave.reporting.card import write_card
 from skillweave.reporting.plots import plot_run
 from skillweave.runs import hub
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import load_evaluation
-from skillweave.types import SkillweaveError
 
 ASK = (
     "Pass the hierarchy that was trained, if you have its code and trust it: "

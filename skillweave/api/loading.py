@@ -9,13 +9,13 @@ from skillweave.api.adoption import adopted, check_run
 from skillweave.api.run import Run
 from skillweave.api.running import caller_of, declared_of
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, short
 from skillweave.runs.command_words import called_by, python_string
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import every_skill, inner_of
 from skillweave.notebooks import Markup, facts, joined, paragraph, table
@@ -15,7 +16,6 @@ from skillweave.skills.base import RecordedSkill, Skill, about, own_methods
 from skillweave.terminal import printable
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy

@@ -5,10 +5,10 @@ from __future__ import annotations
 from skillweave.api import Hierarchy, Run
 from skillweave.arguments import checked_names
 from skillweave.envs.make import make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short, whole_number
-from skillweave.types import SkillweaveError
 
 
 @checked_names

@@ -9,8 +9,9 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
+from skillweave.errors import SkillweaveError
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
-from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+from skillweave.types import Array, Memory, Policy, Step
 
 
 @checked_names

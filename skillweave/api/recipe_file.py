@@ -12,9 +12,9 @@ from types import ModuleType
 
 from skillweave.api.running import READING
 from skillweave.collecting.shipping import add_folder
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
 from skillweave.tracebacks import place
-from skillweave.types import SkillweaveError
 
 
 def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> ModuleType:

@@ -12,6 +12,7 @@ from skillweave.api.notebook_tables import run_html
 from skillweave.api.player import Player
 from skillweave.arguments import checked_names
 from skillweave.envs.make import EngineName
+from skillweave.errors import SkillweaveError
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.schedule import stages_of
@@ -29,7 +30,7 @@ from skillweave.terminal import printable
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy

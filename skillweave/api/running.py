@@ -18,6 +18,7 @@ from skillweave.collecting.cluster import Ray
 from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.collecting.where import HERE, Where
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import Interrupted, SkillweaveError
 from skillweave.evolution.plan import Evolve, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -38,7 +39,6 @@ from skillweave.terminal import steady_streams
 from skillweave.training.callback import Callback, TrainCallback, check_callback
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.training.stage_log import Listener
-from skillweave.types import Interrupted, SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy

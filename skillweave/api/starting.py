@@ -12,12 +12,12 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.run import Run
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, close_matches, short
 from skillweave.runs.starts import Chooses, Learnt, begin_with, chosen_from, learnt_in, same_shapes
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.api import Agent, Hierarchy

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from skillweave.buffers.held import check_columns
 from skillweave.buffers.ram import check_memory
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Experience
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 NOTHING, GOES_ON, TERMINATED = 0, 1, 2  # what lies in a slot; after GOES_ON the value counts
 INTEGERS = (np.uint8, np.int16, np.int32)  # what files can hold

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 try:
     import resource

@@ -16,10 +16,10 @@ from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.telling import put, save_score, tell
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import shown_path
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
-from skillweave.types import MissingExtra, SkillweaveError
 
 MISSION = "tour"
 """Fly left, fly right, land."""

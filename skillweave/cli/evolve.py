@@ -8,10 +8,10 @@ from typing import Any
 
 from skillweave.api.running import apart_to_evolve
 from skillweave.cli.overrides import replaced
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.schedule import stages_of
-from skillweave.types import SkillweaveError
 
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
 

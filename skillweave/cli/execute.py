@@ -16,6 +16,7 @@ from skillweave.cli.targets import load_run, target
 from skillweave.cli.telling import save_score, tell
 from skillweave.cli.training import resume, train
 from skillweave.compat.agilerl_files import convert
+from skillweave.errors import SkillweaveError
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -24,7 +25,6 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.several import open_runs
 from skillweave.terminal import one_line
 from skillweave.training.evaluation_file import load_evaluation
-from skillweave.types import SkillweaveError
 
 
 def run(command: commands.Command) -> int:

@@ -55,9 +55,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         "skillweave --version prints the version.",
         args=given,
     )
+    from skillweave.errors import SkillweaveError
     from skillweave.runs.command_words import called_by
     from skillweave.tracebacks import all_frames_wanted
-    from skillweave.types import SkillweaveError
 
     try:
         from skillweave.cli import execute

@@ -14,9 +14,9 @@ from typing import Any
 from skillweave.algorithms.config import named_config
 from skillweave.algorithms.schedules import Linear
 from skillweave.collecting.lengths import Lengths
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.skills import Skill
-from skillweave.types import SkillweaveError
 
 PLAIN = ("call_steps", "steps", "learn")
 """Fields of a hierarchy that are set by themselves."""

@@ -16,7 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 PATIENCE = 1.0
 """Seconds between looks whether a job's process is still there."""

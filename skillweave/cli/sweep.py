@@ -27,11 +27,11 @@ from skillweave.cli.sweep_table import summary
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.messages import short, told, whole_number
 from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
-from skillweave.types import SkillweaveError
 
 MOST = 10_000
 """Runs of a sweep."""

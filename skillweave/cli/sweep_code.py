@@ -19,9 +19,9 @@ from typing import TypedDict
 
 from skillweave import recipes
 from skillweave.collecting.shipping import is_own_code
+from skillweave.errors import SkillweaveError
 from skillweave.reading import fit, shown
 from skillweave.runs.files import read_json, write_json
-from skillweave.types import SkillweaveError
 
 MARK = ".sweep"
 """A file in the sweep's directory, by which a machine knows that it sees it."""

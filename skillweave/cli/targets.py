@@ -9,8 +9,8 @@ from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.declared import ASK, declared_in
 from skillweave.api.loading import load_from
 from skillweave.cli import commands
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.weights import open_weights
-from skillweave.types import SkillweaveError
 
 
 def target(command: commands.Watched | commands.Export) -> Run:

@@ -7,13 +7,13 @@ from typing import Any
 
 from skillweave.api import Run
 from skillweave.cli import commands
+from skillweave.errors import SkillweaveError
 from skillweave.messages import shown_path
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.terminal import put_result, say
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
-from skillweave.types import SkillweaveError
 
 
 def tell(command: commands.Output, data: dict[str, Any], text: str) -> None:

@@ -15,10 +15,10 @@ from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.telling import put, run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import Evolution
 from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import SkillweaveError
 
 
 def train(command: commands.Train) -> None:

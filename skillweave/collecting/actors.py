@@ -29,8 +29,8 @@ from skillweave.collecting.collector import Collected
 from skillweave.collecting.shipping import packed
 from skillweave.collecting.stationed import COMPUTING, actor_class
 from skillweave.collecting.workers import MakeStanding, WorkerCollectors, WorkerLost, Workers
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
-from skillweave.types import SkillweaveError
 
 PATIENCE = 1.0
 """Seconds that actors have to close their environments."""

@@ -14,10 +14,11 @@ import numpy as np
 from skillweave.collecting.ends import ENDED, Interruption, Why, skill_step
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.infos import allowed_rows
+from skillweave.errors import SkillweaveError
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked, path_of
 from skillweave.skills.outputs import blame
-from skillweave.types import Array, Memory, Policy, SkillweaveError, Step
+from skillweave.types import Array, Memory, Policy, Step
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from skillweave.collecting.group import Collectors, MakeCollector, share_of
 from skillweave.collecting.where import Where
 from skillweave.collecting.workers import MakeStanding, Workers
 from skillweave.envs.make import cores
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import short, told, whole_number
-from skillweave.types import MissingExtra, SkillweaveError
 
 PATIENCE = 5.0
 """Seconds that an address has to answer."""

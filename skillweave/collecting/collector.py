@@ -14,10 +14,11 @@ from skillweave.collecting.columns import as_wide
 from skillweave.collecting.restored import check_numbers, opened
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import info_numbers
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Experience
 from skillweave.seeding import Seeds, seed_global_generators
 from skillweave.skills.info_words import info_keys
-from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
+from skillweave.types import Array, prefixed, unprefixed
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
 """The first columns of ``Collected.episodes``."""

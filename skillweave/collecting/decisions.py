@@ -18,9 +18,10 @@ from skillweave.collecting.restored import ranges_of, ranges_of_guide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import told_success
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Experience
 from skillweave.skills import Skill, path_of
-from skillweave.types import Array, Memory, SkillweaveError, Step, prefixed
+from skillweave.types import Array, Memory, Step, prefixed
 
 
 class DecisionCollector(Collector):

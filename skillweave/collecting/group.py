@@ -9,9 +9,10 @@ import numpy as np
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected, Collector, side_by_side
 from skillweave.collecting.start_methods import runs_again, why_no_processes
+from skillweave.errors import SkillweaveError
 from skillweave.notices import notice
 from skillweave.seeding import Seeds
-from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
+from skillweave.types import Array, prefixed, unprefixed
 
 MakeCollector = Callable[[int, int], Collector]
 """Given how many environments and the number of the first one, makes a collector."""

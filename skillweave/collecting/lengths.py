@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import Any
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
-from skillweave.types import SkillweaveError
 
 
 @checked_names

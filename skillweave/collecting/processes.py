@@ -28,9 +28,9 @@ from skillweave.collecting.workers import (
     Workers,
     environments_of,
 )
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
 from skillweave.notices import notice
-from skillweave.types import SkillweaveError
 
 PATIENCE = 1.0
 """Seconds that workers have to end by themselves when they are closed."""

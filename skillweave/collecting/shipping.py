@@ -18,8 +18,8 @@ import cloudpickle
 import gymnasium as gym
 
 from skillweave.algorithms.config import add_registration, own_registrations
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
-from skillweave.types import SkillweaveError
 
 _FOLDERS: list[str] = []
 """Folders of recipes, whose files these may import."""

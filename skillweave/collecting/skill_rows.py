@@ -14,10 +14,11 @@ from skillweave.collecting.columns import Columns
 from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Experience
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.types import Array, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""

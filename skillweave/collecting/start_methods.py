@@ -11,7 +11,7 @@ from types import FrameType, ModuleType
 from typing import Any
 
 from skillweave.collecting.shipping import packed
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 GUARD = "put what trains inside a block that begins with: if __name__ == '__main__':"
 

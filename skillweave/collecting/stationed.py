@@ -14,8 +14,8 @@ import ray
 
 from skillweave.collecting.shipping import unpacked
 from skillweave.collecting.workers import Station
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
-from skillweave.types import SkillweaveError
 
 COMPUTING = "torch", "numpy", "gymnasium", "envpool", "mujoco"
 """Packages of which another version may compute other numbers."""

@@ -15,10 +15,10 @@ from typing import Any, NoReturn
 
 from skillweave.collecting.channel import Channel
 from skillweave.collecting.workers import Station
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
 from skillweave.notices import Notices, collect_notices
 from skillweave.signals import handle_here
-from skillweave.types import SkillweaveError
 
 LOOK = 1.0
 """Seconds between checks that the parent lives."""

@@ -19,8 +19,9 @@ from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected
 from skillweave.collecting.group import Collectors, joined_states, split_states
 from skillweave.envs.engine import checksums
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 SNAPSHOT_EVERY = 16
 """Requests after which workers say where they stand, so that less need be done again."""

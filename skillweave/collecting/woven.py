@@ -15,9 +15,10 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.levels import CRITIC, SELECTOR, Inside, Level, woven
 from skillweave.collecting.woven_rows import Rows
 from skillweave.envs.engine import Engine, RawStep
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Experience
 from skillweave.skills import Skill
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.types import Array, Step
 
 
 class WovenCollector(DecisionCollector):

@@ -8,10 +8,10 @@ from typing import Any
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy, state_from
+from skillweave.errors import SkillweaveError
 from skillweave.reading import check_file
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 
 def save_agent(path: str | Path, algorithm: Algorithm, state: Any, about: dict[str, Any]) -> None:

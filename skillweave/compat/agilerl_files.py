@@ -18,11 +18,11 @@ from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.compat.agent_files import save_agent
 from skillweave.compat.pickles import read_torch_pickle
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
 from skillweave.reading import Asked, Positive, fit, shown
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 _KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "DDPG": TD3, "TD3": TD3}
 _OUTPUTS = {"PPO": "Softmax", "DQN": None, "DDPG": "Tanh", "TD3": "Tanh"}

@@ -6,7 +6,7 @@ import pickletools
 import zipfile
 from typing import Any
 
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 DEEPEST = 100
 """How deep a pickle may nest what it builds: hashing a deeper tuple overflows Python's stack."""

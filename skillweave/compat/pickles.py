@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from skillweave.compat.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.reading import check_file, shown
-from skillweave.types import SkillweaveError
 
 _STORAGES = {
     "FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16,

@@ -6,9 +6,9 @@ import os
 import sys
 from typing import Any
 
+from skillweave.errors import MissingExtra
 from skillweave.runs.trackers import wandb_mode
 from skillweave.terminal import say
-from skillweave.types import MissingExtra
 
 _messages: list[str] = []
 """What has not been printed yet."""

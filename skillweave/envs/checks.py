@@ -14,16 +14,12 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, told
 from skillweave.notices import notice
 from skillweave.spaces import obs_shape
 from skillweave.spaces.packing import parts
-from skillweave.types import (
-    LARGEST_REWARD,
-    Array,
-    SkillweaveError,
-    wrong_reward,
-)
+from skillweave.types import LARGEST_REWARD, Array, wrong_reward
 
 LONGEST_EPISODE = 100_000
 """Steps after which an engine truncates an episode that nothing else has ended."""

@@ -13,7 +13,8 @@ from skillweave.envs.engine import RawStep
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
 from skillweave.envs.pool import MakePool, installed, no_precision_warnings
-from skillweave.types import Array, MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.types import Array
 
 RENEW_AFTER = 100_000
 """Steps since their seeds after which environments get new ones, as their episodes end."""

@@ -8,10 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, info_keys
 from skillweave.spaces import action_codec
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 
 def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -20,10 +20,10 @@ from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, batched_infos, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, short, shortened, told, whole_number
 from skillweave.reading import as_json
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
-from skillweave.types import MissingExtra, SkillweaveError
 
 MOST = 65_536
 """Environments in one engine."""

@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 import gymnasium as gym
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
-from skillweave.types import SkillweaveError
 
 ObsNames: TypeAlias = Sequence[str] | Mapping[str, Sequence[str]]
 """A name for each number of a flat observation; for a Dict, such names by key."""

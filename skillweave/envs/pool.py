@@ -10,8 +10,9 @@ from typing import Any, Protocol
 import gymnasium as gym
 
 from skillweave.arguments import checked_names
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, short
-from skillweave.types import Array, MissingExtra, SkillweaveError
+from skillweave.types import Array
 
 
 class Pool(Protocol):

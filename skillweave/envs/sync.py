@@ -9,8 +9,9 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.infos import batched_infos
+from skillweave.errors import SkillweaveError
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 
 class SyncEnvs:

@@ -18,6 +18,7 @@ from torch import Tensor
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.errors import SkillweaveError
 from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
@@ -26,7 +27,6 @@ from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
 from skillweave.networks.stacked import Views
 from skillweave.networks.units import Units, channels_of, hidden_units, joint_of
-from skillweave.types import SkillweaveError
 
 Alter = Callable[[Views, bool], dict[str, Tensor]]
 """Parameters by name, and whether they are moments, to those of the changed network."""

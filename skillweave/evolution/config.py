@@ -11,9 +11,9 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.config_checks import check, number, one_of, whole
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import Activation
 from skillweave.reading import fit
-from skillweave.types import SkillweaveError
 
 Scale = Literal["linear", "log", "complement"]
 KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")

@@ -10,12 +10,12 @@ import torch
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import setting_number
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
 from skillweave.evolution.stacks import Member, Origin, copy, networks_of
 from skillweave.networks.config import Network
 from skillweave.ops.device import FLOAT
-from skillweave.types import SkillweaveError
 
 Spaces = tuple[Any, Any]
 

@@ -7,13 +7,13 @@ from typing import Any
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.collecting.where import HERE, Where
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
 from skillweave.training.woven import agents_of
-from skillweave.types import SkillweaveError
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
 """A population for every stage, or for those named."""

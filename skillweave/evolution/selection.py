@@ -8,8 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import Evolution, Tournament, Truncation
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 
 @checked_names

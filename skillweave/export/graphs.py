@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.ops.device import BOOL, FLOAT
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts
-from skillweave.types import MissingExtra, SkillweaveError
 
 OPSET = 18
 """Version of ONNX's operators."""

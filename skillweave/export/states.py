@@ -9,6 +9,7 @@ import numpy as np
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.calls import SkillSet
+from skillweave.errors import SkillweaveError
 from skillweave.export.foreign import file_graph, module_graph
 from skillweave.export.graphs import Graph, agent_graph, worth_graph
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -19,7 +20,7 @@ from skillweave.skills import Reflex
 from skillweave.skills.onnx_file import OnnxPolicy
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.skills.torch_module import TorchPolicy
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 
 class States:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from skillweave.collecting.lengths import Lengths
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.nesting import Nestable, inner_of
 from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
@@ -12,7 +13,6 @@ from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.training.checks import check_algorithm
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.stage import Target, Together, target_of
-from skillweave.types import SkillweaveError
 
 GROUPS = {
     "apart": (Apart, "Apart(skill_steps=100_000)"),

@@ -14,6 +14,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.budgets import budgets_of, scale_budgets
 from skillweave.hierarchy.checks import check_calls, check_groups, checked_reflexes, checked_skills
 from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted_selectors
@@ -38,7 +39,7 @@ from skillweave.training.checks import check_algorithm, check_env, check_fields
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.plain_agent import AGENT, PlainAgent
 from skillweave.training.stage import CRITIC, SELECTOR, TOGETHER, Together, target_of
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
 """Names of stages that are not skills."""

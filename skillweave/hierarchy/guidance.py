@@ -11,12 +11,12 @@ import gymnasium as gym
 from skillweave.algorithms.config import PPO
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.selectors import Automaton, ReadySelector, ready_selector
 from skillweave.skills.foreign_policy import fitted, source_of
 from skillweave.training.checks import check_algorithm
 from skillweave.training.stage import SELECTOR
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.hierarchy.declaration import Declaration

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.skills import Skill
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.hierarchy.declaration import Declaration

@@ -13,9 +13,10 @@ from skillweave.collecting.calls import SkillSet, Why
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import allowed_rows
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
 from skillweave.spaces import unpack
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.types import Array, Step
 
 
 class OptionsEnv(VectorEnv[Any, Any, Any]):

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, SkillCritic
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import Declaration
@@ -31,7 +32,6 @@ from skillweave.training.stage import (
     decides,
     target_of,
 )
-from skillweave.types import SkillweaveError
 
 
 def stages_of(

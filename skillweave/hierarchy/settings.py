@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.selectors.ready import ReadyValue
 from skillweave.training.checks import check_fields
-from skillweave.types import SkillweaveError
 
 
 @checked_names

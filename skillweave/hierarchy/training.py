@@ -6,6 +6,7 @@ from typing import Any
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.collecting.lengths import calls_to_json
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.assembly import assembled, can_act
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import guide_entry, ready_guide
@@ -32,7 +33,7 @@ from skillweave.training.stage_log import Listener
 from skillweave.training.stage_run import MakeLearner
 from skillweave.training.trainer import train_stages
 from skillweave.training.woven import agents_of
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 
 def manifest(

@@ -16,6 +16,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import check_guided, ready_guide
@@ -29,7 +30,7 @@ from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, sourc
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT, PlainAgent
 from skillweave.training.stage import CRITIC, SELECTOR
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 
 def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Policy) -> None:

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from skillweave.errors import SkillweaveError
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.stacked import Views, orthogonal_
 from skillweave.ops.device import FLOAT, Constant
 from skillweave.spaces import ObsCodec
-from skillweave.types import SkillweaveError
 
 KINDS = 16
 """Kinds that are told apart at most, 0 to 15: larger numbers count as 15, smaller ones as 0."""

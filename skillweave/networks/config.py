@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar, get_args
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.named import named
-from skillweave.types import SkillweaveError
 
 T = TypeVar("T")
 WIDEST = 65_536

@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.named import Named, known_names
 from skillweave.networks.config import CNN, Activation
 from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
 from skillweave.spaces import ObsCodec
-from skillweave.types import SkillweaveError
 
 Inputs = Mapping[str, Tensor]
 """What a network takes in: ``vector`` (P, B, O) float and ``image.<i>`` (P, B, C, H, W), raw."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
 from skillweave.networks.recurrent import (
@@ -18,7 +19,6 @@ from skillweave.networks.recurrent import (
 from skillweave.networks.stacked import Views, mlp, mlp_init_, mlp_shapes, orthogonal_
 from skillweave.ops.device import INT, Constant
 from skillweave.spaces import ObsCodec
-from skillweave.types import SkillweaveError
 
 
 class Net:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, told
 from skillweave.named import Named
 from skillweave.networks.encoders import Inputs
@@ -26,7 +27,6 @@ from skillweave.networks.stacked import Views
 from skillweave.ops.device import Constant, usual_defaults
 from skillweave.spaces import ObsCodec
 from skillweave.spaces.packing import parts
-from skillweave.types import SkillweaveError
 
 ROWS = 3
 """Observations that a new module is tried with."""

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 FLOAT: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
 INT: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}

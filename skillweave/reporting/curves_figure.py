@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from skillweave.arguments import checked_names
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.groups import grouped
@@ -20,7 +21,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.several import open_runs
 from skillweave.training.evaluation_file import load_evaluation
-from skillweave.types import Array, MissingExtra, SkillweaveError
+from skillweave.types import Array
 
 Band = Literal["iqr", "range", "none"]
 Paths: TypeAlias = str | Path | Sequence[str | Path]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import SkillweaveError
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.reporting.lineage import Born, Lineage, read_lineage
 from skillweave.reporting.palette import color_of
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.hub import must_be_own
-from skillweave.types import MissingExtra, SkillweaveError
 
 FAINT, TEXT = "#c9c9cf", "#4a4a52"
 COMPLEMENT = ("gamma", "gae_lambda")

@@ -13,6 +13,7 @@ import numpy as np
 from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told, whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
@@ -21,7 +22,7 @@ from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds, global_generators
 from skillweave.training.play import Played, SeededEpisodes, play
-from skillweave.types import Array, Memory, Policy, SkillweaveError
+from skillweave.types import Array, Memory, Policy
 
 __all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
 

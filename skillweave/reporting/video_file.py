@@ -14,8 +14,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.reporting.palette import OWN_COLORS
-from skillweave.types import Array, MissingExtra, SkillweaveError
+from skillweave.types import Array
 
 
 class VideoWriter:

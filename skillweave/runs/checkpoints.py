@@ -10,9 +10,9 @@ from typing import Any
 
 from torch import Tensor
 
+from skillweave.errors import SkillweaveError
 from skillweave.reading import fit
 from skillweave.runs.files import move, read_header, read_tensors, remove, write_tensors
-from skillweave.types import SkillweaveError
 
 
 class Checkpoints:

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy, state_from
+from skillweave.errors import SkillweaveError
 from skillweave.messages import absolute
 from skillweave.reading import fit, shown
 from skillweave.runs.checkpoints import Checkpoints
@@ -51,7 +52,7 @@ from skillweave.runs.lock import Lock
 from skillweave.runs.manifest import Checkpoint, MetricsLine, identity, read_manifest, versions
 from skillweave.runs.population_schema import LineageLine
 from skillweave.runs.replacing import check_ours, check_replaceable, clear
-from skillweave.types import SkillweaveError, unprefixed
+from skillweave.types import unprefixed
 
 S = TypeVar("S")
 First = Callable[["RunDirectory"], None]

@@ -16,8 +16,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from skillweave.errors import SkillweaveError
 from skillweave.reading import check_file, parse_json, read_file, shown
-from skillweave.types import SkillweaveError
 
 SCHEMA = 1
 """Version of everything written here; readers refuse newer ones."""

@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import json_bytes
 from skillweave.runs.hub_errors import asking, status_of
 from skillweave.runs.links import check_no_links_around
-from skillweave.types import MissingExtra, SkillweaveError
 
 KINDS = (".safetensors", ".json", ".jsonl", ".md", ".gif", ".mp4", ".png")
 """Suffixes of files that may be in a run on the hub: weights, settings, its card, its pictures."""

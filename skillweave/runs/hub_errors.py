@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, shortened
-from skillweave.types import SkillweaveError
 
 
 def status_of(error: BaseException | None) -> Any:

@@ -9,9 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.reading import check_file, fit, load_json, shown
 from skillweave.runs.links import own_copy
-from skillweave.types import SkillweaveError
 
 
 class JsonLines:

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from skillweave.errors import SkillweaveError
 from skillweave.runs.files import write_bytes
-from skillweave.types import SkillweaveError
 
 ABOVE = 2
 """Folders above a file in which its run is looked for: ``<run>/policies/<file>``."""

@@ -7,7 +7,7 @@ import platform
 from contextlib import suppress
 from pathlib import Path
 
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 try:
     import fcntl

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from skillweave.algorithms.config import config_from_json
+from skillweave.errors import SkillweaveError
 from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
 from skillweave.runs.files import read_json
 from skillweave.runs.kept import Kept
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
-from skillweave.types import SkillweaveError
 
 
 def _is_path(text: str) -> bool:

@@ -7,10 +7,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
 from skillweave.runs.directory import RunDirectory
 from skillweave.terminal import say
-from skillweave.types import SkillweaveError, flat
+from skillweave.types import flat
 
 EXPERIMENT = "skillweave"
 TAG = "skillweave.run"

@@ -6,7 +6,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 FOLDER = Path("runs")
 """Where numbered directories are made, below the working directory."""

@@ -9,11 +9,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import shown_path
 from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.files import TEMPORARY, remove
 from skillweave.runs.lock import NAME as LOCK
-from skillweave.types import SkillweaveError
 
 if TYPE_CHECKING:
     from skillweave.runs.directory import RunDirectory

@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from skillweave.errors import SkillweaveError
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import SkillweaveError
 
 
 def open_runs(paths: Sequence[Path]) -> list[RunDirectory]:

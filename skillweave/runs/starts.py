@@ -14,6 +14,7 @@ from typing import Any
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.errors import SkillweaveError
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
@@ -23,7 +24,6 @@ from skillweave.runs.files import (
     remove,
     write_tensors,
 )
-from skillweave.types import SkillweaveError
 
 
 @dataclass(frozen=True)

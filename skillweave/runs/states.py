@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from skillweave.algorithms.policy import state_from
+from skillweave.errors import SkillweaveError
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import make_directory, read_tensors, remove, write_tensors
-from skillweave.types import SkillweaveError
 
 S = TypeVar("S")
 

@@ -11,9 +11,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.mlflow_tracker import MLflow
-from skillweave.types import MissingExtra, SkillweaveError
 
 
 class Tracker(Protocol):

@@ -15,11 +15,12 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.collecting.calls import Why
 from skillweave.collecting.guide import LastCall
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import checksum
-from skillweave.types import Array, Memory, SkillweaveError, Step
+from skillweave.types import Array, Memory, Step
 
 Event = Callable[[Step], Any] | str
 """What makes a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""

@@ -8,9 +8,10 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.collecting.guide import LastCall
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.types import Array, Memory, SkillweaveError, Step
+from skillweave.types import Array, Memory, Step
 
 
 class ReadySelector(Foreign):

@@ -10,12 +10,13 @@ from gymnasium.spaces import Discrete
 
 from skillweave.collecting.calls import Why
 from skillweave.collecting.guide import LastCall
+from skillweave.errors import SkillweaveError
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
 from skillweave.skills.ready import required_arguments
-from skillweave.types import Array, Memory, SkillweaveError, Step, read_only
+from skillweave.types import Array, Memory, Step, read_only
 
 
 class FunctionSelector(ReadySelector):

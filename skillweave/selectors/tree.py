@@ -32,9 +32,10 @@ from enum import IntEnum
 from typing import Any, ClassVar
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.selectors.base import function_name
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 
 class Status(IntEnum):

@@ -11,11 +11,12 @@ import numpy as np
 
 from skillweave.collecting.calls import Why
 from skillweave.collecting.guide import LastCall
+from skillweave.errors import SkillweaveError
 from skillweave.selectors.base import ReadySelector, shown_obs
 from skillweave.selectors.tree import Composite, Condition, Node, Status
 from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import checksum, made_up
-from skillweave.types import Array, Memory, SkillweaveError, Step
+from skillweave.types import Array, Memory, Step
 
 
 class TreeSelector(ReadySelector):

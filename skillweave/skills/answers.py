@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, odd_key
 from skillweave.skills.outputs import as_array, at_step, called
 from skillweave.skills.probing import probe
-from skillweave.types import LARGEST_REWARD, Array, SkillweaveError, Step, read_only, wrong_reward
+from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
 
 
 def answer(

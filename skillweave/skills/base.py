@@ -13,13 +13,14 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names, plain
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.skills.answers import answer
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
 from skillweave.skills.spelling import misspelt
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.types import Array, Step
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)

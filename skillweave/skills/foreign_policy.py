@@ -12,8 +12,9 @@ from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector.utils import batch_space
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, told
-from skillweave.types import Array, Memory, Memoryless, Policy, SkillweaveError
+from skillweave.types import Array, Memory, Memoryless, Policy
 
 
 class Foreign(Memoryless):

@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import shortened
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import Foreign, checksum
 from skillweave.skills.outputs import decoded
-from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
+from skillweave.types import Array, Memory
 
 NUMBERS = {
     "tensor(float)": np.float32,

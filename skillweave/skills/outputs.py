@@ -10,10 +10,11 @@ from gymnasium import Space
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from skillweave.arguments import meant
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, told
 from skillweave.skills.info_words import keys_told, odd_key
 from skillweave.tracebacks import is_users
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.types import Array, Step
 
 
 def called(

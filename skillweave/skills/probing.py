@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import told
-from skillweave.types import Array, SkillweaveError, Step, read_only
+from skillweave.types import Array, Step, read_only
 
 MOST = 256
 """Up to so many environments, a function is also called with more than there are."""

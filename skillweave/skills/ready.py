@@ -7,11 +7,12 @@ import sys
 from types import MethodType
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.skills.base import Skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 
 def ready_policy(skill: Skill) -> Policy | None:

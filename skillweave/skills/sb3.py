@@ -12,12 +12,13 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 
 from skillweave.arguments import checked_names
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import Foreign, checksum
 from skillweave.skills.outputs import checked_actions
 from skillweave.skills.torch_module import weights_of, with_weights
-from skillweave.types import Array, Memory, MissingExtra, SkillweaveError
+from skillweave.types import Array, Memory
 
 ALGORITHMS = ("ppo", "a2c", "dqn", "sac", "td3", "ddpg")
 

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.skills.foreign_policy import Foreign, qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
-from skillweave.types import Array, Memory, SkillweaveError, read_only
+from skillweave.types import Array, Memory, read_only
 
 
 class ScriptedPolicy(Foreign):

@@ -9,10 +9,11 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign, checksum, qualified
 from skillweave.skills.outputs import decoded
-from skillweave.types import Array, Memory, SkillweaveError
+from skillweave.types import Array, Memory
 
 if TYPE_CHECKING:
     from torch import nn

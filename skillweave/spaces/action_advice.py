@@ -8,9 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.spaces.packing import parts
-from skillweave.types import SkillweaveError
 
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary, Box (of floats)"
 MOST_CHOICES = 1_000

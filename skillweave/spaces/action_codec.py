@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.errors import SkillweaveError
 from skillweave.spaces.action_advice import unsupported_action
 from skillweave.spaces.packing import check_size
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skillweave.errors import SkillweaveError
 from skillweave.spaces.packing import LARGEST, check_size, obs_dtype, obs_shape, parts
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
 _WIDEST = 2.0**24

@@ -12,8 +12,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these"
 

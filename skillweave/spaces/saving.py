@@ -8,10 +8,11 @@ from typing import Annotated, Any, NotRequired, TypedDict
 import gymnasium as gym
 import numpy as np
 
+from skillweave.errors import SkillweaveError
 from skillweave.reading import LARGEST, Asked, Positive, fit, shown
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import OBSERVATIONS, obs_dtype, parts
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 _MOST = 10**8
 """Numbers of one space: a damaged shape must not take all memory."""

@@ -11,11 +11,11 @@ from typing import Any, Literal
 import numpy as np
 
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.runs.command_words import resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.tracebacks import place
-from skillweave.types import SkillweaveError
 
 
 @checked_names

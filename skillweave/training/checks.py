@@ -12,9 +12,9 @@ from skillweave.algorithms.config import AlgorithmConfig, OnPolicy
 from skillweave.buffers.ram import check_memory
 from skillweave.envs.checks import is_batched, refuse_batched
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.types import SkillweaveError
 
 
 def check_env(env: object) -> None:

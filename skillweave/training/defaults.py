@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.arguments import checked_names
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.training.checks import check_algorithm, check_fields
-from skillweave.types import SkillweaveError
 
 
 @checked_names

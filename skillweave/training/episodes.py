@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from skillweave.collecting.collector import FIRST_INFO
-from skillweave.types import Array, SkillweaveError
+from skillweave.errors import SkillweaveError
+from skillweave.types import Array
 
 WINDOW = 100  # episodes in the reported means
 INFO = "info/"

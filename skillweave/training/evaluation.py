@@ -18,6 +18,7 @@ from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import told_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
@@ -30,7 +31,7 @@ from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.reflex_tally import ReflexTally
 from skillweave.training.skill_report import SkillReport, all_steps, tally_of
 from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
-from skillweave.types import Array, Policy, SkillweaveError
+from skillweave.types import Array, Policy
 
 FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""

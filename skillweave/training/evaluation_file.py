@@ -11,13 +11,13 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any, NotRequired, TypedDict
 
+from skillweave.errors import SkillweaveError
 from skillweave.reading import Count, fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.trackers import steps_of, trackers_of
 from skillweave.training.evaluation import Evaluation
-from skillweave.types import SkillweaveError
 
 SCORE, SAMPLED = "evaluation.json", "evaluation-sampled.json"
 CHARTS = {"usage": "share", "call_length": "length_mean", "success": "success_rate"}

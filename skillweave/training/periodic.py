@@ -8,10 +8,11 @@ from collections.abc import Callable
 import numpy as np
 
 from skillweave.collecting.collector import RETURN, SUCCESS, Collector
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
 from skillweave.training.learner import crossed
 from skillweave.training.scene import Scene
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 
 class PeriodicEvaluation:

@@ -19,6 +19,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting import levels
 from skillweave.collecting.start_methods import cannot_be_sent, runs_again, why_no_processes
 from skillweave.envs.make import EnvSpec, cores, workers_for
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
@@ -26,7 +27,7 @@ from skillweave.reading import LARGEST_FLOAT
 from skillweave.training.checks import check_fields
 from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 SELECTOR, CRITIC = levels.SELECTOR, levels.CRITIC
 TOGETHER = "together"

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
+from skillweave.errors import SkillweaveError
 from skillweave.messages import close_matches
 from skillweave.notices import notice
 from skillweave.reading import shown
@@ -20,7 +21,6 @@ from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
 from skillweave.training.keep_best import KeepBest
-from skillweave.types import SkillweaveError
 
 ENOUGH = 20
 """Episodes after which a logged key of ``info`` that never occurred is reported."""

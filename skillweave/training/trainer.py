@@ -16,6 +16,7 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
+from skillweave.errors import SkillweaveError
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
@@ -33,7 +34,7 @@ from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import START, Listener, StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
-from skillweave.types import Array, Policy, SkillweaveError, prefixed, unprefixed
+from skillweave.types import Array, Policy, prefixed, unprefixed
 
 EARLY = 0.25
 """Share of a stage's budget after which it is said what has not begun."""

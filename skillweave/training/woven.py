@@ -21,6 +21,7 @@ from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Anchor
 from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
@@ -35,7 +36,7 @@ from skillweave.training.stage_log import StageLog, success_rate
 from skillweave.training.stage_run import StageRun, begin_as
 from skillweave.training.trainer import OneAgent
 from skillweave.training.woven_learner import WovenLearner
-from skillweave.types import Array, SkillweaveError, prefixed, unprefixed
+from skillweave.types import Array, prefixed, unprefixed
 
 
 def agents_of(stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> OneAgent:

@@ -41,10 +41,10 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.algorithms.ppo_samples import next_values
 from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 # The table: an algorithm's settings, what it sees, how it acts, how long it learns
 

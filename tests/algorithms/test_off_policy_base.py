@@ -21,13 +21,13 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.parameters import LARGEST
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Sample
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.ops.losses import weighted_mean
 from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
-from skillweave.types import SkillweaveError
 
 NAN, INF = float("nan"), float("inf")
 RANGES: list[tuple[type, str, object, str]] = [

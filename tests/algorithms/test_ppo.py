@@ -13,12 +13,12 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.algorithms.ppo import PPOAlgorithm, State
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
 from skillweave.ops.moments import normalise
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 T, B = 8, 6
 OBS = Box(-np.inf, np.inf, (3,), np.float32)

@@ -15,11 +15,11 @@ from toys import Masked, Toy, learn
 
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.sac import SACAlgorithm, State
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.ops.losses import critic_loss, masked_entropy_target
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 P, B = 2, 6
 LINEAR = SAC(num_envs=2, network=Network(()), learning_rate=1e-2, normalize_obs=False)

@@ -12,9 +12,9 @@ from plain_replay import SPACE, A, World
 
 from skillweave.buffers import ram
 from skillweave.buffers.replay import ReplayStore, replay_store
+from skillweave.errors import SkillweaveError
 from skillweave.experience import Experience, Sample
 from skillweave.spaces import action_codec, obs_dtype
-from skillweave.types import SkillweaveError
 
 GAMMA = torch.tensor([0.9, 0.5, 0.99])
 

@@ -16,8 +16,8 @@ from small_runs import interrupt_at_checkpoint
 
 from skillweave import recipes
 from skillweave.cli import main
+from skillweave.errors import SkillweaveError
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
-from skillweave.types import SkillweaveError
 
 COMMANDS = ("train", "resume", "evaluate", "render", "plot", "report", "compare", "list", "info")
 COMMANDS += ("sweep", "weights", "export", "import-agilerl")

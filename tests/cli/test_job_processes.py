@@ -11,7 +11,7 @@ import time
 import pytest
 
 from skillweave.cli.processes import ProcessEnded, processes
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 
 def doubled(x: int) -> int:

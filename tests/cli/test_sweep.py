@@ -11,10 +11,10 @@ from skillweave.cli import main, sweep
 from skillweave.cli.main import _with_addresses
 from skillweave.cli.sweep_code import code_files
 from skillweave.cli.sweep_table import summary
+from skillweave.errors import SkillweaveError
 from skillweave.recipes import load, source
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import load_evaluation
-from skillweave.types import SkillweaveError
 
 RECIPE = '''
 """One skill on CartPole."""

@@ -29,10 +29,10 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.types import SkillweaveError
 
 N, ALL = 4, (Left, Right, Zigzag, Counter)
 

@@ -23,8 +23,8 @@ from skillweave.collecting.group import Collectors, make_collectors
 from skillweave.collecting.processes import ProcessCollectors
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
 

@@ -31,9 +31,9 @@ from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.group import Collectors
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")

@@ -13,9 +13,9 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
-from skillweave.types import SkillweaveError
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
 

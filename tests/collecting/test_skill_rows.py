@@ -12,9 +12,9 @@ from toys import Ledger, actions, cartpole
 from skillweave.collecting import skill_rows
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill
-from skillweave.types import SkillweaveError
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
 ENGINES = ["envpool", "sync"]

@@ -11,10 +11,10 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.starters import Starters
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.types import SkillweaveError
 
 N = 3
 X, T = range(2)

@@ -15,8 +15,8 @@ from toy_acting import Given, requests
 from skillweave.collecting.processes import ProcessCollectors
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 PID = 8  # the reward is the process
 

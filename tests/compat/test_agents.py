@@ -12,7 +12,7 @@ from skillweave.compat.agilerl.algorithms.dqn_rainbow import RainbowDQN
 from skillweave.compat.agilerl.algorithms.ppo import PPO
 from skillweave.compat.agilerl.algorithms.td3 import TD3
 from skillweave.compat.batches import rollout_of
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 OBS = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
 KINDS = {

@@ -23,8 +23,8 @@ from skillweave.compat.agilerl.algorithms.dqn import DQN
 from skillweave.compat.agilerl.algorithms.ppo import PPO
 from skillweave.compat.agilerl.algorithms.td3 import TD3
 from skillweave.compat.pickles import read_torch_pickle
+from skillweave.errors import SkillweaveError
 from skillweave.runs.files import read_tensors
-from skillweave.types import SkillweaveError
 
 OBS = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
 
@@ -239,7 +239,7 @@ def test_a_pickle_nested_too_deep_is_refused(tmp_path):
 import sys
 from pathlib import Path
 from skillweave.compat.pickles import read_torch_pickle
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 for path in sys.argv[1:]:
     print(Path(path).name, end=": ", flush=True)
     try:

@@ -26,7 +26,7 @@ from skillweave.compat.agilerl.utils.utils import (
     makeVectEnvs,
 )
 from skillweave.compat.agilerl.wrappers.learning import Skill
-from skillweave.types import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, SkillweaveError
 
 MLP = {"arch": "mlp", "hidden_size": [16, 16]}
 HP = {

@@ -7,7 +7,7 @@ import pytest
 from skillweave.envs.checks import CheckedEnv, Watch, time_limit
 from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 BOX = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 GOOD = np.zeros(2, np.float32), 1.0, False, False, {}

@@ -8,7 +8,7 @@ import pytest
 from toys import Ledger, Rememberer, actions, cartpole
 
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.types import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, SkillweaveError
 
 # EnvPool's own, for some environments; that users do not see it is tested once, below.
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")

@@ -8,8 +8,8 @@ import pytest
 
 from skillweave.envs import make
 from skillweave.envs.make import EnvSpec, workers_for
+from skillweave.errors import SkillweaveError
 from skillweave.training.stage import assign_workers
-from skillweave.types import SkillweaveError
 
 
 class Clock:

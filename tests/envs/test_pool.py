@@ -6,7 +6,7 @@ import pytest
 
 import skillweave as sw
 from skillweave.envs.make import make_engine, workers_for
-from skillweave.types import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, SkillweaveError
 
 N = 5
 

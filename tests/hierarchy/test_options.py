@@ -30,11 +30,12 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.calls import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.types import SkillweaveError, Step
+from skillweave.types import Step
 
 torch.set_num_threads(1)
 N = 5

@@ -31,13 +31,14 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Hierarchy, Run
 from skillweave.collecting.calls import SkillSet, Why
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import evaluate
-from skillweave.types import Array, SkillweaveError, Step
+from skillweave.types import Array, Step
 
 torch.set_num_threads(1)
 N = 6

@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 
 from skillweave import PPO, Hierarchy, Skill, TrainDefaults
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import CNN, RNN, Network
-from skillweave.types import SkillweaveError
 
 
 class Upright(Skill):

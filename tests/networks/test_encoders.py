@@ -13,13 +13,13 @@ from toys import Echo, learn
 import skillweave
 from skillweave.algorithms.config import DQN, PPO
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.errors import SkillweaveError
 from skillweave.networks import encoders
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import ACTIVATIONS, Layout
 from skillweave.spaces import ObsCodec, obs_codec
-from skillweave.types import SkillweaveError
 
 P, B = 3, 4
 PLAIN = CNN("plain", (5, 7), (3, 2), (2, 1))

@@ -20,13 +20,13 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.networks.net import Net
 from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Layout
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
-from skillweave.types import SkillweaveError
 
 P, B, A = 2, 4, 3
 OBS = obs_codec(Box(-1, 1, (5,)))

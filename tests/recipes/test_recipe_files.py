@@ -14,7 +14,8 @@ import pytest
 from skillweave import recipes
 from skillweave.collecting import shipping
 from skillweave.collecting.shipping import packed
-from skillweave.types import SkillweaveError, Step
+from skillweave.errors import SkillweaveError
+from skillweave.types import Step
 
 RECIPE = """
 from skillweave import Hierarchy, Skill, PPO

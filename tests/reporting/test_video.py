@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.reporting.video import PALETTE, VideoWriter, caption, color_of, render_policy
 from skillweave.training.evaluation import evaluate
-from skillweave.types import Array, Memory, MissingExtra, SkillweaveError, Step
+from skillweave.types import Array, Memory, Step
 
 Image = pytest.importorskip("PIL.Image")
 

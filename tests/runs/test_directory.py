@@ -20,13 +20,13 @@ from torch import Tensor
 
 from skillweave.algorithms.config import PPO, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 from skillweave.runs.manifest import versions
 from skillweave.runs.population_schema import Generation
 from skillweave.seeding import Seeds
-from skillweave.types import SkillweaveError
 
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
 STAGES: list[dict[str, Any]] = [

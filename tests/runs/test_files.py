@@ -18,6 +18,7 @@ import safetensors.torch
 import torch
 
 import skillweave
+from skillweave.errors import SkillweaveError
 from skillweave.runs import files
 from skillweave.runs.files import (
     SCHEMA,
@@ -28,7 +29,6 @@ from skillweave.runs.files import (
     write_json,
     write_tensors,
 )
-from skillweave.types import SkillweaveError
 
 LIBRARY = Path(skillweave.__file__).parent
 TENSORS = {
@@ -141,7 +141,7 @@ import sys
 from pathlib import Path
 limit, folder = sys.argv[1], Path(sys.argv[2])
 from skillweave.runs.files import write_bytes, write_tensors
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 import torch
 write_bytes(folder / "run.json", b"as it was")
 if limit == "rlimit":

@@ -1,7 +1,7 @@
 import pytest
 
+from skillweave.errors import SkillweaveError
 from skillweave.runs.jsonl import JsonLines
-from skillweave.types import SkillweaveError
 
 
 def test_lines_that_cannot_be_written_name_the_file_and_what_to_do(tmp_path):

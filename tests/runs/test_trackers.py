@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import TRACKERS, make_trackers, track_film, trackers_of
-from skillweave.types import MissingExtra, SkillweaveError
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from shared_runs import NAME, SMALL, Left, Right, declare, files_of, same_action
 
 import skillweave as sw
 from skillweave.cli import main
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import MissingExtra, SkillweaveError
 
 pytest.importorskip("huggingface_hub")
 

@@ -14,9 +14,9 @@ from shared_runs import NAME, files_of, same_actions
 import skillweave as sw
 from skillweave.api import hub as sharing
 from skillweave.cli import main
+from skillweave.errors import SkillweaveError
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import SkillweaveError
 
 pytest.importorskip("huggingface_hub")
 

@@ -11,9 +11,9 @@ from gymnasium.spaces import Box, Dict, Discrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, poisoned, sb3_zip
 
 from skillweave import from_function, from_onnx, from_sb3, from_torch
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import Foreign, as_recorded, fitted, source_of
-from skillweave.types import MissingExtra, SkillweaveError
 
 OBS, ACTION = gym.make("CartPole-v1").observation_space, Discrete(2)
 ROWS = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)

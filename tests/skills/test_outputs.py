@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
+from skillweave.errors import SkillweaveError
 from skillweave.skills.outputs import checked_actions, decoded
-from skillweave.types import SkillweaveError
 
 UNIT = Box(-1.0, 1.0, (2, 3), np.float32)
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
+from skillweave.errors import SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked, checked, from_function
-from skillweave.types import SkillweaveError, Step
+from skillweave.types import Step
 
 
 def step(n: int = 3) -> Step:

@@ -29,8 +29,8 @@ from scripts.torture.report import (
     table,
 )
 from scripts.torture.samples import Sample, agilerl, onnx_file
+from skillweave.errors import SkillweaveError
 from skillweave.runs.files import write_json, write_tensors
-from skillweave.types import SkillweaveError
 
 RIGHT = {"actions": [1, 2]}
 

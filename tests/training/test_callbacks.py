@@ -14,8 +14,8 @@ from small_runs import OFF, ON, Balance, Left, Push, assert_same, lines
 
 import skillweave as sw
 from skillweave import Agent, Apart, EnvSpec, Evolution, Hierarchy, SkillweaveError, TrainEvent
+from skillweave.errors import Interrupted
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import Interrupted
 
 SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 EVALUATED: dict[str, Any] = {"eval_every": 200, "eval_episodes": 2, "checkpoint_every": 150}

@@ -26,13 +26,14 @@ from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.group import Collectors
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack, crossed
 from skillweave.training.loop import Progress, Saved, train
 from skillweave.training.replay_learner import ReplayLearner, store_of
-from skillweave.types import SkillweaveError, unprefixed
+from skillweave.types import unprefixed
 
 SETTINGS: dict[str, Any] = {
     "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 400, "gamma": 0.9,

@@ -32,6 +32,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.group import Collectors
 from skillweave.collecting.processes import ProcessCollectors
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import SkillweaveError
 from skillweave.networks.config import RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
@@ -39,7 +40,6 @@ from skillweave.training.learner import Stack
 from skillweave.training.loop import Progress, Saved
 from skillweave.training.replay_learner import learner_of
 from skillweave.training.scene import skill_scene
-from skillweave.types import SkillweaveError
 
 CONFIG = PPO(
     num_envs=16, n_steps=16, batch_size=64, update_epochs=4, learning_rate=5e-3, gamma=0.9,

@@ -12,8 +12,8 @@ from skillweave import (
     Network,
     train_agent,
 )
+from skillweave.errors import SkillweaveError
 from skillweave.skills import Skill
-from skillweave.types import SkillweaveError
 
 SMALL = {"num_envs": 4, "batch_size": 8, "learning_starts": 40, "network": Network((4,))}
 HUGE = {"buffer_size": 10**13, **SMALL}

@@ -12,8 +12,8 @@ import torch
 from skillweave.compat.agilerl_files import network_of, observations_of
 from skillweave.compat.batches import returns_of
 from skillweave.compat.single_agent import SingleAgent
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.stacks import Member
-from skillweave.types import SkillweaveError
 
 MLP: dict[str, Any] = {"arch": "mlp", "hidden_size": [64, 64]}
 _PAST = ("scores", "fitness", "steps", "mut", "index", "beta", "prior_eps")

@@ -7,7 +7,8 @@ import numpy as np
 
 from skillweave.algorithms import config
 from skillweave.compat.agilerl.agent import MLP, Agent, Setting
-from skillweave.types import Array, SkillweaveError
+from skillweave.errors import SkillweaveError
+from skillweave.types import Array
 
 
 class PPO(Agent):

@@ -12,12 +12,13 @@ import numpy as np
 
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import SkillweaveError
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import frame_of
 from skillweave.reporting.video_file import VideoWriter
 from skillweave.training.call_log import EpisodeLog
-from skillweave.types import Array, SkillweaveError
+from skillweave.types import Array
 
 MOST_FRAMES = 1_500
 MOST_BYTES = 2_800_000  # as text in the page a third more

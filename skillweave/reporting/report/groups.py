@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from skillweave.errors import SkillweaveError
 from skillweave.reporting.report import facts
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import SkillweaveError
 
 
 @dataclass

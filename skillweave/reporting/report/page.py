@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from skillweave.errors import MissingExtra
 from skillweave.reporting.report.film import Film
 from skillweave.runs.files import write_bytes
-from skillweave.types import MissingExtra
 
 HERE = Path(__file__).parent / "templates"
 

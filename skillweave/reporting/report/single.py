@@ -10,6 +10,7 @@ from typing import Any
 
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
+from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.palette import RGB, color_of
@@ -51,7 +52,7 @@ from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import AGENT
 from skillweave.training.play import Played as PlayedStep
 from skillweave.training.skill_report import levels_of
-from skillweave.types import Policy, SkillweaveError
+from skillweave.types import Policy
 
 EPISODES, FILMED = 20, 3
 

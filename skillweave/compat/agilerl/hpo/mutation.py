@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from skillweave.compat.agilerl.agent import random_seed
+from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import KINDS, Range
 from skillweave.evolution.config import Mutations as Native
-from skillweave.types import SkillweaveError
 
 _WORDS = {
     "none": "None", "architecture": "arch", "parameters": "param", "activation": "act",

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave.compat.agilerl.agent import swapped
 from skillweave.compat.wandb_runs import start_wandb
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 Result = tuple[list[Any], list[list[float]]]
 

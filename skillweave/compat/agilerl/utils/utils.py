@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave.compat.agilerl.agents import DDPG, DQN, PPO, TD3, RainbowDQN
 from skillweave.envs.make import EnvSpec
-from skillweave.types import SkillweaveError
+from skillweave.errors import SkillweaveError
 
 _KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDPG, TD3)}
 

@@ -1,0 +1,54 @@
+"""The errors that Skillweave raises, as a tree: catch one kind, or all as ``SkillweaveError``.
+
+Each message is one sentence for people: what is wrong, where, and what to do about it.
+"""
+
+from __future__ import annotations
+
+from skillweave.terminal import printable
+from skillweave.tracebacks import ShortTraceback
+
+
+class SkillweaveError(ShortTraceback, Exception):
+    """Base class of all errors that Skillweave raises."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
+
+
+class DeclarationError(SkillweaveError):
+    """A setting, an argument or a declaration is wrong; raised before anything is trained."""
+
+
+class EnvError(SkillweaveError):
+    """An environment cannot be made or used, or broke Gymnasium's contract."""
+
+
+class SkillError(SkillweaveError):
+    """Code of a skill, a selector or a reflex failed, or returned an unusable value."""
+
+
+class PolicyError(SkillweaveError):
+    """A policy from elsewhere cannot be loaded, or does not fit where it is used."""
+
+
+class TrainingError(SkillweaveError):
+    """Training cannot continue: a loss is not finite, memory is short, or a process was lost."""
+
+
+class RunError(SkillweaveError):
+    """A run or another file is missing, damaged, in use, or cannot be written."""
+
+
+class MissingExtra(SkillweaveError, ImportError):
+    """A feature needs an optional dependency; the message names the extra to install."""
+
+    def __init__(self, feature: str, extra: str) -> None:
+        super().__init__(f"{feature} needs the extra '{extra}': pip install 'skillweave[{extra}]'")
+
+
+class Interrupted(ShortTraceback, KeyboardInterrupt):
+    """Training was interrupted; the message says what is saved and how to continue."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
