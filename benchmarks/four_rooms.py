@@ -58,7 +58,7 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.group import Collectors
 from skillweave.envs.engine import RawStep
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.seeding import Seeds
 from skillweave.skills import ready_policy
 from skillweave.training.episodes import Episodes
@@ -191,13 +191,14 @@ class Counted:
         self.gamma, self.calls = gamma, np.zeros((n, skills))
         self.reward, self.after = np.zeros((n, skills)), np.zeros((n, skills, n))
 
-    def add(self, found: Experience) -> None:
-        some = np.ones_like(found.terminated) if found.valid is None else found.valid
-        on = some & ~found.terminated
-        power = self.gamma ** found.steps.astype(np.float64)
-        np.add.at(self.calls, (found.obs[some], found.action[some]), 1.0)
-        np.add.at(self.reward, (found.obs[some], found.action[some]), found.reward[some])
-        np.add.at(self.after, (found.obs[on], found.action[on], found.next_obs[on]), power[on])
+    def add(self, found: Batch) -> None:
+        some = np.ones_like(found["terminated"]) if found.get("valid") is None else found["valid"]
+        on = some & ~found["terminated"]
+        power = self.gamma ** found["steps"].astype(np.float64)
+        obs, action = found["obs"], found["action"]
+        np.add.at(self.calls, (obs[some], action[some]), 1.0)
+        np.add.at(self.reward, (obs[some], action[some]), found["reward"][some])
+        np.add.at(self.after, (obs[on], action[on], found["next_obs"][on]), power[on])
 
     def model(self) -> Model:
         calls = np.maximum(self.calls, 1.0)
@@ -211,7 +212,7 @@ class Counting(Collectors):
 
     def collect(self, request: Request) -> Any:
         found = super().collect(request)
-        self.counted.add(found.experience)
+        self.counted.add(found.batches[""])
         return found
 
 

@@ -58,7 +58,7 @@ def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
     import torch
 
     from skillweave.buffers.replay import ReplayStore
-    from skillweave.experience import Experience
+    from skillweave.experience import Batch
 
     torch.set_num_threads(1)
     before = resident()
@@ -67,7 +67,7 @@ def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
 
     def add(obs: Any, true: Any, action: Any, reward: Any, ended: Any) -> None:
         seen, acted = obs[None], action[None]
-        store.add(Experience(seen, acted, reward[None], ones, ended[None], never, true[None]))
+        store.add(Batch(seen, acted, reward[None], ones, ended[None], never, true[None]))
 
     speed = filled(transitions, add)
     grown = resident() - before

@@ -119,7 +119,7 @@ class A2CAlgorithm(Algorithm):
                 torch.full_like(state.gamma, self.config.gae_lambda),
             )  # fmt: skip
             returns = advantage + value
-        mask = None if rollout.obs_mask is None else rollout.obs_mask.flatten(1, 2)
+        mask = None if rollout.mask is None else rollout.mask.flatten(1, 2)
         head = self.actor(leaves, inputs)
         log_prob, entropy = self.head.stats(head, None, mask, rollout.action.flatten(1, 2))
         gain = log_prob.unflatten(1, lead) * normalise(advantage, valid)

@@ -1,14 +1,16 @@
-"""Experience: what a collector gives to a learner, and the batches that a learner learns from.
+"""Experience: the columns that pass from acting to learning, and the batches that algorithms get.
 
-Arrays of NumPy end here and tensors begin: a store turns ``Experience`` into ``Rollout`` or
-``Sample``, on the learner's device.
+``SCHEMA`` is the only list of columns. Collectors fill a ``Batch`` of NumPy arrays; a store turns
+it into a ``Rollout`` or a ``Sample`` of tensors on the learner's device.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from skillweave.types import Array
 
@@ -16,53 +18,147 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-@dataclass(slots=True)
-class Experience:
-    """What one learner did in N environments: T rows of N columns, in the order of time.
+@dataclass(frozen=True)
+class Column:
+    """How one column of experience is joined with others, and which stores carry it."""
 
-    A row of a column is one transition: a primitive step of a skill or of a plain agent, or one
-    decision of a selector with the whole call that followed. Columns need not be full: only where
-    ``valid`` holds did this learner act. Where a valid row neither terminated nor was truncated,
-    the column's next valid row, here or in the next experience, begins where this one ended.
+    fill: Any = 0
+    """The value of rows that are not valid, and of environments without this column."""
+    per_env: bool = False
+    """One value for each environment, (N, …), not one for each row."""
+    ragged: bool = False
+    """The last axis is as long as the longest row needs; zeros follow shorter ones."""
+    rollout: bool = True
+    """``Rollout`` has it."""
 
-    N = P·B: the environments of member 0 come first, then those of member 1, and so on.
+
+SCHEMA: dict[str, Column] = {
+    # Lead axes (T, N): T rows, in the order of time, of N environments.
+    "obs": Column(),  # (T, N, *obs_shape)
+    "action": Column(),  # (T, N) int64, or (T, N, A) float32 in policy units
+    "reward": Column(),  # (T, N) float32, the learner's own; of a call Σ γᵏ rₖ
+    "steps": Column(fill=1),  # (T, N) int64, environment steps: 1, or τ of a call
+    "terminated": Column(),  # (T, N) bool, the value of what follows is 0
+    "truncated": Column(),  # (T, N) bool, cut here, but the value continues; never where terminated
+    "next_obs": Column(),  # (T, N, *obs_shape), the true successors
+    "valid": Column(fill=True),  # (T, N) bool, rows of this learner; absent: all
+    "mask": Column(fill=True),  # (T, N, A) bool, allowed actions in ``obs``; absent: all
+    "next_mask": Column(fill=True, rollout=False),  # (T, N, A) bool, in ``next_obs``
+    "dist_params": Column(),  # (T, N, H) float32, the distribution that ``action`` is from
+    "recurrent_state": Column(per_env=True),  # (N, M) float32, before each first valid row
+    "episode_start": Column(),  # (T, N) bool, the recurrent state is empty before this row
+    "rewards": Column(ragged=True, rollout=False),  # (T, N, L) float32, of each step of a call
+    "advantage": Column(),  # (T, N) float32, added to the learner's own advantage
+    "guide": Column(),  # (T, N, A) float32, logits of a ready selector's choice
+    "overridden": Column(),  # (T, N) bool, a reflex acted instead of ``action``
+    "call_start": Column(),  # (T, N) bool, a call starts here; for critics of skills
+}
+"""All columns, by name. A row is a step of an environment, or a decision with its whole call."""
+
+
+class Batch(Mapping[str, Array]):
+    """Columns of ``SCHEMA`` with the same lead axes (T, N): what one learner did.
+
+    N = P·B: the environments of member 0 come first, then those of member 1, and so on. Where a
+    valid row neither terminated nor was truncated, the next valid row of its environment, here or
+    in the next batch, starts where this one ended.
     """
 
-    obs: Array  # (T, N, *obs_shape)
-    action: Array  # (T, N) int64, or (T, N, A) float32 in policy units
-    reward: Array  # (T, N) float32, the learner's own; of a call Σ γᵏ rₖ
-    steps: Array  # (T, N) int64, environment steps: 1, or τ of a call
-    terminated: Array  # (T, N) bool, nothing is worth anything after it
-    truncated: Array  # (T, N) bool, cut here, but its value goes on; never where terminated
-    next_obs: Array  # (T, N, *obs_shape), the true successors
-    obs_mask: Array | None = None  # (T, N, A) bool, allowed actions in ``obs``; None: all
-    next_obs_mask: Array | None = None  # (T, N, A) bool, in ``next_obs``; None: all
-    valid: Array | None = None  # (T, N) bool, rows of this learner; None: all
-    head: Array | None = None  # (T, N, H) float32, the distribution that ``action`` is from
-    memory: Array | None = None  # (N, M) float32, before each column's first valid row
-    starts: Array | None = None  # (T, N) bool, an episode begins here, so memory is empty before it
-    rewards: Array | None = None  # (T, N, L) float32, of each step of a call, then zeros
-    advantage: Array | None = None  # (T, N) float32, what counts beside the learner's own
-    guide: Array | None = None  # (T, N, A) float32, logits of a ready selector's choice
-    overridden: Array | None = None  # (T, N) bool, a reflex acted, not ``action``; None: nowhere
-    decided: Array | None = None  # (T, N) bool, a call begins here; of critics of skills
-    parts: tuple[Experience, ...] = ()
-    """Of a selector: what its skills did in the same steps, those that learn, in their order."""
-    spent: int = 0
-    """Environment steps that were made for it, those of rows that are not valid included."""
+    __slots__ = ("_columns",)
+
+    def __init__(self, **columns: Array | None) -> None:
+        """Take the columns that are not None."""
+        unknown = columns.keys() - SCHEMA.keys()
+        assert not unknown, f"no column of SCHEMA: {unknown}"
+        self._columns = {name: x for name, x in columns.items() if x is not None}
+
+    def __getitem__(self, name: str) -> Array:
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    @property
+    def lead(self) -> tuple[int, int]:
+        """T and N."""
+        rows, envs = self._columns["reward"].shape
+        return rows, envs
 
     @property
     def ended(self) -> Array:
         """(T, N) bool, the trajectory ends here, by termination or truncation."""
-        ended: Array = self.terminated | self.truncated
+        ended: Array = self["terminated"] | self["truncated"]
         return ended
+
+    @property
+    def valid_rows(self) -> Array:
+        """(T, N) bool, rows of this learner."""
+        valid = self.get("valid")
+        return np.ones(self.lead, bool) if valid is None else valid
+
+    def replace(self, **columns: Array | None) -> Batch:
+        """Return a batch with other values of some columns; None removes one."""
+        return Batch(**(self._columns | columns))
+
+    def rows(self, part: slice) -> Batch:
+        """Return some of the T rows."""
+        whole = {k: v if SCHEMA[k].per_env else v[part] for k, v in self.items()}
+        return Batch(**whole)
+
+
+def side_by_side(batches: Sequence[Batch], members: int) -> Batch:
+    """Join batches of several collectors: the environments of each member stand side by side."""
+    if len(batches) == 1:
+        return batches[0]
+    height = max(batch.lead[0] for batch in batches)
+    batches = [_as_high(batch, height) for batch in batches]
+    names = {name: None for batch in batches for name in batch}
+    return Batch(**{name: _joined([b.get(name) for b in batches], members, name) for name in names})
+
+
+def _as_high(batch: Batch, height: int) -> Batch:
+    """Add rows that are not valid until there are ``height``."""
+    rows, envs = batch.lead
+    if rows == height:
+        return batch
+    valid = np.concatenate([batch.valid_rows, np.zeros((height - rows, envs), bool)])
+    whole = {k: v if SCHEMA[k].per_env else _padded(v, height - rows) for k, v in batch.items()}
+    return Batch(**(whole | {"valid": valid}))
+
+
+def _padded(x: Array, more: int) -> Array:
+    return np.concatenate([x, np.zeros((more, *x.shape[1:]), x.dtype)])
+
+
+def _joined(parts: list[Array | None], members: int, name: str) -> Array:
+    column, axis = SCHEMA[name], 0 if SCHEMA[name].per_env else 1
+    example = next(part for part in parts if part is not None)
+    known = [np.full_like(example, column.fill) if p is None else p for p in parts]
+    if column.ragged:
+        known = padded_last_axis(known)
+    split = [x.reshape(*x.shape[:axis], members, -1, *x.shape[axis + 1 :]) for x in known]
+    whole = np.concatenate(split, axis + 1)
+    return whole.reshape(*whole.shape[:axis], -1, *whole.shape[axis + 2 :])
+
+
+def padded_last_axis(parts: Sequence[Array]) -> list[Array]:
+    """Return arrays whose last axis is as long as the longest; zeros are added."""
+    longest = max(part.shape[-1] for part in parts)
+    before = [(0, 0)] * (parts[0].ndim - 1)
+    return [
+        p if p.shape[-1] == longest else np.pad(p, [*before, (0, longest - p.shape[-1])])
+        for p in parts
+    ]
 
 
 @dataclass(slots=True)
 class Rollout:
     """Trajectories for an on-policy learner: P members, T rows of B columns each.
 
-    ``discount`` is 0 where the trajectory terminated, else γ^τ; ``last`` says that it is cut here
+    ``discount`` is 0 where the trajectory terminated, else γ^τ; ``last`` is True where it is cut
     (terminated, truncated, or the rollout's end). The ``valid`` rows of a column come first; the
     others repeat valid ones.
     """
@@ -73,36 +169,37 @@ class Rollout:
     discount: Tensor  # (P, T, B)
     next_obs: Tensor  # (P, T, B, *obs_shape), the true successors
     last: Tensor  # (P, T, B) bool; False where not valid
-    obs_mask: Tensor | None = None  # (P, T, B, A) bool
+    mask: Tensor | None = None  # (P, T, B, A) bool, allowed actions; None: all
     valid: Tensor | None = None  # (P, T, B) bool; None: all
-    head: Tensor | None = None  # (P, T, B, H)
+    dist_params: Tensor | None = None  # (P, T, B, H), the distribution that ``action`` is from
     log_std: Tensor | None = None
-    """Of who acted, where it is no part of ``head``: (P, 1, 1, A), or (P, 1, B, A), by column."""
-    memory: Tensor | None = None  # (P, B, M), before the first row
-    starts: Tensor | None = None  # (P, T, B) bool, memory is empty before this row
-    advantage: Tensor | None = None  # (P, T, B), what counts beside the learner's own advantage
+    """Of the policy that acted, where it is no part of ``dist_params``: (P, 1, 1, A), or
+    (P, 1, B, A), by column."""
+    recurrent_state: Tensor | None = None  # (P, B, M), before the first row
+    episode_start: Tensor | None = None  # (P, T, B) bool, the recurrent state is empty before
+    advantage: Tensor | None = None  # (P, T, B), added to the learner's own advantage
     guide: Tensor | None = None  # (P, T, B, A), logits of a ready selector's choice
     overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted instead; None: nowhere
-    decided: Tensor | None = None  # (P, T, B) bool, a call begins here; of critics of skills
-    anchor: Anchor | None = None  # the policy to stay near
+    call_start: Tensor | None = None  # (P, T, B) bool, a call starts here; for critics of skills
+    reference: Reference | None = None  # the policy to stay near
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
 
 @dataclass(slots=True)
-class Anchor:
+class Reference:
     """The policy that a learner is to stay near."""
 
-    params: Any | None  # ``ActingParams`` of P members; None: ``Rollout.guide`` says what it does
-    coef: Tensor  # (P,), what a nat of KL from it costs
-    nats: float = 0.0  # how far from it the learner is to be; the cost follows it
+    params: Any | None  # ``ActingParams`` of P members; None: ``Rollout.guide`` is its choice
+    coef: Tensor  # (P,), the cost of one nat of KL from it
+    target_kl: float = 0.0  # the KL from it that the cost is adapted to
 
 
 @dataclass(slots=True)
 class Sample:
     """A batch from replay: P members, B transitions of up to n rows each.
 
-    ``reward`` is the discounted sum over the n rows, ``discount`` what the value of ``next_obs``
-    counts after them: 0 where the episode terminated, else γ^Στ.
+    ``reward`` is the discounted sum over the n rows, ``discount`` the factor of the value of
+    ``next_obs`` after them: 0 where the episode terminated, else γ^Στ.
     """
 
     obs: Tensor  # (P, B, *obs_shape)
@@ -110,32 +207,32 @@ class Sample:
     reward: Tensor  # (P, B) float32
     discount: Tensor  # (P, B) float32
     next_obs: Tensor  # (P, B, *obs_shape), the true successors
-    obs_mask: Tensor | None  # (P, B, A) bool, allowed actions in ``obs``; None: all
-    next_obs_mask: Tensor | None  # (P, B, A) bool, allowed actions in ``next_obs``; None: all
+    mask: Tensor | None  # (P, B, A) bool, allowed actions in ``obs``; None: all
+    next_mask: Tensor | None  # (P, B, A) bool, allowed actions in ``next_obs``; None: all
     weight: Tensor | None  # (P, B) float32, importance weights; None where drawn uniformly
     index: Array  # (P, B) int64, which transitions these are, to give them new priorities
     # Where an algorithm asks for them, the n − 1 observations between ``obs`` and ``next_obs``:
     between_obs: Tensor | None = None  # (P, B, n − 1, *obs_shape)
     between_mask: Tensor | None = None  # (P, B, n − 1, A) bool, allowed actions; None: all
     between_discount: Tensor | None = None
-    """(P, B, n − 1), what a reward there counts: γ^Στ, or 0 where the rows ended before."""
+    """(P, B, n − 1), the factor of a reward there: γ^Στ, or 0 where the rows ended before."""
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
     def split(self, batch: int) -> Iterator[Sample]:
-        """Samples of ``batch`` transitions of each member, one after another."""
+        """Yield samples of ``batch`` transitions of each member, one after another."""
         size = self.reward.shape[1]
         whole: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         for start in range(0, size, batch):
-            part = slice(start, start + batch)
-            found: dict[str, Any] = {
-                k: v if v is None or isinstance(v, float) else v[:, part] for k, v in whole.items()
+            rows = slice(start, start + batch)
+            part: dict[str, Any] = {
+                k: v if v is None or isinstance(v, float) else v[:, rows] for k, v in whole.items()
             }
-            yield Sample(**found)
+            yield Sample(**part)
 
 
 @dataclass(slots=True)
 class Report:
-    """What an update tells: metrics of each member, and how far off each sample was."""
+    """The result of an update: metrics of each member, and the error of each sample."""
 
     metrics: dict[str, Tensor] = field(default_factory=dict)  # each (P,)
     error: Tensor | None = None  # (P, B), for the priorities of replay

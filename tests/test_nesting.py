@@ -248,7 +248,7 @@ def test_all_learn_at_every_level_in_one_stream(whole, kind):
 def test_selectors_at_all_levels_stay_near_their_guides(whole):
     run, path = whole("guides")
     told = {name for line in lines(path) if line["stage"] == "together" for name in line}
-    assert {"selector.anchor_kl", "inner/selector.anchor_kl"} <= told
+    assert {"selector.reference_kl", "inner/selector.reference_kl"} <= told
     inner = run.policy.skills.policies[1]
     assert run.policy.guide is None
     assert inner.guide.restricts

@@ -210,7 +210,7 @@ def test_who_starts_from_a_run_is_not_held_near_what_it_was(source, tmp_path, mo
     anchors, make = {}, WovenLearner.__init__
 
     def made(self, parts, *more):
-        anchors.update({name: getattr(part, "anchor", None) for name, part in parts.items()})
+        anchors.update({name: getattr(part, "reference", None) for name, part in parts.items()})
         make(self, parts, *more)
 
     monkeypatch.setattr(WovenLearner, "__init__", made)

@@ -196,7 +196,7 @@ def test_the_better_of_before_and_after_is_kept(whole):
     names = {"selector", "left", "balance"}
     own = {f"{n}.safetensors" for n in names} | {f"together.{n}.safetensors" for n in names}
     assert set(policies(path)) == own, "nothing that was learnt is lost"
-    assert "anchor_kl" in " ".join(lines(path)[-1])
+    assert "reference_kl" in " ".join(lines(path)[-1])
 
 
 @pytest.mark.fast_cases(1)
@@ -420,8 +420,8 @@ def test_a_skill_that_never_succeeded_is_told_and_moves_freely_afterwards(tmp_pa
     assert "success() held at the end of none of its calls" in said[0]
     assert "skill 'never' did not succeed any more" in said[1]
     told = lines(tmp_path / "run")[-1]
-    assert "always.anchor_kl" in told
-    assert "never.anchor_kl" not in told
+    assert "always.reference_kl" in told
+    assert "never.reference_kl" not in told
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import torch
 from skillweave.errors import SkillweaveError
 
 PROGRAMS = 64
-"""The most programs of one gradient step: for other sizes, for rows with gaps, with an anchor."""
+"""The most programs of one gradient step: by size, rows with gaps, and reference policy."""
 
 
 class Compiled:

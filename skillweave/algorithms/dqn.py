@@ -195,7 +195,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         slow = self.layout.views(state.target)
         out = self.net(self._noisy(slow, noises[1]), inputs)
         judge = self.net(self._noisy(views, noises[2]), inputs) if self.config.double else out
-        best = mask_logits(self._q(judge), sample.next_obs_mask).argmax(-1)
+        best = mask_logits(self._q(judge), sample.next_mask).argmax(-1)
         chosen = _taken(out, best)
         if self.atoms is None:
             return td_target(reward, sample.discount, chosen.squeeze(-1))

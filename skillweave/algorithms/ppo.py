@@ -154,7 +154,7 @@ class PPOAlgorithm(Algorithm):
         now = Terms.of(cfg, state, batch)
         samples, metrics = samples_of(self, state, batch, now)
         rate, count, limited = now.rate, samples.count, self._kl_limit is not None
-        names = REPORT if now.anchor is None else (*REPORT, "anchor_kl")
+        names = REPORT if now.reference is None else (*REPORT, "reference_kl")
         taken, sums = torch.zeros_like(rate), rate.new_zeros(len(names), len(rate))
         compiles = cfg.compile and not self.memory_size
         # A compiled step makes its leaves itself; others share these.
@@ -238,13 +238,13 @@ class PPOAlgorithm(Algorithm):
         with torch.no_grad():
             kl = approximate_kl(log_prob, old, weight, acted)
         report = {"policy_loss": policy, "value_loss": value, "entropy": mean_entropy, "kl": kl}
-        if now.anchor is not None:
-            near = now.anchor.params
+        if now.reference is not None:
+            near = now.reference.params
             other = None if near is None else near.views.get("actor.log_std")
-            assert batch.anchor is not None
-            away = self.head.kl(head, log_std, batch.anchor, other, batch.mask)
-            report["anchor_kl"] = masked_mean(away, acted)
-            total = total + now.anchor.coef * report["anchor_kl"]
+            assert batch.reference is not None
+            away = self.head.kl(head, log_std, batch.reference, other, batch.mask)
+            report["reference_kl"] = masked_mean(away, acted)
+            total = total + now.reference.coef * report["reference_kl"]
         return total, {k: v.detach() for k, v in report.items()}
 
     def run(

@@ -12,7 +12,7 @@ from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import PPO, SkillCritic
 from skillweave.algorithms.parameters import rate_now
 from skillweave.algorithms.rollouts import Cells, Samples, values_after
-from skillweave.experience import Anchor, Rollout
+from skillweave.experience import Reference, Rollout
 from skillweave.networks.stacked import take_rows
 from skillweave.ops.losses import likelihood_ratio
 from skillweave.ops.moments import explained_variance, normalise
@@ -28,7 +28,7 @@ class Terms:
 
     rate: Tensor  # (P,), Adam's step size
     ent_coef: Tensor  # (P,)
-    anchor: Anchor | None
+    reference: Reference | None
 
     @classmethod
     def of(cls, config: PPO, state: Any, rollout: Rollout) -> Terms:
@@ -38,7 +38,7 @@ class Terms:
         ent_coef, final = state.ent_coef, config.ent_coef_final
         if final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
-        return cls(rate, ent_coef, rollout.anchor)
+        return cls(rate, ent_coef, rollout.reference)
 
 
 def epsilon_now(config: PPO | SkillCritic, progress: float, like: Tensor) -> Tensor | None:
@@ -60,7 +60,7 @@ def samples_of(
     agent: PPOAlgorithm, state: State, rollout: Rollout, now: Terms
 ) -> tuple[Samples, dict[str, Tensor]]:
     """What ``loss`` needs of a rollout without gaps, and metrics (P,)."""
-    cfg, memory, starts = agent.config, rollout.memory, rollout.starts
+    cfg, memory, starts = agent.config, rollout.recurrent_state, rollout.episode_start
     if not agent.memory_size:
         memory = starts = None
     cells = Cells(rollout, all_cells=memory is not None)
@@ -81,7 +81,7 @@ def samples_of(
     if cfg.normalize_returns:
         agent.update_return_stats(state, returns, valid)
     mean, scale = state.return_mean, state.return_scale
-    action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.obs_mask)
+    action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.mask)
     # Clipping and KL count from the policy as it is now, whoever acted: an older one, or one with a
     # epsilon. A ratio of mixtures would let the policy collapse within the clip where epsilon is
     # high: all it can change in the mixture is 1 − epsilon.
@@ -94,7 +94,7 @@ def samples_of(
         log_prob=log_prob,
         importance=likelihood_ratio(log_prob, _acted(agent, rollout, cells, mask, action)),
         advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), own),
-        anchor=_anchor(agent, now, rollout, cells),
+        reference=_reference(agent, now, rollout, cells),
         target=(returns - mean) / scale,
         old_value=None if cfg.clip_value is None else (value - mean) / scale,
         mask=mask,
@@ -115,21 +115,21 @@ def _own(overridden: Tensor | None, valid: Tensor | None) -> Tensor | None:
     return ~overridden if valid is None else valid & ~overridden
 
 
-def _anchor(agent: PPOAlgorithm, now: Terms, rollout: Rollout, cells: Cells) -> Tensor | None:
+def _reference(agent: PPOAlgorithm, now: Terms, rollout: Rollout, cells: Cells) -> Tensor | None:
     """Heads (P, N, H) of the policy that the learner is to stay near.
 
-    Where there is a memory, it runs along each trajectory. What the anchor would remember from
+    Where there is a memory, it runs along each trajectory. What the reference would remember from
     before the rollout's first row is not known; the learner, who is near, says it.
     """
-    if now.anchor is None:
+    if now.reference is None:
         return None
-    if now.anchor.params is None:
+    if now.reference.params is None:
         return cells.flat_or_none(rollout.guide)
-    params, recurrent = now.anchor.params, bool(agent.memory_size)
+    params, recurrent = now.reference.params, bool(agent.memory_size)
     inputs = agent.inputs(params, cells.flat(rollout.obs))
     if recurrent:
         inputs = {k: cells.unflat(v) for k, v in inputs.items()}
-    memory, starts = (rollout.memory, rollout.starts) if recurrent else (None, None)
+    memory, starts = (rollout.recurrent_state, rollout.episode_start) if recurrent else (None, None)
     return agent.run(agent.actor_net, params.views, inputs, memory, starts)[0]
 
 
@@ -146,12 +146,12 @@ def _acted(
     agent: PPOAlgorithm, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor
 ) -> Tensor:
     """Log-probabilities (P, N) of the actions by the policy that acted."""
-    assert rollout.head is not None
+    assert rollout.dist_params is not None
     log_std = rollout.log_std
     if log_std is not None:
         one = log_std.shape[2] == 1
         log_std = log_std[:, 0] if one else cells.flat(log_std.expand(-1, cells.shape[0], -1, -1))
-    return agent.head.stats(cells.flat(rollout.head), log_std, mask, action)[0]
+    return agent.head.stats(cells.flat(rollout.dist_params), log_std, mask, action)[0]
 
 
 def next_values(

@@ -95,7 +95,7 @@ class Samples:
     advantage: Tensor
     target: Tensor  # of the value, in units of normalised returns
     old_value: Tensor | None = None  # in the same units, where values are clipped
-    anchor: Tensor | None = None  # (P, N, H), heads of the policy that it is to stay near
+    reference: Tensor | None = None  # (P, N, H), distribution parameters of the policy to stay near
     mask: Tensor | None = None  # bool, allowed actions; None: all
     valid: Tensor | None = None  # bool, samples that count; None: all
     own: Tensor | None = None  # bool, those whose action was the policy's own; None: as ``valid``

@@ -150,7 +150,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
         inputs, alpha = self.inputs(params, sample.next_obs), self.alpha(state)
         head, slow = self.net(self.layout.views(state.params), inputs), state.critic_target
         if self.codec.discrete:
-            log_p = masked_log_probs(head, sample.next_obs_mask)
+            log_p = masked_log_probs(head, sample.next_mask)
             value = expected_soft_value(log_p, self.smallest(slow, inputs), alpha)
         else:
             action, log_prob = squashed_sample(*self.head.moments(head, None), noise[0])
@@ -186,7 +186,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
         self, state: State, sample: Sample, inputs: Inputs, rate: Tensor, noise: list[Tensor]
     ) -> None:
         """One gradient step of the actor, and of the temperature if it is learnt, in place."""
-        leaves, mask = self.layout.leaves(state.params), sample.obs_mask
+        leaves, mask = self.layout.leaves(state.params), sample.mask
         loss, entropy = self.policy_loss(leaves, state, mask, inputs, noise[-1:])
         self.step_(state, loss, leaves, rate)
         state.policy_loss, state.entropy = loss.detach(), entropy

@@ -107,7 +107,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
     def keep(self, state: State, rollout: Rollout) -> None:
         """Keep the rows of a rollout whose return exceeds the value, in place of the oldest."""
         cells = Cells(rollout, all_cells=False)
-        obs, mask = cells.flat(rollout.obs), cells.flat_or_none(rollout.obs_mask)
+        obs, mask = cells.flat(rollout.obs), cells.flat_or_none(rollout.mask)
         value = self.value(state, obs)
         if mask is None:
             mask = state.kept_mask.new_ones(*value.shape, self.codec.size)

@@ -120,10 +120,10 @@ class SkillCriticAlgorithm(Algorithm):
         leaves = self.layout.leaves(state.params)
         inputs = self.inputs(self.learning_params(state), obs)
         action, size = _valid(batch, batch.action), target.shape[1]
-        decided = None
+        call_start = None
         if cfg.deciding:
-            assert batch.decided is not None
-            decided = _valid(batch, batch.decided)
+            assert batch.call_start is not None
+            call_start = _valid(batch, batch.call_start)
         rate = rate_now(cfg, state.learning_rate, batch.progress)
         loss = target.new_zeros(len(target))
         parts = max(1, round(size / cfg.batch_size))
@@ -136,9 +136,9 @@ class SkillCriticAlgorithm(Algorithm):
                 worth, goal = self.net(leaves, own), take_rows(target, rows)
                 chosen = worth.gather(2, take_rows(action, rows)[..., None])
                 loss = value_loss(chosen.squeeze(-1), goal)
-                if decided is not None:  # V(s) = Σ π(k | s) Q(s, k), learnt where one decided
+                if call_start is not None:  # V(s) = Σ π(k | s) Q(s, k), learnt where one decided
                     # A row counts as much as one of Q, however few decisions there are.
-                    anew = torch.where(take_rows(decided, rows), worth[..., -1], goal)
+                    anew = torch.where(take_rows(call_start, rows), worth[..., -1], goal)
                     loss = loss + value_loss(anew, goal)
                 grad = self.layout.gradient(loss, leaves)
                 clip_grad_norm_(grad, torch.full_like(rate, cfg.max_grad_norm))

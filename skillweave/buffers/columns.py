@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +12,7 @@ from torch import Tensor
 from skillweave.buffers.held import check_columns
 from skillweave.buffers.ram import check_memory
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array
 
@@ -90,7 +89,7 @@ class Columns:
         last = None if count is None else first + count
         return min(int(self.newest[first:last].max()) + 1, self.rows)
 
-    def add(self, experience: Experience) -> list[tuple[Array, Array]]:
+    def add(self, batch: Batch) -> list[tuple[Array, Array]]:
         """Append rows.
 
         Returns:
@@ -98,7 +97,7 @@ class Columns:
             which some are transitions as well and the others boundaries; both (k,).
         """
         most = self.rows // 2  # a row takes at most two slots
-        return [self._add(part) for part in _parts(experience, most)]
+        return [self._add(part) for part in _parts(batch, most)]
 
     def cut(self, columns: Array) -> None:
         """End the open trajectories of ``columns`` (k,), whose environments begin anew."""
@@ -168,39 +167,40 @@ class Columns:
             found["rewards"] = self._rewards[: self._rewards_used]
         return found | {"newest": self.newest, "open": self._open}
 
-    def _add(self, rows: Experience) -> tuple[Array, Array]:
+    def _add(self, rows: Batch) -> tuple[Array, Array]:
         """Append rows of which each column has room for all."""
-        data, valid, slot = self.data, rows.valid, self._claim(rows)
+        data, valid, slot = self.data, rows.get("valid"), self._claim(rows)
+        mask, next_mask = rows.get("mask"), rows.get("next_mask")
         after = self.after(slot)
 
         def flat(x: Array) -> Array:
             return x.reshape(-1, *x.shape[2:]) if valid is None else x[valid]
 
-        if "steps" not in data and (flat(rows.steps) != 1).any():
+        if "steps" not in data and (flat(rows["steps"]) != 1).any():
             self._start("steps")
             if self._keeps_rewards:
                 self._start("call")
-        if "mask" not in data and not (rows.obs_mask is None and rows.next_obs_mask is None):
+        if "mask" not in data and not (mask is None and next_mask is None):
             self._start("mask")
         # Where a trajectory goes on, a successor's slot is that of the next transition as well.
-        data["obs"][after], data["kind"][after] = flat(rows.next_obs), NOTHING
-        data["obs"][slot] = flat(rows.obs)
-        data["action"][slot], data["reward"][slot] = flat(rows.action), flat(rows.reward)
+        data["obs"][after], data["kind"][after] = flat(rows["next_obs"]), NOTHING
+        data["obs"][slot] = flat(rows["obs"])
+        data["action"][slot], data["reward"][slot] = flat(rows["action"]), flat(rows["reward"])
         if "steps" in data:
-            data["steps"][slot] = flat(rows.steps)
+            data["steps"][slot] = flat(rows["steps"])
         if "call" in data:
             data["kind"][slot] = NOTHING  # what is overwritten needs its rewards no more
-            each = rows.reward[..., None] if rows.rewards is None else rows.rewards
-            self._keep_rewards(slot, flat(each), flat(rows.steps))
+            each = rows["rewards"] if "rewards" in rows else rows["reward"][..., None]
+            self._keep_rewards(slot, flat(each), flat(rows["steps"]))
         if "mask" in data:
-            for where, mask in (after, rows.next_obs_mask), (slot, rows.obs_mask):
-                data["mask"][where] = 255 if mask is None else np.packbits(flat(mask), axis=-1)
-        data["kind"][slot] = GOES_ON + flat(rows.terminated)
+            for where, x in (after, next_mask), (slot, mask):
+                data["mask"][where] = 255 if x is None else np.packbits(flat(x), axis=-1)
+        data["kind"][slot] = GOES_ON + flat(rows["terminated"])
         return slot, after
 
-    def _claim(self, rows: Experience) -> Array:
+    def _claim(self, rows: Batch) -> Array:
         """The slots (k,) that valid rows take, in the order of time; moves the newest ones on."""
-        valid, ended = rows.valid, rows.ended
+        valid, ended = rows.get("valid"), rows.ended
         place = (self.newest + ~self._open)[None]
         if len(ended) > 1:  # a slot for each row before, and for each end before
             before = np.ones_like(ended) if valid is None else valid
@@ -264,17 +264,12 @@ class Columns:
         return where + np.arange(len(where)), steps
 
 
-def _parts(experience: Experience, most: int) -> list[Experience]:
-    """The rows of an experience, at most so many at a time."""
-    t = len(experience.reward)
-    if 0 < t <= most:
-        return [experience]
-    named = {f.name: getattr(experience, f.name) for f in fields(experience)}
-    rows = {k: v for k, v in named.items() if isinstance(v, np.ndarray) and k != "memory"}
-    parts: list[dict[str, Any]] = [
-        {k: v[start : start + most] for k, v in rows.items()} for start in range(0, t, most)
-    ]
-    return [replace(experience, **part) for part in parts]
+def _parts(batch: Batch, most: int) -> list[Batch]:
+    """Cut a batch into parts of at most ``most`` rows."""
+    rows, _ = batch.lead
+    if 0 < rows <= most:
+        return [batch]
+    return [batch.rows(slice(start, start + most)) for start in range(0, rows, most)]
 
 
 def copy_into(arrays: dict[str, Array], state: dict[str, Tensor]) -> None:

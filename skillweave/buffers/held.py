@@ -15,16 +15,16 @@ from skillweave.types import Array
 
 DTYPES = {
     "reward": torch.float32, "steps": torch.int64, "terminated": torch.bool, "last": torch.bool,
-    "valid": torch.bool, "advantage": torch.float32, "starts": torch.bool,
-    "overridden": torch.bool, "decided": torch.bool, "obs_mask": torch.bool,
-    "head": torch.float32, "guide": torch.float32, "memory": torch.float32,
+    "valid": torch.bool, "advantage": torch.float32, "episode_start": torch.bool,
+    "overridden": torch.bool, "call_start": torch.bool, "mask": torch.bool,
+    "dist_params": torch.float32, "guide": torch.float32, "recurrent_state": torch.float32,
     "log_std": torch.float32,
 }  # fmt: skip
 """Of all fields but observations and actions."""
 NEEDED = {"obs", "next_obs", "action", "reward", "steps", "terminated", "last", "valid"}
-ONE_ROW = ("memory", "log_std")
+ONE_ROW = ("recurrent_state", "log_std")
 """Fields that have one row, however many there are of the others."""
-VECTORS = ("obs_mask", "head", "guide", *ONE_ROW)
+VECTORS = ("mask", "dist_params", "guide", *ONE_ROW)
 """Fields that have several numbers for each row."""
 
 
@@ -51,7 +51,7 @@ def check_held(
     seen = obs_codec(observation_space)
     for rows in held:
         # Where all actions are allowed, an experience has no mask.
-        names, first = rows.keys() - {"obs_mask"}, held[0].keys() - {"obs_mask"}
+        names, first = rows.keys() - {"mask"}, held[0].keys() - {"mask"}
         if names != first or not NEEDED <= names <= NEEDED | DTYPES.keys():
             raise ValueError(f"its rows hold {', '.join(sorted(rows))}")
         lead = rows["valid"].shape

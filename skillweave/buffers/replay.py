@@ -13,7 +13,7 @@ from torch import Tensor
 
 from skillweave.buffers.columns import NOTHING, TERMINATED, Columns, copy_into
 from skillweave.buffers.priorities import Priorities
-from skillweave.experience import Experience, Sample
+from skillweave.experience import Batch, Sample
 from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array
 
@@ -74,7 +74,7 @@ def replay_store(
 class ReplayStore:
     """Filled with experience and sampled at random; the oldest transitions make room.
 
-    N = P·B columns as in ``Experience``. Members see their own columns, or with ``shared`` all;
+    N = P·B columns as in ``Batch``. Members see their own columns, or with ``shared`` all;
     each has its own γ. Every end of a trajectory takes the room of a transition.
 
     Args:
@@ -134,9 +134,9 @@ class ReplayStore:
         """Bytes that are reserved; what was never written takes no memory yet."""
         return self._columns.nbytes + (self._priorities.nbytes if self._priorities else 0)
 
-    def add(self, experience: Experience) -> None:
-        """Append the rows of an experience to their columns; they are copied."""
-        for slot, after in self._columns.add(experience):
+    def add(self, batch: Batch) -> None:
+        """Append the rows of a batch to their columns; they are copied."""
+        for slot, after in self._columns.add(batch):
             if self._priorities is not None:
                 # Of slots named twice, the last counts: a successor may be a transition.
                 member, place = self._places(np.concatenate([after, slot]))
@@ -189,8 +189,8 @@ class ReplayStore:
             reward=self._tensor(reward),
             discount=self._tensor(discount * (data["kind"].take(slot) != TERMINATED)),
             next_obs=self._tensor(data["obs"].take(after, axis=0)),
-            obs_mask=self._mask(start),
-            next_obs_mask=self._mask(after),
+            mask=self._mask(start),
+            next_mask=self._mask(after),
             weight=None if weight is None else self._tensor(weight),
             index=index,
             progress=progress,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from skillweave.buffers.held import ONE_ROW, check_held
-from skillweave.experience import Anchor, Experience, Rollout
+from skillweave.experience import SCHEMA, Batch, Reference, Rollout
 from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array, unprefixed
 
@@ -32,28 +32,22 @@ class RolloutStore:
 
     def __init__(self, members: int, quota: int = 0, device: str | torch.device = "cpu") -> None:
         self._members, self._quota, self._device = members, quota, torch.device(device)
-        self._held: list[dict[str, Tensor]] = []  # fields (P, T, B, …), memory as one row
+        self._held: list[dict[str, Tensor]] = []  # columns (P, T, B, …)
 
-    def add(self, experience: Experience, log_std: Tensor | None = None) -> None:
-        """Keep an experience until it is learnt from.
+    def add(self, batch: Batch, log_std: Tensor | None = None) -> None:
+        """Store a batch until it is learnt from.
 
         Arrays of one member are not copied: they must stay as they are until then.
 
         Args:
-            log_std: (P, 1, 1, A), of who acted in it, where it is no part of ``head``.
+            log_std: (P, 1, 1, A), of who acted in it, where it is no part of ``dist_params``.
         """
-        e, last = experience, experience.ended
-        valid = np.ones_like(last) if e.valid is None else e.valid
+        valid, last = batch.valid_rows, batch.ended
         if not valid.any():
             return
-        found = {
-            "obs": e.obs, "action": e.action, "reward": e.reward, "steps": e.steps,
-            "terminated": e.terminated, "next_obs": e.next_obs, "last": last,
-            "obs_mask": e.obs_mask, "head": e.head, "starts": e.starts,
-            "advantage": e.advantage, "overridden": e.overridden, "guide": e.guide,
-            "decided": e.decided,
-        }  # fmt: skip
-        rows = {k: x for k, x in found.items() if x is not None}
+        rows = {k: x for k, x in batch.items() if SCHEMA[k].rollout and not SCHEMA[k].per_env}
+        rows |= {"last": last, "valid": valid}
+        del rows["truncated"]
         if valid.all():
             last[-1] = True
         else:
@@ -61,10 +55,11 @@ class RolloutStore:
             rows = {k: x.reshape(-1, *x.shape[2:])[cells] for k, x in rows.items()}
             column = np.flatnonzero(valid[0])
             rows["last"][valid.sum(0)[column] - 1, column] = True
-            rows["last"] &= valid
-        held = {k: self._by_member(x) for k, x in (rows | {"valid": valid}).items()}
-        if e.memory is not None:
-            held["memory"] = self._by_member(e.memory[None])
+            rows |= {"last": rows["last"] & valid, "valid": valid}
+        held = {k: self._by_member(x) for k, x in rows.items()}
+        for name, x in batch.items():
+            if SCHEMA[name].per_env:
+                held[name] = self._by_member(x[None])
         if log_std is not None:
             held["log_std"] = log_std
         self._held.append(held)
@@ -73,13 +68,13 @@ class RolloutStore:
         self,
         gamma: Tensor,
         progress: float = 0.0,
-        anchor: Anchor | None = None,
+        reference: Reference | None = None,
     ) -> Rollout | None:
         """All that was collected since the last one; None: it is not enough yet.
 
         Args:
             gamma: (P,), each member's discount of one step.
-            progress, anchor: of the ``Rollout``.
+            progress, reference: of the ``Rollout``.
         """
         if not self._held or (self._quota and self._valid_rows() < self._quota):
             return None
@@ -91,9 +86,8 @@ class RolloutStore:
         if named["valid"].all():
             del named["valid"]
         parts: dict[str, Any] = {name: x.to(self._device) for name, x in named.items()}
-        memory = parts.pop("memory", None)
-        parts["memory"] = None if memory is None else memory[:, 0]
-        return Rollout(**parts, anchor=anchor, progress=progress)
+        parts |= {k: x[:, 0] for k, x in parts.items() if k in SCHEMA and SCHEMA[k].per_env}
+        return Rollout(**parts, reference=reference, progress=progress)
 
     def state(self) -> dict[str, Tensor]:
         """Copies of what is held, to go on exactly; see ``load``."""
@@ -160,10 +154,10 @@ def _filled_columns(named: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Several experiences as one: more columns, as many rows as the longest has."""
-    masks = [h["obs_mask"] for h in held if "obs_mask" in h]
+    masks = [h["mask"] for h in held if "mask" in h]
     if masks:  # without one, all is allowed
         every = [masks[0].new_ones(*h["valid"].shape, masks[0].shape[-1]) for h in held]
-        held = [{"obs_mask": free} | h for free, h in zip(every, held, strict=True)]
+        held = [{"mask": free} | h for free, h in zip(every, held, strict=True)]
     if "log_std" in held[0]:  # each was acted with one of its own
         held = [h | {"log_std": h["log_std"].expand(-1, -1, h["valid"].shape[2], -1)} for h in held]
     t = max(h["valid"].shape[1] for h in held)

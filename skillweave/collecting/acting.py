@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -44,25 +44,26 @@ class Request:
     seeds: Seeds
     at_random: bool = False  # act at random instead
     greedy: bool = False  # do not explore
-    parts: tuple[Request, ...] = ()  # the same of skills that learn below a selector
+    below: Mapping[str, Request] = field(default_factory=dict)
+    """By path, the requests to those that learn below a selector."""
     action_repeat: ActionRepeat | None = None  # None: there are none
 
     def of_collector(self, number: int) -> Request:
         """The same for one of several collectors."""
-        parts = tuple(part.of_collector(number) for part in self.parts)
+        below = {path: part.of_collector(number) for path, part in self.below.items()}
         action_repeat = self.action_repeat and replace(
             self.action_repeat, seeds=self.action_repeat.seeds / number
         )
-        return replace(self, seeds=self.seeds / number, parts=parts, action_repeat=action_repeat)
+        return replace(self, seeds=self.seeds / number, below=below, action_repeat=action_repeat)
 
 
 @dataclass
 class Acted:
-    """What n environments are to do, and what the learner keeps of it."""
+    """Actions in n environments, and what a learner stores with them."""
 
     action: Array  # (n, …) in policy units
-    head: Array | None  # (n, H), of learners from rollouts
-    memory: Array | None  # (n, M) afterwards, of learners with a memory
+    dist_params: Array | None  # (n, H), of learners from rollouts
+    recurrent_state: Array | None  # (n, M) afterwards, of recurrent networks
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ class Acting:
         """Act in environments ``rows`` (n,) only; all arguments are of all N."""
         if self.members > 1:  # rows of several members: all act, and some of it counts
             acted = self._act(lambda stack: self._draw(stack, self.each), obs, mask, memory)
-            head, after = acted.head, acted.memory
+            head, after = acted.dist_params, acted.recurrent_state
             return Acted(
                 acted.action[rows],
                 None if head is None else head[rows],
@@ -187,8 +188,8 @@ class Acting:
             return found[0]
         return Acted(
             np.concatenate([f.action for f in found]),
-            _joined([f.head for f in found]),
-            _joined([f.memory for f in found]),
+            _joined([f.dist_params for f in found]),
+            _joined([f.recurrent_state for f in found]),
         )
 
     def _stack(

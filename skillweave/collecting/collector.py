@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.columns import as_wide
 from skillweave.collecting.restored import check_numbers, opened
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import info_numbers
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Experience
+from skillweave.experience import Batch, padded_last_axis, side_by_side
 from skillweave.seeding import Seeds, seed_global_generators
 from skillweave.skills.info_words import info_keys
 from skillweave.types import Array, prefixed, unprefixed
@@ -30,7 +29,10 @@ FIRST_INFO = 4
 class Collected:
     """What a learner is to learn from, and what people want to know of it."""
 
-    experience: Experience
+    batches: dict[str, Batch]
+    """By path, what each learner did; \"\" where there is one."""
+    steps: int
+    """Environment steps that were made for it, those of rows that are not valid included."""
     episodes: Array  # (K, 4 + I) float64, those that ended; NaN where there is no such number
     stands: Array | None = None  # (N,) checksums of what the environments show now; of workers
     begun_anew: Array = field(default_factory=lambda: np.empty(0, np.int64))
@@ -87,13 +89,13 @@ class Collector:
         """``request.rows`` steps of each environment."""
         before, self._ended, self._who = self.engine.steps_made, [], []
         self._info_keys = set()
-        experience = self._collect(request)
-        experience.spent = self.engine.steps_made - before
+        batches = self._collect(request)
+        steps = self.engine.steps_made - before
         episodes = np.concatenate([np.zeros((0, FIRST_INFO + len(self.log_info))), *self._ended])
         limited = self.engine.time_limit is not None
         longest = 0 if limited else int(self.kept["age"].max())
         keys = frozenset(self._info_keys)
-        return Collected(experience, episodes, info_keys=keys, longest=longest)
+        return Collected(batches, steps, episodes, info_keys=keys, longest=longest)
 
     def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
         """Play one episode in each environment, from its start.
@@ -177,7 +179,7 @@ class Collector:
         """One step of every environment; ``out`` is told what is to be learnt from."""
         raise NotImplementedError
 
-    def _collect(self, request: Request) -> Experience:
+    def _collect(self, request: Request) -> dict[str, Batch]:
         raise NotImplementedError
 
     def _forget(self, ids: Array) -> None:
@@ -244,7 +246,7 @@ def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting)
             rows[:] = np.concatenate([c.kept[name] for c in collectors])
     for name, example in collectors[0].open.items():
         parts = [c.open.get(name, np.zeros_like(example)) for c in collectors]
-        found.open[name] = np.concatenate(as_wide(parts) if name == "rewards" else parts)
+        found.open[name] = np.concatenate(padded_last_axis(parts) if name == "rewards" else parts)
     found.obs, found.begun = np.concatenate([c.obs for c in collectors]), True
     return found
 
@@ -261,61 +263,13 @@ def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
         collector.obs, first = joined.obs[part].copy(), part.stop
 
 
-def side_by_side(parts: Sequence[Collected], members: int) -> Collected:
+def joined_collected(parts: Sequence[Collected], members: int) -> Collected:
     """What several collectors found as one: each member's environments stand side by side."""
     if len(parts) == 1:
         return parts[0]
-    joined = _joined([p.experience for p in parts], members)
+    paths, steps = parts[0].batches, sum(p.steps for p in parts)
+    batches = {path: side_by_side([p.batches[path] for p in parts], members) for path in paths}
     keys = frozenset[str]().union(*(p.info_keys for p in parts))
     longest = max(p.longest for p in parts)
     episodes = np.concatenate([p.episodes for p in parts])
-    return Collected(joined, episodes, info_keys=keys, longest=longest)
-
-
-def _joined(experiences: Sequence[Experience], members: int) -> Experience:
-    height = max(e.reward.shape[0] for e in experiences)
-    if any(e.reward.shape[0] < height for e in experiences):
-        experiences = [_higher(e, height) for e in experiences]
-    names = [k for k in Experience.__dataclass_fields__ if k not in _WHOLE]
-    found = {k: _beside([getattr(e, k) for e in experiences], members, k) for k in names}
-    below = zip(*(e.parts for e in experiences), strict=True)
-    spent = sum(e.spent for e in experiences)
-    return Experience(**found, parts=tuple(_joined(b, members) for b in below), spent=spent)
-
-
-_WHOLE = ("parts", "spent")
-"""Fields of an experience that are no arrays."""
-
-
-def _higher(experience: Experience, height: int) -> Experience:
-    """The same with empty rows at the end."""
-    rows, columns = experience.reward.shape
-    valid = experience.valid
-    full = replace(experience, valid=np.ones((rows, columns), bool) if valid is None else valid)
-
-    def padded(name: str) -> Any:
-        value = getattr(full, name)
-        if value is None or name in ("memory", *_WHOLE):
-            return value
-        return np.concatenate([value, np.zeros((height - rows, *value.shape[1:]), value.dtype)])
-
-    return Experience(**{k: padded(k) for k in Experience.__dataclass_fields__})
-
-
-_FREE = {"obs_mask", "next_obs_mask", "valid"}  # where a part says nothing, it is all True
-
-
-def _beside(values: list[Any], members: int, name: str) -> Any:
-    known = next((v for v in values if v is not None), None)
-    if known is None:
-        return None
-    if name in _FREE:
-        values = [np.ones_like(known) if v is None else v for v in values]
-    if name == "head":  # a skill that no one called there
-        values = [np.zeros_like(known) if v is None else v for v in values]
-    if name == "rewards":
-        values = as_wide(values)
-    axis = 0 if name == "memory" else 1
-    split = [v.reshape(*v.shape[:axis], members, -1, *v.shape[axis + 1 :]) for v in values]
-    joined = np.concatenate(split, axis + 1)
-    return joined.reshape(*joined.shape[:axis], -1, *joined.shape[axis + 2 :])
+    return Collected(batches, steps, episodes, info_keys=keys, longest=longest)

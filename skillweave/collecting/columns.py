@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skillweave.collecting.acting import Acted
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.types import Array
 
 if TYPE_CHECKING:
@@ -51,8 +51,8 @@ class Columns:
         self._obs[at], self._next_obs[at], self._reward[at] = obs, next_obs, judged.reward
         self._terminated[at], self._truncated[at] = judged.terminated, judged.truncated
         self._action.append(acted.action)
-        if acted.head is not None:
-            self._head.append(acted.head)
+        if acted.dist_params is not None:
+            self._head.append(acted.dist_params)
         self._masks.append(mask)
         self._next_masks.append(next_mask)
         if overridden is not None:
@@ -62,7 +62,7 @@ class Columns:
                 self._valid = np.ones(self._reward.shape, bool)
             self._valid[at] = valid
 
-    def experience(self) -> Experience:
+    def batch(self) -> Batch:
         """All rows."""
         valid = self._valid
         ended = self._terminated | self._truncated
@@ -72,7 +72,7 @@ class Columns:
             starts[0], starts[1:] = self._begins, ended[:-1]
             if valid is not None:  # the first row after a search
                 starts[1:] |= valid[1:] & ~valid[:-1]
-        return Experience(
+        return Batch(
             obs=self._obs,
             action=np.stack(self._action),
             reward=self._reward,
@@ -80,12 +80,12 @@ class Columns:
             terminated=self._terminated,
             truncated=self._truncated,
             next_obs=self._next_obs,
-            obs_mask=stacked(self._masks),
-            next_obs_mask=stacked(self._next_masks),
+            mask=stacked(self._masks),
+            next_mask=stacked(self._next_masks),
             valid=valid,
-            head=np.stack(self._head) if self._head else None,
-            memory=self._memory,
-            starts=starts,
+            dist_params=np.stack(self._head) if self._head else None,
+            recurrent_state=self._memory,
+            episode_start=starts,
             overridden=np.stack(self._overridden) if self._overridden else None,
         )
 
@@ -97,13 +97,3 @@ def stacked(masks: list[Any]) -> Array | None:
         return None
     free = np.ones_like(known)
     return np.stack([free if mask is None else mask for mask in masks])
-
-
-def as_wide(parts: list[Array]) -> list[Array]:
-    """Arrays of which the last axis is as long as that of the longest; zeros are added."""
-    longest = max(part.shape[-1] for part in parts)
-    before = [(0, 0)] * (parts[0].ndim - 1)
-    return [
-        p if p.shape[-1] == longest else np.pad(p, [*before, (0, longest - p.shape[-1])])
-        for p in parts
-    ]

@@ -19,7 +19,7 @@ from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import told_success
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.skills import Skill, path_of
 from skillweave.types import Array, Memory, Step, prefixed
 
@@ -81,13 +81,13 @@ class DecisionCollector(Collector):
             for name, value in self.guide.start(len(ids)).items():
                 self.kept[name][ids] = value
 
-    def _collect(self, request: Request) -> Experience:
+    def _collect(self, request: Request) -> dict[str, Batch]:
         self._prepare(request)
         out = Decisions(self.num_envs)
         for _ in range(request.rows):
             self._step(out)
         self._check_lengths()
-        return out.experience(self._open, self.obs)
+        return {"": out.batch(self._open, self.obs)}
 
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request, every_step=False)
@@ -170,8 +170,8 @@ class DecisionCollector(Collector):
         choice = np.asarray(self.acting.to_env(acted.action))
         kept["over"][rows] = False
         self._open.begin(rows, here, choice, acted, kept["memory"][rows])
-        if acted.memory is not None:
-            kept["memory"][rows] = acted.memory
+        if acted.recurrent_state is not None:
+            kept["memory"][rows] = acted.recurrent_state
         self.skills.begin(self._calls, rows, choice)
 
     def _allowed(self, rows: Array, here: Array) -> Array:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from skillweave.collecting.acting import Request
-from skillweave.collecting.collector import Collected, Collector, side_by_side
+from skillweave.collecting.collector import Collected, Collector, joined_collected
 from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.errors import SkillweaveError
 from skillweave.notices import notice
@@ -69,8 +69,8 @@ class Collectors:
             part.close()
 
     def _joined(self, found: Sequence[Collected]) -> Collected:
-        collected = side_by_side(found, self.members)
-        self.steps_made += collected.experience.spent
+        collected = joined_collected(found, self.members)
+        self.steps_made += collected.steps
         return collected
 
     def _columns(self, ids: Sequence[Array]) -> Array:

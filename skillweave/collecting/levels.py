@@ -13,7 +13,7 @@ from skillweave.collecting.calls import Interruption, SkillSet, skills_below
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.ends import ENDED, Why
 from skillweave.collecting.open_calls import Decisions, OpenCalls
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.skills import Skill
 from skillweave.types import Array, Memory, Memoryless, Policy, unprefixed
 
@@ -56,8 +56,8 @@ class LearningSkill(Memoryless):
         """Actions (n, …) in the environment's units, as the request says."""
         self.mask, self.before = mask, memory.get("rnn")
         self.acted = self.acts.these(obs, mask, self.before)
-        after = {} if self.acted.memory is None else {"rnn": self.acted.memory}
-        return self.acts.to_env(self.acted.action), after
+        after = self.acted.recurrent_state
+        return self.acts.to_env(self.acted.action), {} if after is None else {"rnn": after}
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def woven(
 def _worth(critic: Acting) -> Callable[[Array], Array]:
     def worth(obs: Array) -> Array:
         """What each skill is worth in observations (n, …), and deciding anew, (n, S + 1)."""
-        found = critic.these(obs, None, None).head
+        found = critic.these(obs, None, None).dist_params
         assert found is not None
         return found
 
@@ -241,10 +241,10 @@ class Inside(Level):
             self.open[new] = True
         self.acted[:] = here
 
-    def taken(self, obs: Array) -> Experience:
-        """The decisions since this was last asked; ``obs`` as of ``Decisions.experience``."""
+    def taken(self, obs: Array) -> Batch:
+        """The decisions since this was last asked; ``obs`` as of ``Decisions.batch``."""
         out, self.out = self.out, Decisions(len(obs))
-        return out.experience(self.calls, obs)
+        return out.batch(self.calls, obs)
 
     def ends(self, memory: Memory, ids: Array, why: Array) -> Array:
         """(k,) why the calls of its skills are over, for what they learn.

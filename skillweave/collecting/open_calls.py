@@ -9,10 +9,9 @@ import numpy as np
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.columns import as_wide
 from skillweave.collecting.guide import ActiveGuide, as_logits
 from skillweave.collecting.restored import known
-from skillweave.experience import Experience
+from skillweave.experience import Batch, padded_last_axis
 from skillweave.types import Array, Memory
 
 
@@ -73,7 +72,7 @@ class OpenCalls:
             kept["before"][ids] = known(before)
         if (rewards := self.opened("rewards")) is not None:
             rewards[ids] = 0.0
-        head = None if acted.head is None else known(acted.head)
+        head = None if acted.dist_params is None else known(acted.dist_params)
         for name, value in (("obs", obs), ("head", head)):
             if value is not None:
                 held = self.opened(name)
@@ -109,18 +108,18 @@ class OpenCalls:
             "terminated": terminated,
             "truncated": truncated,
             "next_obs": next_obs,
-            "starts": kept["first"][ids],
+            "episode_start": kept["first"][ids],
         }
         if self.memory_size:
-            values["memory"] = kept["before"][ids]
-        for name in ("head", "rewards"):
+            values["recurrent_state"] = kept["before"][ids]
+        for name, column in (("head", "dist_params"), ("rewards", "rewards")):
             if (held := self.opened(name)) is not None:
-                values[name] = held[ids]
+                values[column] = held[ids]
         if "allowed" in kept:
-            values["obs_mask"] = kept["allowed"][ids]
-            values["next_obs_mask"] = self._next_mask(values, ids)
+            values["mask"] = kept["allowed"][ids]
+            values["next_mask"] = self._next_mask(values, ids)
         if (chances := self.chances) is not None:
-            values["guide"] = as_logits(chances[ids], values["obs_mask"])
+            values["guide"] = as_logits(chances[ids], values["mask"])
         return values
 
     @property
@@ -141,7 +140,7 @@ class OpenCalls:
 
     def _next_mask(self, values: Mapping[str, Array], ids: Array) -> Array:
         """Where skills may start in the true successors: all where that does not matter."""
-        mask = np.ones_like(values["obs_mask"])
+        mask = np.ones_like(values["mask"])
         on = np.flatnonzero(~values["terminated"])
         if len(on):
             found = self.skills.startable(values["next_obs"][on])
@@ -163,7 +162,7 @@ class Decisions:
         self._found.append((self._count[ids], ids, values))
         self._count[ids] += 1
 
-    def experience(self, calls: OpenCalls, obs: Array) -> Experience:
+    def batch(self, calls: OpenCalls, obs: Array) -> Batch:
         """All decisions, (D, N), as far as each column goes.
 
         Args:
@@ -176,38 +175,38 @@ class Decisions:
         found: dict[str, Array] = {}
         for name in self._found[0][2]:
             found[name] = self._column(name, height, n)
-        memory = found.pop("memory", None)
-        starts = found.pop("starts")
+        memory = found.pop("recurrent_state", None)
+        starts = found.pop("episode_start")
         valid = np.arange(height)[:, None] < self._count
-        return Experience(
-            **found,  # type: ignore[arg-type]
+        return Batch(
+            **found,
             valid=None if valid.all() else valid,
-            memory=None if memory is None else memory[0],
-            starts=None if memory is None else starts,
+            recurrent_state=None if memory is None else memory[0],
+            episode_start=None if memory is None else starts,
         )
 
     def _column(self, name: str, height: int, n: int) -> Array:
         """One field of all decisions, (D, N, …); rewards of calls as long as the longest."""
         values = [value[name] for _, _, value in self._found]
         if name == "rewards":
-            values = as_wide(values)
+            values = padded_last_axis(values)
         whole = np.zeros((height, n, *values[0].shape[1:]), values[0].dtype)
         for (rows, ids, _), value in zip(self._found, values, strict=True):
             whole[rows, ids] = value
         return whole
 
     @staticmethod
-    def _nothing(calls: OpenCalls, obs: Array) -> Experience:
+    def _nothing(calls: OpenCalls, obs: Array) -> Batch:
         """One empty row: no call has ended."""
         n = len(obs)
         lead, no = (1, n), np.zeros((1, n), bool)
         head, size, chances = calls.opened("head"), calls.memory_size, calls.chances
-        return Experience(
+        return Batch(
             obs=obs[None], action=np.zeros(lead, np.int64), reward=np.zeros(lead, np.float32),
             steps=np.ones(lead, np.int64), terminated=no, truncated=no, next_obs=obs[None],
-            valid=no, head=None if head is None else np.zeros_like(head)[None],
-            memory=np.zeros((n, size), np.float32) if size else None,
-            starts=no if size else None,
+            valid=no, dist_params=None if head is None else np.zeros_like(head)[None],
+            recurrent_state=np.zeros((n, size), np.float32) if size else None,
+            episode_start=no if size else None,
             rewards=np.zeros((*lead, 1), np.float32) if calls.keep_rewards else None,
             guide=None if chances is None else chances[None],
         )  # fmt: skip

@@ -15,7 +15,7 @@ from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, Step
@@ -94,12 +94,12 @@ class SkillCollector(Collector):
         how = self._start_calls, self._search_steps, self._episode_calls
         return SkillCollector(engine, acting, self.skill, self.reflexes, starters, *how)
 
-    def _collect(self, request: Request) -> Experience:
+    def _collect(self, request: Request) -> dict[str, Batch]:
         self._prepare(request)
         out = Columns(self, request.rows)
         for _ in range(request.rows):
             self._step(out)
-        return out.experience()
+        return {"": out.batch()}
 
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request)
@@ -131,8 +131,8 @@ class SkillCollector(Collector):
             next_mask = self.engine.mask()
             out.put(obs, mask, acted, judged, raw.next_obs, next_mask, playing, overridden)
         self._count(raw, judged, playing)
-        if memory is not None and acted.memory is not None:
-            memory[:] = acted.memory
+        if memory is not None and acted.recurrent_state is not None:
+            memory[:] = acted.recurrent_state
             if playing is not None:
                 memory[~playing] = 0
         self.obs = raw.next_obs

@@ -16,7 +16,7 @@ from skillweave.collecting.levels import CRITIC, SELECTOR, Inside, Level, woven
 from skillweave.collecting.woven_rows import Rows
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.skills import Skill
 from skillweave.types import Array, Step
 
@@ -66,14 +66,14 @@ class WovenCollector(DecisionCollector):
         """Not possible: populations of hierarchies that learn as a whole are not built."""
         raise SkillweaveError("hierarchies that learn as a whole do not evolve")
 
-    def _collect(self, request: Request) -> Experience:
+    def _collect(self, request: Request) -> dict[str, Batch]:
         self._rows = Rows(self, request.rows, self.root.all())
-        found = super()._collect(request)
-        found.parts = tuple(self._part(name) for name in self.learners)
+        (selector,) = super()._collect(request).values()
+        found = {SELECTOR: selector} | {path: self._part(path) for path in self.learners}
         self._rows = None
         return found
 
-    def _part(self, path: str) -> Experience:
+    def _part(self, path: str) -> Batch:
         """What was collected for a learner."""
         node, _, name = path.rpartition("/")
         level = next(x for x in self.root.all() if x.path == (f"{node}/" if node else ""))
@@ -89,9 +89,9 @@ class WovenCollector(DecisionCollector):
     def _prepare(self, request: Request) -> None:
         super()._prepare(request)
         self._gammas = {}
-        for (path, acting), own in zip(self.learners.items(), request.parts, strict=True):
-            acting.begin(own, every_step=False)
-            self._gammas[path] = own.gamma.astype(np.float64).repeat(acting.each)
+        for path, acting in self.learners.items():
+            acting.begin(request.below[path], every_step=False)
+            self._gammas[path] = request.below[path].gamma.astype(np.float64).repeat(acting.each)
 
     def _act(self, obs: Array, mask: Array | None) -> Array:
         """The actions; who acts, and what selectors below have decided, is kept."""

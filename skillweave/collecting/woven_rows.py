@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.columns import stacked
 from skillweave.collecting.levels import Level
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.spaces import action_codec
 from skillweave.types import Array, Step
 
@@ -76,10 +76,12 @@ class Rows:
         """Write what a leaf did in environments ``mine`` (k,)."""
         lead = self._reward.shape
         self._action[self._at, mine] = acted.action
-        if acted.head is not None:
+        if acted.dist_params is not None:
             if leaf not in self._heads:
-                self._heads[leaf] = np.zeros((*lead, *acted.head.shape[1:]), acted.head.dtype)
-            self._heads[leaf][self._at, mine] = acted.head
+                self._heads[leaf] = np.zeros(
+                    (*lead, *acted.dist_params.shape[1:]), acted.dist_params.dtype
+                )
+            self._heads[leaf][self._at, mine] = acted.dist_params
 
     def judge(
         self, mine: Array, reward: Array, terminated: Array, over: Array, goes_on: Array
@@ -112,29 +114,29 @@ class Rows:
         """What is the same for all leaves, once the rows are full."""
         return {
             "steps": np.ones(self._reward.shape, np.int64),
-            "obs_mask": stacked(self._masks),
-            "next_obs_mask": stacked(self._next_masks),
+            "mask": stacked(self._masks),
+            "next_mask": stacked(self._next_masks),
         }
 
-    def of_leaf(self, leaf: int) -> Experience:
+    def of_leaf(self, leaf: int) -> Batch:
         """What a leaf did."""
         memory = self._memory.get(leaf)
-        return Experience(
+        return Batch(
             obs=self._obs, action=self._action, reward=self._reward, terminated=self._terminated,
             truncated=self._truncated, next_obs=self._next_obs, valid=self._owner == leaf,
-            head=self._heads.get(leaf), memory=memory,
-            starts=None if memory is None else self._fresh, overridden=self._overridden,
-            **self._shared,  # type: ignore[arg-type]
+            dist_params=self._heads.get(leaf), recurrent_state=memory,
+            episode_start=None if memory is None else self._fresh,
+            overridden=self._overridden, **self._shared,
         )  # fmt: skip
 
-    def of_critic(self, path: str) -> Experience:
+    def of_critic(self, path: str) -> Batch:
         """All steps of a level, for its critic."""
         rows = self._critics[path]
-        return Experience(
+        return Batch(
             obs=self._obs, action=rows.skill, reward=rows.reward,
             steps=np.ones(rows.skill.shape, np.int64), terminated=rows.terminated,
             truncated=rows.truncated, next_obs=self._next_obs,
-            valid=None if rows.valid.all() else rows.valid, decided=rows.decided,
+            valid=None if rows.valid.all() else rows.valid, call_start=rows.decided,
         )  # fmt: skip
 
 

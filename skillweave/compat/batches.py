@@ -65,7 +65,9 @@ def rollout_of(
     log_probs = _tensor(log_prob, np.float32).view(lead)
     head = algorithm.head.with_log_prob(actions, log_probs, log_std)
     rewards = rewards.view(lead)
-    return Rollout(before, actions, rewards, discount, following, last, head=head, log_std=log_std)
+    return Rollout(
+        before, actions, rewards, discount, following, last, dist_params=head, log_std=log_std
+    )
 
 
 def sample_of(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from skillweave.buffers.replay import ReplayStore
-from skillweave.experience import Experience, Sample
+from skillweave.experience import Batch, Sample
 from skillweave.ops.device import FLOAT
 from skillweave.types import Array
 
@@ -40,14 +40,14 @@ class TransitionBuffer:
         never, once = np.zeros((1, len(before)), bool), np.ones((1, len(before)), np.int64)
         reward = reward.astype(np.float32)
         self._buffer.add(
-            Experience(
-                before[None],
-                action[None],
-                reward[None],
-                once,
-                ended.astype(bool)[None],
-                never,
-                after[None],
+            Batch(
+                obs=before[None],
+                action=action[None],
+                reward=reward[None],
+                steps=once,
+                terminated=ended.astype(bool)[None],
+                truncated=never,
+                next_obs=after[None],
             )
         )
         self._after = after

@@ -6,7 +6,7 @@ they found, ``learn`` turns it into new parameters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from skillweave.algorithms.base import ActingParams
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
-from skillweave.experience import Anchor, Experience
+from skillweave.experience import Batch, Reference
 from skillweave.seeding import Seeds
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -55,8 +55,8 @@ class Learner(Protocol):
         """What collectors are to do next."""
         ...
 
-    def take(self, experience: Experience) -> None:
-        """Keep what was collected by the latest request."""
+    def take(self, batches: Mapping[str, Batch]) -> None:
+        """Store what was collected by the latest request, by path; "" where there is one."""
         ...
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
@@ -96,7 +96,7 @@ class RolloutLearner:
         config = stack.algorithm.config
         self.overlap, self.threads = bool(config.overlap), int(config.threads)
         self._store = RolloutStore(stack.members, quota, stack.state.params.device)
-        self.anchor: Anchor | None = None
+        self.reference: Reference | None = None
         """The policy that it is to stay near, if there is one."""
         self._progress = 0.0  # where the rollout began, so that the first has the whole rate
         self._resumed: ActingParams | None = None  # of the first request after a checkpoint
@@ -109,17 +109,17 @@ class RolloutLearner:
         self._asked = params, progress
         return Request(algorithm.config.n_steps, (params,), state.gamma.cpu().numpy(), seeds)
 
-    def take(self, experience: Experience) -> None:
+    def take(self, batches: Mapping[str, Batch]) -> None:
         """Keep a rollout, and what it was collected with."""
         params, self._progress = self._asked
         log_std = params.views.get("actor.log_std")
-        self._store.add(experience, None if log_std is None else log_std[:, None])
+        self._store.add(batches[""], None if log_std is None else log_std[:, None])
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
         """An update, where there was something to learn from."""
         stack = self._stack
-        gamma, anchor = stack.state.gamma, self.anchor
-        rollout = self._store.rollout(gamma, self._progress, anchor)
+        gamma, reference = stack.state.gamma, self.reference
+        rollout = self._store.rollout(gamma, self._progress, reference)
         if rollout is None:
             return {}
         seeds = member_seeds(self._seeds, "learn", stack.members, update)
@@ -127,8 +127,9 @@ class RolloutLearner:
         with torch.enable_grad():  # the user may have switched gradients off
             stack.state, report = stack.algorithm.update(stack.state, rollout, generators)
         metrics: dict[str, Tensor] = report.metrics
-        if anchor is not None and "anchor_kl" in metrics:
-            anchor.coef = adapted(anchor.coef, metrics["anchor_kl"], anchor.nats)
+        if reference is not None and "reference_kl" in metrics:
+            kl = metrics["reference_kl"]
+            reference.coef = adapted(reference.coef, kl, reference.target_kl)
         return metrics
 
     def cut(self, columns: Array) -> None:
@@ -136,7 +137,8 @@ class RolloutLearner:
 
     def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
         """Rows of which there are not enough yet, what a nat of divergence costs, who acts next."""
-        coef = {} if self.anchor is None else {"anchor_coef": self.anchor.coef.cpu().clone()}
+        reference = self.reference
+        coef = {} if reference is None else {"reference_coef": reference.coef.cpu().clone()}
         params, _ = self._asked
         acting = prefixed("acting", params.state()) if requested else {}
         return self._store.state() | coef | acting
@@ -147,11 +149,11 @@ class RolloutLearner:
         acting = unprefixed("acting", kept)
         self._resumed = acting_of(self._stack, acting) if acting else None
         self._store.load(kept, algorithm.observation_space, algorithm.codec)
-        if self.anchor is not None:
-            coef = kept["anchor_coef"]
-            if coef.shape != self.anchor.coef.shape or not bool(coef.isfinite().all()):
+        if self.reference is not None:
+            coef = kept["reference_coef"]
+            if coef.shape != self.reference.coef.shape or not bool(coef.isfinite().all()):
                 raise ValueError(f"the price of divergence is {coef.tolist()}")
-            self.anchor.coef = coef.to(self.anchor.coef.device)
+            self.reference.coef = coef.to(self.reference.coef.device)
 
 
 def acting_of(stack: Stack, saved: dict[str, Tensor]) -> ActingParams:
@@ -170,16 +172,18 @@ def keep_to_guide(learner: Learner, target_kl: float | None) -> None:
     if target_kl is not None and isinstance(learner, RolloutLearner):
         (stack,) = learner.stacks
         coef = torch.ones_like(stack.state.params[:, 0])
-        learner.anchor = Anchor(None, coef, target_kl)
+        learner.reference = Reference(None, coef, target_kl)
 
 
-def adapted(coef: Tensor, kl: Tensor, nats: float) -> Tensor:
-    """What a nat of KL costs from now on, so that KL comes near ``nats``; (P,) each.
+def adapted(coef: Tensor, kl: Tensor, target_kl: float) -> Tensor:
+    """Return the next cost of a nat of KL, so that KL approaches ``target_kl``; (P,) each.
 
     The rule of the adaptive penalty of Schulman et al. 2017, sec. 4.
     """
     one = torch.ones_like(kl)
-    factor = torch.where(kl > 1.5 * nats, 2.0 * one, torch.where(kl < nats / 1.5, 0.5 * one, one))
+    factor = torch.where(
+        kl > 1.5 * target_kl, 2.0 * one, torch.where(kl < target_kl / 1.5, 0.5 * one, one)
+    )
     return (coef * factor).clamp(1e-3, 1e3)
 
 

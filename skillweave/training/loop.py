@@ -190,13 +190,13 @@ class _Loop:
         at, learner = self.at, self.learner
         collected = self.collectors.collect(self._request)
         self.report()
-        before, at.steps = at.steps, at.steps + collected.experience.spent
+        before, at.steps = at.steps, at.steps + collected.steps
         update, at.update = at.update, at.update + 1
         over = at.steps >= budget
         self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
         if len(collected.begun_anew):
             learner.cut(collected.begun_anew)
-        learner.take(collected.experience)
+        learner.take(collected.batches)
         if learner.overlap and not over:
             self.request()  # before the parameters change
         every = learner.report_every

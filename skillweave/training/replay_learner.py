@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 from skillweave.algorithms.base import ActingParams
 from skillweave.buffers.replay import ReplayStore, replay_store
 from skillweave.collecting.acting import ActionRepeat, Request
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
@@ -100,36 +100,38 @@ class ReplayLearner:
             at, cfg.action_repeat * (1.0 - progress), cfg.action_repeat_steps, self._seeds / "bouts"
         )
 
-    def take(self, experience: Experience) -> None:
-        """Put rows into the store, and keep the running scales of observations and returns."""
-        self.store.add(experience)
-        valid = experience.valid
-        count = experience.reward.size if valid is None else int(valid.sum())
+    def take(self, batches: Mapping[str, Batch]) -> None:
+        """Put rows into the store, and update the running scales of observations and returns."""
+        batch = batches[""]
+        self.store.add(batch)
+        valid = batch.get("valid")
+        count = batch["reward"].size if valid is None else int(valid.sum())
         self._transitions[1] += count / self.members
         for i, stack in enumerate(self.stacks):
-            columns = self._columns(i, experience)
+            columns = self._columns(i)
             stack.algorithm.update_obs_stats(
                 stack.state,
-                _rows(experience.obs, columns, stack),
+                _rows(batch["obs"], columns, stack),
                 None if valid is None else _rows(valid, columns, stack),
             )
         if any(s.algorithm.scales_rewards for s in self.stacks):
-            self._scale_returns(experience)
+            self._scale_returns(batch)
 
-    def _scale_returns(self, experience: Experience) -> None:
+    def _scale_returns(self, batch: Batch) -> None:
         """Keep the running scale of discounted returns, row by row."""
-        n = experience.reward.shape[1]
+        _, n = batch.lead
         each = n // self.members
         if self._returns is None:
             self._returns = np.zeros(n, np.float32)
         gamma = self._gamma().repeat(each)
-        for at, ended in enumerate(experience.ended):
-            valid = None if experience.valid is None else experience.valid[at]
-            power = gamma ** experience.steps[at].astype(np.float32)
-            now = self._returns * power + experience.reward[at]
+        every = batch.get("valid")
+        for at, ended in enumerate(batch.ended):
+            valid = None if every is None else every[at]
+            power = gamma ** batch["steps"][at].astype(np.float32)
+            now = self._returns * power + batch["reward"][at]
             self._returns = now if valid is None else np.where(valid, now, self._returns)
             for i, stack in enumerate(self.stacks):
-                columns = self._columns(i, experience)
+                columns = self._columns(i)
                 stack.algorithm.update_return_stats(
                     stack.state,
                     _rows(self._returns[None], columns, stack),
@@ -210,9 +212,9 @@ class ReplayLearner:
         """(P,) float32, of all members."""
         return np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks])
 
-    def _columns(self, stack: int, experience: Experience) -> slice:
-        """The columns of a stack's members."""
-        each = experience.reward.shape[1] // self.members
+    def _columns(self, stack: int) -> slice:
+        """Return the columns of a stack's members."""
+        each = self.store.num_envs // self.members
         return slice(self._first[stack] * each, self._first[stack + 1] * each)
 
 

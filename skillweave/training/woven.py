@@ -22,7 +22,7 @@ from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Anchor
+from skillweave.experience import Reference
 from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.starts import start_of
@@ -121,19 +121,19 @@ class WovenAgents(OneAgent):
         for name, algorithm in self.algorithms.items():
             fresh: Any = algorithm.init([self.stage.seeds / name / "member" / 0])
             device = resolve_device(algorithm.config.device)
-            before, anchor = self._before(name), None
+            before, reference = self._before(name), None
             if before is not None:
                 if not saved:
                     self._tell_lost_state(name, log)
                 fresh = self._as_before(name, algorithm, fresh, *before)
-                anchor = self._anchor(name, algorithm, fresh, device, log)
+                reference = self._reference(name, algorithm, fresh, device, log)
             if saved:
                 fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
             stack = Stack(algorithm, state_to(fresh, device))
             learnt_before = before is not None or name in self.stage.entry.get("starts", {})
             part = self._part(name, stack, log, learnt_before=learnt_before)
-            if anchor is not None:
-                part.anchor = anchor  # type: ignore[attr-defined]
+            if reference is not None:
+                part.reference = reference  # type: ignore[attr-defined]
             keep_to_guide(part, self._guide_kl(name))
             parts[name] = part
         weights = self.stage.entry["task_weights"]
@@ -179,9 +179,9 @@ class WovenAgents(OneAgent):
             found = fresh
         return found
 
-    def _anchor(
+    def _reference(
         self, name: str, algorithm: Algorithm, state: Any, device: torch.device, log: StageLog
-    ) -> Anchor | None:
+    ) -> Reference | None:
         """What a skill that was trained before is to stay near: this state."""
         rollouts = algorithm.store == "rollout"
         if self.together.reference_kl is None or decides(name) or not rollouts:
@@ -197,7 +197,7 @@ class WovenAgents(OneAgent):
             return None
         params = algorithm.acting_params(state, device=device)
         # Who seldom succeeded has little to lose, and much to learn.
-        return Anchor(
+        return Reference(
             params,
             torch.ones(1, dtype=torch.float32, device=device),
             self.together.reference_kl / rate,
@@ -285,7 +285,9 @@ class WovenAgents(OneAgent):
             for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
         }  # fmt: skip
         ready = Request(0, (), np.ones(1), seeds / self.first, greedy=True)
-        asked = replace(requests.pop(self.first, ready), parts=tuple(requests.values()))
+        asked = replace(
+            requests.pop(self.first, ready), below={self._below(k): r for k, r in requests.items()}
+        )
         with torch_threads(1), global_generators(seeds / "global"):
             limit = longest_evaluation(arena.engine.time_limit)
             return player.play(asked, seeds / "start", limit)

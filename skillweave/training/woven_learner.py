@@ -11,7 +11,7 @@ from torch import Tensor
 
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.ops.device import FLOAT
 from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.training.stage import CRITIC, SELECTOR, decides
@@ -43,6 +43,7 @@ class WovenLearner:
             for name, part in parts.items()
             if isinstance(part, RolloutLearner) and not decides(name)
         }
+        self._node = node
         self._selector, self._critic = node + SELECTOR, node + CRITIC
         self.counts = {name: [0, 0] for name in parts}
         """By path, in how many rows each has acted, and how often it has learnt from them."""
@@ -58,31 +59,29 @@ class WovenLearner:
         Where the selector is ready, as many as the skill asks for that asks for most.
         """
         self._progress = progress
-        asked = tuple(p.request(update, steps, progress) for p in self.parts.values())
+        below = {k: p.request(update, steps, progress) for k, p in self.parts.items()}
+        first = next(iter(below.values()))
         if self._selector in self.parts:
-            return replace(asked[0], parts=asked[1:])
-        rows, seeds = max(r.rows for r in asked), asked[0].seeds / self._selector
-        return Request(rows, (), asked[0].gamma, seeds, parts=asked)
+            del below[self._selector]
+        else:
+            rows, seeds = max(r.rows for r in below.values()), first.seeds / self._selector
+            first = Request(rows, (), first.gamma, seeds)
+        return replace(first, below={k.removeprefix(self._node): r for k, r in below.items()})
 
-    def take(self, experience: Experience) -> None:
-        """Give each its own rows, and skills the task's advantage in them, if it counts."""
-        found = experience.parts
-        if self._selector in self.parts:
-            found = (replace(experience, parts=()), *found)
-        own = dict(zip(self.parts, found, strict=True))
+    def take(self, batches: Mapping[str, Batch]) -> None:
+        """Give each learner its own rows, and skills the task's advantage, if it has a weight."""
+        own = {name: batches[name.removeprefix(self._node)] for name in self.parts}
         if any(self._weights.values()):
             advantage = self._progress * self._task_advantage(own[self._critic])
             for name, weight in self._weights.items():
                 if weight:
-                    own[name].advantage = weight * advantage
+                    own[name] = own[name].replace(advantage=weight * advantage)
         for name, rows in own.items():
-            self.counts[name][0] += int(
-                rows.reward.size if rows.valid is None else rows.valid.sum()
-            )
+            self.counts[name][0] += int(rows.valid_rows.sum())
             self._acted |= prefixed(name, how_it_acted(name, rows))
-            self.parts[name].take(rows)
+            self.parts[name].take({"": rows})
 
-    def _task_advantage(self, rows: Experience) -> Array:
+    def _task_advantage(self, rows: Batch) -> Array:
         """What each step did for the task, (T, N) float32, with deviation 1.
 
         With less where it is small, in units of reward: see ``PPO.min_advantage_std``.
@@ -124,7 +123,7 @@ class WovenLearner:
             part.load(unprefixed(name, kept))
 
 
-def how_it_acted(name: str, rows: Experience) -> dict[str, Tensor]:
+def how_it_acted(name: str, rows: Batch) -> dict[str, Tensor]:
     """Of a selector the mean steps of its calls; of a skill how much it acted, and its reward.
 
     Args:
@@ -135,13 +134,13 @@ def how_it_acted(name: str, rows: Experience) -> dict[str, Tensor]:
         ``call_length``, or ``usage`` (a share of all steps) and ``reward`` (mean of a step, where
         it acted), each (1,).
     """
-    valid = np.ones(rows.reward.shape, bool) if rows.valid is None else rows.valid
+    valid = rows.valid_rows
     found: dict[str, float] = {}
     if name.rpartition("/")[2] == SELECTOR:
         if valid.any():
-            found["call_length"] = rows.steps[valid].mean()
+            found["call_length"] = rows["steps"][valid].mean()
     elif not decides(name):
         found["usage"] = valid.mean()
         if valid.any():
-            found["reward"] = rows.reward[valid].mean()
+            found["reward"] = rows["reward"][valid].mean()
     return {key: torch.tensor([float(value)], **FLOAT) for key, value in found.items()}

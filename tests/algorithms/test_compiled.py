@@ -31,7 +31,7 @@ from skillweave import (
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.shipping import packed, unpacked
-from skillweave.experience import Anchor, Rollout, Sample
+from skillweave.experience import Reference, Rollout, Sample
 from skillweave.seeding import Seeds
 
 P, B = 2, 16
@@ -55,8 +55,8 @@ def sample(space: gym.Space[Any], seed: int) -> Sample:
         reward=torch.randn(P, B, generator=g),
         discount=torch.rand(P, B, generator=g).round() * 0.9,
         next_obs=torch.randn(P, B, 3, generator=g),
-        obs_mask=allowed if discrete else None,
-        next_obs_mask=allowed if discrete else None,
+        mask=allowed if discrete else None,
+        next_mask=allowed if discrete else None,
         weight=torch.rand(P, B, generator=g),
         index=np.zeros((P, B), np.int64),
     )
@@ -111,7 +111,7 @@ def rollout(space: gym.Space[Any], seed: int) -> Rollout:
         last=last,
         head=torch.randn(*lead, 3 if discrete else 2, generator=g),
         log_std=None if discrete else torch.zeros(P, 1, 1, 2),
-        obs_mask=mask if discrete else None,
+        mask=mask if discrete else None,
         valid=valid,
         progress=0.1,
     )
@@ -190,9 +190,9 @@ def test_a_learner_that_stays_near_another_compiled_learns_what_it_learns_plainl
     params = []
     for compile in (False, True):
         algorithm, state = small_ppo(compile=compile)
-        near = Anchor(algorithm.acting_params(state), torch.ones(P))
-        learn(algorithm, state, anchor=near)
-        learn(algorithm, state, anchor=near)
+        near = Reference(algorithm.acting_params(state), torch.ones(P))
+        learn(algorithm, state, reference=near)
+        learn(algorithm, state, reference=near)
         params.append(state.params)
     torch.testing.assert_close(*params, rtol=1e-4, atol=1e-6)
 

@@ -19,7 +19,7 @@ from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO, Skillweave
 from skillweave.algorithms import rollouts
 from skillweave.algorithms.base import state_to
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.experience import Anchor, Rollout, Sample
+from skillweave.experience import Reference, Rollout, Sample
 from skillweave.networks.config import CNN, RNN
 from skillweave.ops.device import Constant, all_false, on_host, resolve_device
 from skillweave.seeding import Seeds
@@ -102,7 +102,7 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
     batch = Rollout(
         rows(algorithm, lead), actions(algorithm, lead), torch.zeros(lead), torch.zeros(lead),
         rows(algorithm, lead), last, head=torch.zeros(*lead, width),
-        obs_mask=torch.ones(*lead, width, dtype=torch.bool) if algorithm.codec.discrete else None,
+        mask=torch.ones(*lead, width, dtype=torch.bool) if algorithm.codec.discrete else None,
         log_std=None if algorithm.codec.discrete else torch.zeros(P, 1, 1, width),
         memory=memory, starts=None if memory is None else last,
         overridden=last,
@@ -111,7 +111,7 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state, batch = on_device(algorithm, mode), moved(batch, mode)
         near = algorithm.acting_params(state, device=THERE)
-        batch.anchor = Anchor(near, mode.from_tensor(torch.ones(P)).to(THERE))
+        batch.reference = Reference(near, mode.from_tensor(torch.ones(P)).to(THERE))
         assert algorithm.value(state, batch.obs[:, 0]).device == THERE
         state, report = algorithm.update(state, batch, rng)
         assert devices(state) == {"meta"}
@@ -132,14 +132,14 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         learner = RolloutLearner(Stack(algorithm, on_device(algorithm, mode)), Seeds(0))
         keep_to_guide(learner, 0.1)
-        assert learner.anchor is not None
+        assert learner.reference is not None
         batch = moved(batch, mode)
-        batch.anchor = learner.anchor
+        batch.reference = learner.reference
         monkeypatch.setattr(learner._store, "rollout", lambda *about: batch)
         learner.learn(0, 0, 0.0)
         learner._asked = algorithm.acting_params(learner.stacks[0].state, 0.0), 0.0
-        assert learner.anchor.coef.device == THERE
-        assert learner.kept()["anchor_coef"].device.type == "cpu"
+        assert learner.reference.coef.device == THERE
+        assert learner.kept()["reference_coef"].device.type == "cpu"
 
 
 @pytest.mark.fast_cases(2)
@@ -158,7 +158,7 @@ def test_algorithms_of_replay_learn_and_act_where_their_state_is(name):
     rng = [Seeds(m).torch() for m in range(P)]
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state, batch = on_device(algorithm, mode), moved(batch, mode)
-        assert algorithm.value(state, batch.obs, batch.obs_mask).device == THERE
+        assert algorithm.value(state, batch.obs, batch.mask).device == THERE
         noise = [x.to(THERE) for x in algorithm.learning_noise(rng, B, True)]
         metrics, error = algorithm.learn(state, batch, algorithm.rate(state, 0.1), noise, True)
         assert {k for k, v in vars(state).items() if v.device.type == "cpu"} == {"updates"}

@@ -41,7 +41,7 @@ def sample(members: int = P, masked: bool = False, weighted: bool = False) -> Sa
     return Sample(
         obs=torch.randn(*lead, 2, generator=g), action=torch.randint(A, lead, generator=g),
         reward=torch.randn(lead, generator=g), discount=discount,
-        next_obs=torch.randn(*lead, 2, generator=g), obs_mask=None, next_obs_mask=mask,
+        next_obs=torch.randn(*lead, 2, generator=g), mask=None, next_mask=mask,
         weight=torch.rand(lead, generator=g) if weighted else None, index=np.zeros(lead, np.int64),
     )  # fmt: skip
 
@@ -68,7 +68,7 @@ def test_the_target_by_hand(double, masked):
         for b in range(B):
             slow = linear(algorithm, state.target, m, s.next_obs[m, b])
             fast = linear(algorithm, state.params, m, s.next_obs[m, b])
-            allowed = [a for a in range(A) if not masked or s.next_obs_mask[m, b, a]]
+            allowed = [a for a in range(A) if not masked or s.next_mask[m, b, a]]
             judge = fast if double else slow
             best = max(allowed, key=lambda a, judge=judge: judge[a].item())
             differ += best != int(slow.argmax())
@@ -114,7 +114,7 @@ def test_the_distributions_target_is_the_projection_of_the_best_actions(masked):
             fast = linear(algorithm, state.params, m, s.next_obs[m, b]).view(A, 5).softmax(-1)
             slow = linear(algorithm, state.target, m, s.next_obs[m, b]).view(A, 5).softmax(-1)
             worth = fast @ torch.tensor(atoms)
-            allowed = [a for a in range(A) if not masked or s.next_obs_mask[m, b, a]]
+            allowed = [a for a in range(A) if not masked or s.next_mask[m, b, a]]
             p, target = slow[max(allowed, key=lambda a, w=worth: w[a].item())], [0.0] * 5
             for j in range(5):
                 moved = s.reward[m, b].item() + s.discount[m, b].item() * atoms[j]

@@ -15,7 +15,7 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.algorithms.rollouts import rows_where
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.experience import Experience, Rollout
+from skillweave.experience import Batch, Rollout
 from skillweave.networks.config import RNN, Network
 from skillweave.seeding import Seeds
 
@@ -27,7 +27,7 @@ CONFIG = PPO(
 RECURRENT = replace(CONFIG, network=Network((8,), rnn=RNN("gru", 4)))
 NAN = float("nan")
 CELLS = (
-    "obs", "action", "reward", "discount", "next_obs", "last", "obs_mask", "head", "starts",
+    "obs", "action", "reward", "discount", "next_obs", "last", "mask", "head", "starts",
 )  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def packed(rollout: Rollout) -> Rollout:
     last, terminated = rows.pop("last"), rows.pop("discount") == 0.0
     memory = None if rollout.memory is None else rollout.memory.flatten(0, 1).numpy()
     store = RolloutStore(members)
-    store.add(Experience(
+    store.add(Batch(
         **rows, terminated=terminated, truncated=last & ~terminated, memory=memory,
         steps=np.ones(last.shape, np.int64),
     ))  # fmt: skip

@@ -171,7 +171,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     cfg = algorithm.config
     data = rollout(algorithm, state, masked=masked)
     tr = data
-    acted, _ = algorithm.head.stats(data.head, data.log_std, tr.obs_mask, tr.action)
+    acted, _ = algorithm.head.stats(data.head, data.log_std, tr.mask, tr.action)
     if late:  # what learns is no longer what acted
         state = algorithm.init([Seeds(7)])
         random_critic(algorithm, state)
@@ -185,7 +185,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     def policy() -> torch.distributions.Distribution:
         head = actor(tr.obs)
         if algorithm.head.discrete:
-            head = head.masked_fill(~tr.obs_mask, -1e9) if masked else head
+            head = head.masked_fill(~tr.mask, -1e9) if masked else head
             return torch.distributions.Categorical(logits=head)
         return torch.distributions.Independent(torch.distributions.Normal(head, log_std.exp()), 1)
 

@@ -12,7 +12,7 @@ from toys import Toy, learn
 from skillweave import PPO, Network, SkillweaveError
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo_samples import Terms, epsilon_now, samples_of
-from skillweave.experience import Anchor, Rollout
+from skillweave.experience import Reference, Rollout
 from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_epsilon
 from skillweave.seeding import Seeds
@@ -130,12 +130,12 @@ def test_an_anchor_keeps_the_policy_near(space):
     algorithm, moved = make_algorithm(config, SEEN, space), {}
     for coef in (0.0, 100.0):
         state = algorithm.init([Seeds(0)])
-        near = Anchor(algorithm.acting_params(state), torch.tensor([coef]))
+        near = Reference(algorithm.acting_params(state), torch.tensor([coef]))
         rngs = [torch.Generator().manual_seed(1)]
         for i in range(3):
-            rollout = rollout_of(algorithm, state, i, anchor=near)
+            rollout = rollout_of(algorithm, state, i, reference=near)
             state, report = algorithm.update(state, rollout, rngs)
-        moved[coef] = report.metrics["anchor_kl"].item()
+        moved[coef] = report.metrics["reference_kl"].item()
     assert moved[100.0] < 0.1 * moved[0.0]
 
 

@@ -12,7 +12,7 @@ import torch
 from skillweave import PPO, RNN, Network
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo_samples import Terms, samples_of
-from skillweave.experience import Anchor, Rollout
+from skillweave.experience import Reference, Rollout
 from skillweave.seeding import Seeds
 
 SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)
@@ -118,10 +118,10 @@ def test_each_rollout_that_was_held_counts_by_the_deviation_it_was_acted_with():
 def test_an_anchor_is_no_distance_from_the_policy_that_it_is_a_copy_of(space, network):
     algorithm, state = made(space, network, update_epochs=1)
     rollout = acted(algorithm, state)
-    rollout.anchor = Anchor(algorithm.acting_params(state), torch.ones(1))
+    rollout.reference = Reference(algorithm.acting_params(state), torch.ones(1))
     samples, _ = samples_of(algorithm, state, rollout, Terms.of(algorithm.config, state, rollout))
-    assert samples.anchor.shape[-1] == algorithm.head.width
-    torch.testing.assert_close(samples.anchor.reshape(1, T, B, -1), rollout.head)
+    assert samples.reference.shape[-1] == algorithm.head.width
+    torch.testing.assert_close(samples.reference.reshape(1, T, B, -1), rollout.head)
 
 
 @pytest.mark.slow
@@ -130,9 +130,9 @@ def test_an_anchor_keeps_a_policy_with_a_memory_near():
     moved = {}
     for coef in (0.0, 100.0):
         state = algorithm.init([Seeds(0)])
-        near = Anchor(algorithm.acting_params(state), torch.tensor([coef]))
+        near = Reference(algorithm.acting_params(state), torch.tensor([coef]))
         for i in range(3):
-            rollout = replace(acted(algorithm, state, i), anchor=near)
+            rollout = replace(acted(algorithm, state, i), reference=near)
             state, report = algorithm.update(state, rollout, [torch.Generator().manual_seed(1)])
-        moved[coef] = report.metrics["anchor_kl"].item()
+        moved[coef] = report.metrics["reference_kl"].item()
     assert moved[100.0] < 0.1 * moved[0.0]

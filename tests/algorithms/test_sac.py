@@ -51,7 +51,7 @@ def sample(space: Any, masked: bool = False) -> Sample:
         obs=torch.randn(P, B, 3, generator=g),
         action=torch.randint(3, (P, B), generator=g) if space is CHOICES else forces,
         reward=torch.randn(P, B, generator=g), discount=discount,
-        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=masks[0], next_obs_mask=masks[1],
+        next_obs=torch.randn(P, B, 3, generator=g), mask=masks[0], next_mask=masks[1],
         weight=torch.rand(P, B, generator=g), index=np.zeros((P, B), np.int64),
     )  # fmt: skip
 
@@ -84,7 +84,7 @@ def losses(algorithm: SACAlgorithm, state: State, s: Sample) -> tuple[Any, Any]:
     inputs = {"vector": s.obs}
     noise = algorithm.learning_noise(generators(), s.reward.shape[1], False)
     views = algorithm.layout.views(state.params)
-    policy = algorithm.policy_loss(views, state, s.obs_mask, inputs, noise)
+    policy = algorithm.policy_loss(views, state, s.mask, inputs, noise)
     return critic(algorithm, state, s, noise), policy
 
 
@@ -132,7 +132,7 @@ def test_choices_by_hand(masked):
         return Categorical(logits=logits if mask is None else logits.masked_fill(~mask[m], -1e9))
 
     for m in range(P):
-        after = law(m, s.next_obs[m], s.next_obs_mask)
+        after = law(m, s.next_obs[m], s.next_mask)
         slow = critics(algorithm, state.critic_target, m, s.next_obs[m]).min(0).values
         soft = (after.probs * slow).sum(-1) + alphas[m] * after.entropy()
         target = s.reward[m] + s.discount[m] * soft
@@ -141,7 +141,7 @@ def test_choices_by_hand(masked):
         cost = (0.5 * gaps**2 * s.weight[m]).sum(0).mean()
         torch.testing.assert_close(total[m], cost, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(error[m], gaps.abs().mean(0), rtol=1e-4, atol=1e-5)
-        now = law(m, s.obs[m], s.obs_mask)
+        now = law(m, s.obs[m], s.mask)
         q = fast.min(0).values
         loss = -(now.probs * q).sum(-1) - alphas[m] * now.entropy()
         torch.testing.assert_close(policy[m], loss.mean(), rtol=1e-4, atol=1e-5)

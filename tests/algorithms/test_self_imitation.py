@@ -95,7 +95,7 @@ def test_the_loss_is_that_of_the_paper_written_plainly():
         state.params.normal_(generator=torch.Generator().manual_seed(0))
     mask = torch.ones(1, 4, 1, 3, dtype=torch.bool)
     mask[0, 1, 0, 2] = False
-    algorithm.keep(state, rollout([[90.0, 80.0, 0.2, 70.0]], ends=[(1, 0), (3, 0)], obs_mask=mask))
+    algorithm.keep(state, rollout([[90.0, 80.0, 0.2, 70.0]], ends=[(1, 0), (3, 0)], mask=mask))
     rows = state.rows.take(torch.arange(3)[None])
     views = algorithm.layout.views(state.params)
     found = algorithm.imitation_loss(views, state, rows)

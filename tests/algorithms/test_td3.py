@@ -39,7 +39,7 @@ def sample(weighted: bool = False) -> Sample:
     return Sample(
         obs=torch.randn(P, B, 3, generator=g), action=torch.rand(P, B, A, generator=g) * 2 - 1,
         reward=torch.randn(P, B, generator=g), discount=discount,
-        next_obs=torch.randn(P, B, 3, generator=g), obs_mask=None, next_obs_mask=None,
+        next_obs=torch.randn(P, B, 3, generator=g), mask=None, next_mask=None,
         weight=torch.rand(P, B, generator=g) if weighted else None,
         index=np.zeros((P, B), np.int64),
     )  # fmt: skip

@@ -123,9 +123,9 @@ def test_decisions_have_the_exact_multi_time_model(goal, which):
     counted = Counted(len(skills))
     for i in range(4):
         request = Request(100, (), np.array([GAMMA]), Seeds(3) / i, at_random=True)
-        found = collector.collect(request).experience
+        found = collector.collect(request).batches[""]
         counted.add(found)
-        assert found.obs_mask is not None
+        assert found.get("mask") is not None
     model = exact(goal, skills)
     calls, here = counted.calls, np.arange(len(PLACES)) != goal
     assert not calls[~model.allowed].any()

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.buffers.replay import ReplayStore
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 
 SPACE = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
 A = 3
@@ -17,7 +17,7 @@ class Kept:
     """A transition with everything that belongs to it."""
 
     obs: np.ndarray
-    obs_mask: np.ndarray
+    mask: np.ndarray
     action: int
     reward: float
     next_obs: np.ndarray
@@ -75,7 +75,7 @@ class World:
         slots += [kept, None]
         self.begins[column] = kept.ended
 
-    def collect(self, rows: int = 1, only: int | None = None) -> Experience:
+    def collect(self, rows: int = 1, only: int | None = None) -> Batch:
         """Some rows, perhaps of one column, noted; cells that are not valid hold anything."""
         n, rng = self.num_envs, self.rng
         valid = rng.random((rows, n)) < self.filled
@@ -86,14 +86,12 @@ class World:
                 kept = self.transition(c)
                 self.note(c, kept)
                 put(e, (t, c), kept)
-        if not self.told:
-            e.rewards = None
-        if self.filled < 1.0 or only is not None:
-            e.valid = valid
-        for name in ("obs_mask", "next_obs_mask"):
-            if getattr(e, name)[valid].all():
-                setattr(e, name, None)
-        return e
+        absent: dict[str, None] = {} if self.told else {"rewards": None}
+        for name in ("mask", "next_mask"):
+            if e[name][valid].all():
+                absent[name] = None
+        e = e.replace(**absent)
+        return e if self.filled == 1.0 and only is None else e.replace(valid=valid)
 
     def add(self, rows: int = 1) -> None:
         self.store.add(self.collect(rows))
@@ -125,7 +123,7 @@ class World:
             if kept is None:
                 break
             if k:
-                between_obs[k - 1], between_mask[k - 1] = kept.obs, kept.obs_mask
+                between_obs[k - 1], between_mask[k - 1] = kept.obs, kept.mask
                 counts[k - 1] = discount
             own = kept.reward
             if self.told:
@@ -135,15 +133,15 @@ class World:
             last = kept
         first = self.slots[column][number]
         return {
-            "obs": first.obs, "obs_mask": first.obs_mask, "action": first.action,
+            "obs": first.obs, "mask": first.mask, "action": first.action,
             "reward": reward, "discount": discount * (not last.terminated),
-            "next_obs": last.next_obs, "next_obs_mask": last.next_mask,
+            "next_obs": last.next_obs, "next_mask": last.next_mask,
             "between_discount": counts, "between_obs": between_obs, "between_mask": between_mask,
         }  # fmt: skip
 
 
-def empty(rows: int, n: int, longest: int, rng: np.random.Generator) -> Experience:
-    """An experience of which every cell holds nonsense."""
+def empty(rows: int, n: int, longest: int, rng: np.random.Generator) -> Batch:
+    """Return a batch of which every cell holds nonsense."""
 
     def floats(*shape: int) -> np.ndarray:
         return rng.random((rows, n, *shape), dtype=np.float32) + 50
@@ -151,18 +149,19 @@ def empty(rows: int, n: int, longest: int, rng: np.random.Generator) -> Experien
     def bools(*shape: int) -> np.ndarray:
         return rng.random((rows, n, *shape)) < 0.5
 
-    return Experience(
+    return Batch(
         obs=floats(2), action=rng.integers(A, size=(rows, n)), reward=floats(),
         steps=rng.integers(7, size=(rows, n)), terminated=bools(), truncated=bools(),
-        next_obs=floats(2), obs_mask=bools(A), next_obs_mask=bools(A), rewards=floats(longest),
+        next_obs=floats(2), mask=bools(A), next_mask=bools(A), rewards=floats(longest),
     )  # fmt: skip
 
 
-def put(e: Experience, cell: tuple[int, int], kept: Kept) -> None:
+def put(e: Batch, cell: tuple[int, int], kept: Kept) -> None:
     """Write a transition into a cell."""
-    e.obs[cell], e.next_obs[cell], e.action[cell] = kept.obs, kept.next_obs, kept.action
-    e.reward[cell], e.steps[cell] = kept.reward, kept.steps
-    e.terminated[cell], e.truncated[cell] = kept.terminated, kept.ended and not kept.terminated
-    e.obs_mask[cell], e.next_obs_mask[cell] = kept.obs_mask, kept.next_mask
-    e.rewards[cell] = 0.0
-    e.rewards[cell][: kept.steps] = kept.rewards
+    e["obs"][cell], e["next_obs"][cell], e["action"][cell] = kept.obs, kept.next_obs, kept.action
+    e["reward"][cell], e["steps"][cell] = kept.reward, kept.steps
+    e["terminated"][cell] = kept.terminated
+    e["truncated"][cell] = kept.ended and not kept.terminated
+    e["mask"][cell], e["next_mask"][cell] = kept.mask, kept.next_mask
+    e["rewards"][cell] = 0.0
+    e["rewards"][cell][: kept.steps] = kept.rewards

@@ -13,7 +13,7 @@ from plain_replay import SPACE, A, World
 from skillweave.buffers import ram
 from skillweave.buffers.replay import ReplayStore, replay_store
 from skillweave.errors import SkillweaveError
-from skillweave.experience import Experience, Sample
+from skillweave.experience import Batch, Sample
 from skillweave.spaces import action_codec, obs_dtype
 
 GAMMA = torch.tensor([0.9, 0.5, 0.99])
@@ -47,7 +47,7 @@ def line(rewards, ends="", capacity=100, steps=None, at_once=1, **kwargs) -> Rep
     for t in range(0, len(rewards), at_once):
         part = slice(t, t + at_once)
         store.add(
-            Experience(
+            Batch(
                 obs[part],
                 (np.arange(len(rewards)) % A)[part, None],
                 np.float32(rewards)[part, None],
@@ -247,11 +247,11 @@ def test_one_filled_column_of_many_is_sampled():
 # Kinds of data
 
 
-def rows_of(obs, action, after, truncated=None) -> Experience:
+def rows_of(obs, action, after, truncated=None) -> Batch:
     """One row of plain steps."""
     n = len(action)
     no = np.zeros((1, n), bool)
-    return Experience(
+    return Batch(
         obs[None], action[None], np.zeros((1, n), np.float32), np.ones((1, n), np.int64), no,
         no if truncated is None else truncated[None], after[None],
     )  # fmt: skip
@@ -263,8 +263,8 @@ def test_boxes_of_actions_stay_as_they_are_and_choices_become_int64():
     boxes.add(rows_of(obs, action, obs))
     sample = boxes.sample(1, GAMMA[:2], generators(2))
     assert torch.equal(sample.action[:, 0], torch.from_numpy(action))
-    assert sample.obs_mask is None
-    assert sample.next_obs_mask is None
+    assert sample.mask is None
+    assert sample.next_mask is None
     assert sample.weight is None
     for choices, bytes_each in (256, 1), (257, 2), (40_000, 4):
         store = ReplayStore(10, 2, 2, SPACE, (), np.int64, mask_size=choices)
@@ -314,8 +314,8 @@ def test_the_store_keeps_copies_and_so_does_its_state():
     for _ in range(7):
         e = world.collect(2)
         store.add(e)
-        e.obs += 99
-        e.next_obs += 99
+        e["obs"] += 99
+        e["next_obs"] += 99
     state, before = store.state(), store.sample(9, GAMMA[:1], generators(1))
     for _ in range(5):
         world.add()
@@ -366,7 +366,7 @@ def test_a_million_lunar_lander_transitions_take_at_most_90_megabytes():
         )
         assert store.nbytes <= (43e6 if prioritized else 39e6)
         e = rows_of(np.zeros((16, 8)), np.zeros(16), np.zeros((16, 8)))
-        e.steps[:], e.obs_mask = 2, np.ones((1, 16, 4), bool)
+        e["steps"][:], e["mask"] = 2, np.ones((1, 16, 4), bool)
         store.add(e)
         assert store.nbytes <= 90e6  # with masks and calls
 
@@ -524,12 +524,12 @@ def test_the_observations_between_n_steps_and_what_rewards_there_count():
     assert line([1, 2], between=True).sample(2, GAMMA[:1], generators(1)).between_obs is None
 
 
-def call(rewards: np.ndarray) -> Experience:
+def call(rewards: np.ndarray) -> Batch:
     """A call in each of N environments; rewards (N, τ)."""
     zeros = np.zeros((len(rewards), 2), np.float32)
     e = rows_of(zeros, np.zeros(len(rewards)), zeros)
     # Who acted discounted by γ = 0: to them a call paid its first reward alone.
-    e.reward[:], e.steps[:], e.rewards = rewards[:, 0], rewards.shape[1], rewards[None]
+    e["reward"][:], e["steps"][:], e["rewards"] = rewards[:, 0], rewards.shape[1], rewards[None]
     return e
 
 
@@ -558,7 +558,7 @@ def test_rewards_of_calls_that_are_gone_take_no_room_though_a_column_stands_stil
     store.add(call(np.float32([[1, 2, 4]] * 2)))
     for i in range(200):
         e = call(np.full((2, 1 + i % 7), 0.5, np.float32))
-        e.valid = np.array([[False, True]])
+        e["valid"] = np.array([[False, True]])
         store.add(e)
     assert len(store.state()["rewards"]) <= 64
     s = store.sample(200, torch.tensor([1.0, 0.5]), generators(2))

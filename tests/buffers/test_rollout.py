@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.experience import Experience, Rollout
+from skillweave.experience import Batch, Rollout
 from skillweave.spaces import action_codec, obs_dtype
 
 T, P, B, A, M = 3, 2, 2, 3, 5
@@ -16,7 +16,7 @@ GAMMA = torch.tensor([0.9, 0.5])
 SPACE, CODEC = gym.spaces.Box(-1, 1, (2,)), action_codec(gym.spaces.Discrete(1000))
 
 
-def experience(rows=T, terminated=(), truncated=(), steps=1, columns=P * B) -> Experience:
+def experience(rows=T, terminated=(), truncated=(), steps=1, columns=P * B) -> Batch:
     """Observations say (time, column), rewards 10 · time + column; the successor is t + 0.5.
 
     ``terminated`` and ``truncated`` are cells (time, column).
@@ -27,7 +27,7 @@ def experience(rows=T, terminated=(), truncated=(), steps=1, columns=P * B) -> E
     for end, cells in zip(ends, (terminated, truncated), strict=True):
         for cell in cells:
             end[cell] = True
-    return Experience(
+    return Batch(
         obs, 100 * time + column, (10 * time + column).astype(np.float32),
         np.broadcast_to(steps, (rows, columns)).copy(), *ends, obs + np.float32([0.5, 0]),
         head=np.repeat(obs[..., :1] + 7, A, -1),
@@ -36,7 +36,7 @@ def experience(rows=T, terminated=(), truncated=(), steps=1, columns=P * B) -> E
     )  # fmt: skip
 
 
-def rollout(*experiences: Experience, quota=0, **kwargs) -> Rollout:
+def rollout(*experiences: Batch, quota=0, **kwargs) -> Rollout:
     store = RolloutStore(P, quota)
     for e in experiences:
         store.add(e)
@@ -54,14 +54,14 @@ def test_columns_are_member_after_member():
     assert torch.equal(r.obs[..., 0], torch.arange(3.0)[None, :, None].expand(P, T, B))
     assert torch.equal(r.obs[..., 1], torch.tensor([[0.0, 1], [2, 3]])[:, None].expand(P, T, B))
     assert torch.equal(r.next_obs, r.obs + torch.tensor([0.5, 0]))
-    assert torch.equal(r.head, (r.obs[..., :1] + 7).expand(P, T, B, A))
-    assert torch.equal(r.memory[..., 0], torch.tensor([[0.0, 1], [2, 3]]))
-    assert torch.equal(r.starts, r.obs[..., 0] == 0)
+    assert torch.equal(r.dist_params, (r.obs[..., :1] + 7).expand(P, T, B, A))
+    assert torch.equal(r.recurrent_state[..., 0], torch.tensor([[0.0, 1], [2, 3]]))
+    assert torch.equal(r.episode_start, r.obs[..., 0] == 0)
     assert r.log_std is None
     assert r.progress == 0.25
-    assert r.obs_mask is None
+    assert r.mask is None
     assert r.valid is None
-    rows = [r.obs, r.action, r.reward, r.next_obs, r.last, r.discount, r.head]
+    rows = [r.obs, r.action, r.reward, r.next_obs, r.last, r.discount, r.dist_params]
     assert all(x[p].is_contiguous() for x in rows for p in range(P))
 
 
@@ -89,10 +89,10 @@ def test_the_end_of_the_rollout_cuts_every_trajectory_but_keeps_its_discount():
 
 def test_masks_travel_with_their_observations():
     e = experience()
-    e.obs_mask = np.random.default_rng(0).random((T, P * B, A)) < 0.5
+    e = e.replace(mask=np.random.default_rng(0).random((T, P * B, A)) < 0.5)
     r = rollout(e)
     for t in range(T):
-        assert torch.equal(r.obs_mask[:, t].flatten(0, 1), torch.from_numpy(e.obs_mask[t]))
+        assert torch.equal(r.mask[:, t].flatten(0, 1), torch.from_numpy(e["mask"][t]))
 
 
 def test_rows_of_one_member_are_not_copied():
@@ -108,20 +108,20 @@ def test_rows_of_one_member_are_not_copied():
 def test_structured_observations_become_bytes():
     space = gym.spaces.Dict({"a": gym.spaces.Box(-1, 1, (2,), np.float64)})
     e, kind = experience(), obs_dtype(space)
-    e.obs, e.next_obs = np.zeros((2, T, P * B), kind)
-    e.obs["a"] = np.random.default_rng(0).random((T, P * B, 2))
+    e = e.replace(obs=np.zeros((T, P * B), kind), next_obs=np.zeros((T, P * B), kind))
+    e["obs"]["a"] = np.random.default_rng(0).random((T, P * B, 2))
     for valid in None, np.arange(P * B) < 3:
-        e.valid = None if valid is None else np.broadcast_to(valid, (T, P * B))
+        e = e.replace(valid=None if valid is None else np.broadcast_to(valid, (T, P * B)))
         found = rollout(e).obs
         assert found.shape == (P, T, B, kind.itemsize)
         found = found[1, :, 0].numpy().copy().view(kind).ravel()
-        assert np.array_equal(found, e.obs[:, 2])
+        assert np.array_equal(found, e["obs"][:, 2])
 
 
 def test_rollouts_are_on_the_learners_device():
     store = RolloutStore(P, device="meta")
     e = experience(steps=2)
-    e.valid, e.obs_mask = np.eye(P * B, dtype=bool)[:T], np.ones((T, P * B, A), bool)
+    e = e.replace(valid=np.eye(P * B, dtype=bool)[:T], mask=np.ones((T, P * B, A), bool))
     store.add(e)
     r = store.rollout(GAMMA)
     tensors = [x for f in fields(Rollout) if isinstance(x := getattr(r, f.name), torch.Tensor)]
@@ -136,7 +136,7 @@ def test_without_valid_rows_there_is_nothing_to_learn_from():
     store = RolloutStore(P)
     assert store.rollout(GAMMA) is None
     e = experience()
-    e.valid = np.zeros((T, P * B), bool)
+    e = e.replace(valid=np.zeros((T, P * B), bool))
     store.add(e)
     store.add(experience(rows=0))
     assert store.rollout(GAMMA) is None
@@ -147,7 +147,7 @@ def test_without_valid_rows_there_is_nothing_to_learn_from():
 
 def test_valid_rows_come_first_and_the_rectangle_is_as_high_as_the_fullest_column():
     e = experience(4, terminated=[(1, 0), (2, 1)])
-    e.valid = np.array([[0, 1, 0, 1], [1, 0, 0, 1], [0, 0, 0, 0], [1, 0, 0, 0]], bool)
+    e = e.replace(valid=np.array([[0, 1, 0, 1], [1, 0, 0, 1], [0, 0, 0, 0], [1, 0, 0, 0]], bool))
     r = rollout(e)
     assert r.valid.tolist() == [[[True, True], [True, False]], [[True, False], [True, False]]]
     # Column 2 is empty: it stands behind column 3, as the other member has two.
@@ -155,43 +155,45 @@ def test_valid_rows_come_first_and_the_rectangle_is_as_high_as_the_fullest_colum
     assert r.reward[r.valid].tolist() == [10, 1, 30, 3, 13]
     assert r.last.tolist() == [[[True, True], [True, False]], [[False, False], [True, False]]]
     assert r.discount[r.valid].tolist() == pytest.approx([0, 0.9, 0.9, 0.5, 0.5])
-    assert r.starts[r.valid].tolist() == [False, True, False, True, False]
-    assert torch.equal(r.memory[..., 0], torch.tensor([[0.0, 1], [3, 2]]))
+    assert r.episode_start[r.valid].tolist() == [False, True, False, True, False]
+    assert torch.equal(r.recurrent_state[..., 0], torch.tensor([[0.0, 1], [3, 2]]))
 
 
 def test_rows_that_are_not_valid_repeat_valid_ones_so_that_nothing_is_out_of_range():
     e = experience(5)
-    e.valid = np.zeros((5, P * B), bool)
-    e.valid[1:3, 2] = True
-    e.obs_mask = np.repeat(e.valid[..., None], A, -1)  # elsewhere nothing at all is allowed
-    e.obs[~e.valid] = e.reward[~e.valid] = e.head[~e.valid] = np.nan
+    e = e.replace(valid=np.zeros((5, P * B), bool))
+    e["valid"][1:3, 2] = True
+    e = e.replace(
+        mask=np.repeat(e["valid"][..., None], A, -1)
+    )  # elsewhere nothing at all is allowed
+    e["obs"][~e["valid"]] = e["reward"][~e["valid"]] = e["dist_params"][~e["valid"]] = np.nan
     r = rollout(e, experience(3))
     assert r.obs.shape == (P, 3, 3, 2)  # the second member has three columns
-    assert r.obs_mask.all()
-    for x in r.obs, r.reward, r.head, r.discount:
+    assert r.mask.all()
+    for x in r.obs, r.reward, r.dist_params, r.discount:
         assert x.isfinite().all()
     assert not r.last[~r.valid].any()
 
 
 def test_columns_without_a_valid_row_are_left_out():
     e = experience()
-    e.valid = np.ones((T, P * B), bool)
-    e.valid[:, [0, 3]] = False
+    e = e.replace(valid=np.ones((T, P * B), bool))
+    e["valid"][:, [0, 3]] = False
     r = rollout(e)
     assert r.valid is None
     assert r.reward.tolist() == [[[1], [11], [21]], [[2], [12], [22]]]
-    assert r.memory[..., 0].tolist() == [[1], [2]]
+    assert r.recurrent_state[..., 0].tolist() == [[1], [2]]
 
 
 def test_what_is_not_valid_has_no_nan_of_another_member():
     e = experience()
-    e.valid = np.ones((T, P * B), bool)
-    e.valid[1:, [1, 3]] = False
-    e.head[:, :B] = np.nan  # the first has diverged
+    e = e.replace(valid=np.ones((T, P * B), bool))
+    e["valid"][1:, [1, 3]] = False
+    e["dist_params"][:, :B] = np.nan  # the first has diverged
     r = rollout(e)
     assert r.valid.sum((1, 2)).tolist() == [T + 1] * P
-    assert r.head[0].isnan().all()
-    assert r.head[1].isfinite().all()
+    assert r.dist_params[0].isnan().all()
+    assert r.dist_params[1].isfinite().all()
 
 
 # Several experiences, side by side
@@ -200,7 +202,9 @@ def test_what_is_not_valid_has_no_nan_of_another_member():
 def test_a_quota_collects_until_every_member_has_enough():
     store = RolloutStore(P, quota=4)
     e = experience(2)
-    e.valid = np.array([[1, 1, 1, 0], [1, 1, 0, 0]], bool)  # 4 rows of the first, 1 of the other
+    e = e.replace(
+        valid=np.array([[1, 1, 1, 0], [1, 1, 0, 0]], bool)
+    )  # 4 rows of the first, 1 of the other
     for _ in range(3):
         store.add(e)
         assert store.rollout(GAMMA) is None
@@ -213,7 +217,7 @@ def test_a_quota_collects_until_every_member_has_enough():
 def test_experiences_lie_side_by_side_with_their_memory():
     """The second is longer, has steps and a mask, which the first has not."""
     first, second = experience(2), experience(3, terminated=[(0, 0)], steps=2)
-    second.obs_mask = np.zeros((3, P * B, A), bool)
+    second.mask = np.zeros((3, P * B, A), bool)
     second.memory += 50
     r = rollout(first, second)
     assert r.valid.tolist() == [[[True] * 4, [True] * 4, [False, False, True, True]]] * P
@@ -221,12 +225,12 @@ def test_experiences_lie_side_by_side_with_their_memory():
         *[0, 1, 0, 1, 10, 11, 10, 11, 20, 21],
         *[2, 3, 2, 3, 12, 13, 12, 13, 22, 23],
     ]
-    assert r.memory[..., 0].tolist() == [[0, 1, 50, 51], [2, 3, 52, 53]]
+    assert r.recurrent_state[..., 0].tolist() == [[0, 1, 50, 51], [2, 3, 52, 53]]
     assert r.last[0].tolist() == [[False, False, True, False], [True, True, False, False],
                                   [False, False, True, True]]  # fmt: skip
     assert r.discount[0, 0].tolist() == pytest.approx([0.9, 0.9, 0.0, 0.81])
-    assert r.obs_mask[:, :2, :2].all()
-    assert not r.obs_mask[:, :, 2:].any()
+    assert r.mask[:, :2, :2].all()
+    assert not r.mask[:, :, 2:].any()
 
 
 def test_each_experience_keeps_the_deviation_that_it_was_acted_with():
@@ -234,7 +238,9 @@ def test_each_experience_keeps_the_deviation_that_it_was_acted_with():
     first, second = torch.full((P, 1, 1, A), -1.0), torch.full((P, 1, 1, A), 2.0)
     first[1] = -3.0
     e = experience(2)
-    e.valid = np.array([[1, 0, 1, 1], [1, 0, 0, 1]], bool)  # a column of member 0 is empty
+    e = e.replace(
+        valid=np.array([[1, 0, 1, 1], [1, 0, 0, 1]], bool)
+    )  # a column of member 0 is empty
     store.add(e, first)
     again.load(store.state(), SPACE, CODEC)
     for each in store, again:
@@ -261,15 +267,18 @@ def test_every_valid_row_is_there_once_in_its_order_and_cut_at_its_end(seed, sha
     expected: list[list[list[tuple]]] = [[] for _ in range(P)]  # by member and column, its rows
     for i, rows in enumerate(shapes):
         e = experience(rows, steps=rng.integers(1, 4, (rows, P * B)))
-        e.reward += np.float32(1000 * i)
-        e.terminated, e.truncated = rng.random((rows, P * B)) < 0.3, rng.random((rows, P * B)) < 0.1
-        e.valid = rng.random((rows, P * B)) < filled
+        e["reward"] += np.float32(1000 * i)
+        e["terminated"], e["truncated"] = (
+            rng.random((rows, P * B)) < 0.3,
+            rng.random((rows, P * B)) < 0.1,
+        )
+        e = e.replace(valid=rng.random((rows, P * B)) < filled)
         store.add(e)
-        for c in range(P * B) if e.valid.any() else ():  # else it is not kept
-            times = e.valid[:, c].nonzero()[0]
-            discount = gamma[c // B] ** e.steps[:, c] * ~e.terminated[:, c]
+        for c in range(P * B) if e["valid"].any() else ():  # else it is not kept
+            times = e["valid"][:, c].nonzero()[0]
+            discount = gamma[c // B] ** e["steps"][:, c] * ~e["terminated"][:, c]
             ends = e.ended[:, c] | (np.arange(rows) == times.max(initial=-1))
-            expected[c // B].append([(e.reward[t, c], discount[t], ends[t]) for t in times])
+            expected[c // B].append([(e["reward"][t, c], discount[t], ends[t]) for t in times])
     r = store.rollout(GAMMA)
     if r is None:
         assert not any(rows for columns in expected for rows in columns)
@@ -291,7 +300,7 @@ def test_every_valid_row_is_there_once_in_its_order_and_cut_at_its_end(seed, sha
 def test_a_state_goes_on_exactly_and_is_a_copy():
     store, other = RolloutStore(P, quota=10), RolloutStore(P, quota=10)
     e = experience(2, steps=3)
-    e.valid = np.array([[1, 0, 1, 1], [1, 1, 0, 1]], bool)
+    e = e.replace(valid=np.array([[1, 0, 1, 1], [1, 1, 0, 1]], bool))
     for _ in range(3):
         store.add(e)
     other.add(experience())  # gives way
@@ -301,11 +310,11 @@ def test_a_state_goes_on_exactly_and_is_a_copy():
         assert each.rollout(GAMMA) is None
         each.add(experience(2))
         found.append(each.rollout(GAMMA))
-    for name in (f.name for f in fields(Rollout) if f.name not in ("log_std", "obs_mask")):
+    for name in (f.name for f in fields(Rollout) if f.name not in ("log_std", "mask")):
         assert np.array_equal(*(getattr(r, name) for r in found)), name
     alone = RolloutStore(1)
     alone.add(e)
     state = alone.state()
-    e.memory += 99
+    e["recurrent_state"] += 99
     assert (state["0.memory"] < 99).all()
     assert RolloutStore(1).state() == {}

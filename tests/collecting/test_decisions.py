@@ -62,27 +62,27 @@ def scalars_of(skills, call_steps, n=N, gamma=0.97, reflexes=(), env=Walk):
 
 def compare(collected, scalars, exact=False):
     """Every decision is the scalar loop's next one; how many steps each column's calls took."""
-    experience, episodes = collected.experience, []
-    valid = experience.valid
-    valid = np.ones(experience.reward.shape, bool) if valid is None else valid
+    experience, episodes = collected.batches[""], []
+    valid = experience["valid"]
+    valid = np.ones(experience["reward"].shape, bool) if valid is None else valid
     assert (valid[:-1] | ~valid[1:]).all(), "a gap within a column"
     steps = np.zeros(len(scalars), int)
     for t, n in zip(*np.nonzero(valid), strict=True):
         scalar = scalars[n]
         allowed, obs = scalar.allowed(), scalar.obs
-        np.testing.assert_array_equal(experience.obs[t, n], obs)
-        if experience.obs_mask is not None:
-            assert experience.obs_mask[t, n].tolist() == allowed
-        want = scalar.call(int(experience.action[t, n]))
-        assert experience.steps[t, n] == want.steps
+        np.testing.assert_array_equal(experience["obs"][t, n], obs)
+        if experience.get("mask") is not None:
+            assert experience["mask"][t, n].tolist() == allowed
+        want = scalar.call(int(experience["action"][t, n]))
+        assert experience["steps"][t, n] == want.steps
         near = np.float32(want.reward) if exact else pytest.approx(want.reward, abs=1e-5)
-        assert experience.reward[t, n] == near
-        assert experience.terminated[t, n] == want.terminated
-        assert experience.truncated[t, n] == (want.truncated and not want.terminated)
-        np.testing.assert_array_equal(experience.next_obs[t, n], want.next_obs)
-        assert experience.head[t, n, 0] == experience.action[t, n]
-        if experience.rewards is not None:
-            each = experience.rewards[t, n]
+        assert experience["reward"][t, n] == near
+        assert experience["terminated"][t, n] == want.terminated
+        assert experience["truncated"][t, n] == (want.truncated and not want.terminated)
+        np.testing.assert_array_equal(experience["next_obs"][t, n], want.next_obs)
+        assert experience["dist_params"][t, n, 0] == experience["action"][t, n]
+        if experience.get("rewards") is not None:
+            each = experience["rewards"][t, n]
             total = (each * scalar.gamma ** np.arange(len(each))).sum()
             assert total == pytest.approx(want.reward, abs=1e-5)
             assert not each[want.steps :].any()
@@ -108,7 +108,7 @@ def test_every_decision_is_that_of_a_scalar_loop(call_steps, rows):
         collected = collector.collect(request)
         taken += compare(collected, scalars)
         ticks, ended = ticks + rows, ended + len(collected.episodes)
-        assert collected.experience.spent == rows * N
+        assert collected.steps == rows * N
     # What is not in a decision yet is in an open call: no step is lost, none invented.
     open_calls = np.where(collector.kept["over"], 0, collector.kept["tau"])
     np.testing.assert_array_equal(taken + open_calls, ticks)
@@ -154,9 +154,9 @@ def test_every_member_has_its_own_gamma_and_the_rewards_of_each_step_are_kept():
     for request in itertools.islice(requests(60, gamma), 3):
         collected = collector.collect(request)
         compare(collected, scalars)
-        widths.add(collected.experience.rewards.shape)
+        widths.add(collected.batches[""]["rewards"].shape)
     assert all(width >= 13 for _, _, width in widths)
-    plain = collector_of(skills).collect(next(requests(60))).experience
+    plain = collector_of(skills).collect(next(requests(60))).batches[""]
     assert plain.rewards is None
 
 
@@ -211,10 +211,10 @@ def test_real_environments_agree_with_a_scalar_loop(env_id, kinds, limit):
     for request in itertools.islice(requests(100), 4):
         collected = collector.collect(request)
         compare(collected, scalars)
-        valid = collected.experience.valid
+        valid = collected.batches[""]["valid"]
         valid = ... if valid is None else valid
-        terminated += collected.experience.terminated[valid].sum()
-        truncated += collected.experience.truncated[valid].sum()
+        terminated += collected.batches[""]["terminated"][valid].sum()
+        truncated += collected.batches[""]["truncated"][valid].sum()
     assert terminated
     assert truncated
 
@@ -231,23 +231,29 @@ def test_calls_of_different_lengths_do_not_wait_for_each_other():
     collector = collector_of(skill_set(Long, Short, call_steps=None))
     counts = np.zeros(N, int)
     for request in itertools.islice(requests(32), 6):
-        experience = collector.collect(request).experience
-        counts += experience.valid.sum(0) if experience.valid is not None else len(experience.obs)
+        experience = collector.collect(request).batches[""]
+        counts += (
+            experience["valid"].sum(0)
+            if experience.get("valid") is not None
+            else len(experience["obs"])
+        )
     assert counts.max() > counts.min(), "columns are not ragged"
 
 
 def test_masks_of_successors_are_those_of_the_next_decision():
     collector = collector_of(skill_set(*ALL))
-    experience = collector.collect(next(requests(128))).experience
-    valid, checked = experience.valid, 0
+    experience = collector.collect(next(requests(128))).batches[""]
+    valid, checked = experience["valid"], 0
     for n in range(N):
-        rows = np.flatnonzero(valid[:, n]) if valid is not None else np.arange(len(experience.obs))
+        rows = (
+            np.flatnonzero(valid[:, n]) if valid is not None else np.arange(len(experience["obs"]))
+        )
         for now, then in itertools.pairwise(rows):
-            mask = experience.next_obs_mask[now, n]
-            if experience.terminated[now, n]:
+            mask = experience["next_mask"][now, n]
+            if experience["terminated"][now, n]:
                 assert mask.all()
-            elif not experience.truncated[now, n]:
-                assert mask.tolist() == experience.obs_mask[then, n].tolist()
+            elif not experience["truncated"][now, n]:
+                assert mask.tolist() == experience["mask"][then, n].tolist()
                 checked += 1
     assert checked > 20
 
@@ -272,7 +278,7 @@ def test_restored_it_goes_on_as_if_it_had_not_been_stopped(rows):
         one, two = first.collect(request), again.collect(request)
         for name in ("obs", "action", "reward", "steps", "terminated", "next_obs", "rewards"):
             np.testing.assert_array_equal(
-                getattr(one.experience, name), getattr(two.experience, name)
+                getattr(one.batches[""], name), getattr(two.batches[""], name)
             )
         np.testing.assert_array_equal(one.episodes, two.episodes)
 
@@ -325,15 +331,15 @@ def test_a_selectors_memory_goes_on_from_decision_to_decision_within_an_episode(
     scalars, remembered, begun, across = scalars_of(skills.skills, 5), np.zeros(N), 0, 0
     begins = np.ones(N, bool)
     for request in itertools.islice(requests(rows), 140 // rows):
-        experience = collector.collect(request).experience
+        experience = collector.collect(request).batches[""]
         for n in range(N):
             for at, t in enumerate(valid_rows(experience, n)):
-                want = scalars[n].call(int(experience.action[t, n]))
+                want = scalars[n].call(int(experience["action"][t, n]))
                 remembered[n] = 0 if begins[n] else remembered[n]
-                assert experience.starts[t, n] == begins[n]
-                assert experience.head[t, n, 0] == remembered[n]
+                assert experience["episode_start"][t, n] == begins[n]
+                assert experience["dist_params"][t, n, 0] == remembered[n]
                 if at == 0:
-                    assert experience.memory[n, 0] == remembered[n]
+                    assert experience["recurrent_state"][n, 0] == remembered[n]
                     across += not begins[n]
                 begun += begins[n]
                 begins[n] = want.terminated or want.truncated
@@ -393,18 +399,18 @@ def test_termination_sees_the_step_of_its_own_environment_and_call():
     seen, expected = {}, 0
     collector = collector_of(skill_set(Left, recorder(seen, 3), call_steps=4))
     for request in itertools.islice(requests(60), 3):
-        experience = collector.collect(request).experience
+        experience = collector.collect(request).batches[""]
         for n in range(N):
             for t in valid_rows(experience, n):
-                if experience.action[t, n] != 1:
+                if experience["action"][t, n] != 1:
                     continue
-                tag, episode, time, position = experience.obs[t, n].tolist()
-                tau = experience.steps[t, n]
+                tag, episode, time, position = experience["obs"][t, n].tolist()
+                tau = experience["steps"][t, n]
                 for k in range(1, tau + 1):
                     row, _, ended, _, timed_out, elapsed, told, _ = seen[tag, episode, time + k - 1]
                     assert row == [tag, episode, time + k, position + k]
                     assert (elapsed, told) == (k, time + k)
-                    assert ended == (experience.terminated[t, n] and k == tau)
+                    assert ended == (experience["terminated"][t, n] and k == tau)
                     assert ended or timed_out == (k == 3)
                     expected += 1
     assert expected > 100
@@ -481,9 +487,9 @@ def test_a_skill_sees_its_own_rows_of_info_however_deep():
 
 
 def test_without_initiation_sets_there_is_no_mask():
-    experience = collector_of(skill_set(Left, Zigzag)).collect(next(requests(9))).experience
-    assert experience.obs_mask is None
-    assert experience.next_obs_mask is None
+    experience = collector_of(skill_set(Left, Zigzag)).collect(next(requests(9))).batches[""]
+    assert experience.get("mask") is None
+    assert experience.get("next_mask") is None
 
 
 def test_where_no_skill_may_start_the_error_names_them_all():

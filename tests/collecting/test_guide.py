@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, OpenDoor, Wait, bound, got_key
-from toy_acting import Choices, requests
+from toy_acting import Choices, requests, valid_rows
 
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.collector import side_by_side
+from skillweave.collecting.collector import joined_collected
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.guide import SMOOTHED, ActiveGuide, AskedElsewhere, as_logits
 from skillweave.collecting.lengths import Lengths
@@ -58,31 +58,31 @@ def test_only_what_the_automatons_state_allows_is_called(call_steps):
     collector, seen = collector_of(ActiveGuide(bound(AUTOMATON)), call_steps), set()
     lengths = collector.skills.choices // 4
     for request in itertools.islice(requests(60), 3):
-        found = collector.collect(request).experience
-        assert found.guide is None
-        valid = np.ones(found.reward.shape, bool) if found.valid is None else found.valid
-        allowed = of_state(found.obs).repeat(lengths, -1)
-        np.testing.assert_array_equal(found.obs_mask[valid], allowed[valid])
-        on = valid & ~found.terminated
-        ahead = of_state(found.next_obs).repeat(lengths, -1)
-        np.testing.assert_array_equal(found.next_obs_mask[on], ahead[on])
-        seen |= set(np.unique(found.action[valid] // lengths).tolist())
+        found = collector.collect(request).batches[""]
+        assert found.get("guide") is None
+        valid = found.valid_rows
+        allowed = of_state(found["obs"]).repeat(lengths, -1)
+        np.testing.assert_array_equal(found["mask"][valid], allowed[valid])
+        on = valid & ~found["terminated"]
+        ahead = of_state(found["next_obs"]).repeat(lengths, -1)
+        np.testing.assert_array_equal(found["next_mask"][on], ahead[on])
+        seen |= set(np.unique(found["action"][valid] // lengths).tolist())
     assert seen == {0, 1, 2, 3}
 
 
 def test_who_is_not_restricted_is_told_what_the_guide_would_do():
     collector = collector_of(ActiveGuide(bound(AUTOMATON), restricts=False, tells=True))
-    found = collector.collect(next(requests(80))).experience
-    valid = np.ones(found.reward.shape, bool) if found.valid is None else found.valid
-    key = found.obs[..., KEY] == 1
+    found = collector.collect(next(requests(80))).batches[""]
+    valid = found.valid_rows
+    key = found["obs"][..., KEY] == 1
     starts = np.stack([key | True, key, key | True, key | True], -1)
-    np.testing.assert_array_equal(found.obs_mask[valid], starts[valid])
-    assert (found.action[valid] == 2).any(), "leave is called where the automaton would not"
-    chances = np.exp(found.guide[valid])
+    np.testing.assert_array_equal(found["mask"][valid], starts[valid])
+    assert (found["action"][valid] == 2).any(), "leave is called where the automaton would not"
+    chances = np.exp(found["guide"][valid])
     np.testing.assert_allclose(chances.sum(1), 1.0, atol=1e-6)
     search = valid & ~key
     expected = np.float32([0.95 / 2, 1e-8, 0, 0.95 / 2]) + np.float32([1, 0, 1, 1]) * 0.05 / 3
-    np.testing.assert_allclose(np.exp(found.guide[search])[0], expected, atol=1e-6)
+    np.testing.assert_allclose(np.exp(found["guide"][search])[0], expected, atol=1e-6)
 
 
 def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy():
@@ -95,9 +95,9 @@ def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy
         collector.start(Seeds(2))
         request = next(requests(80))
         request = type(request)(80, (), request.gamma, request.seeds, greedy=greedy)
-        found = collector.collect(request).experience
-        valid = np.ones(found.reward.shape, bool) if found.valid is None else found.valid
-        taken = set(np.unique(found.action[valid & (found.obs[..., KEY] == 0)]).tolist())
+        found = collector.collect(request).batches[""]
+        valid = found.valid_rows
+        taken = set(np.unique(found["action"][valid & (found["obs"][..., KEY] == 0)]).tolist())
         assert taken == ({0} if greedy else {0, 3})
 
 
@@ -122,12 +122,12 @@ def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts()
     guide = ActiveGuide(bound(clock, names), decides=True)
     collector = DecisionCollector(make_engine(SPEC, N), AskedElsewhere(N), skill_set, guide=guide)
     collector.start(Seeds(2))
-    found = collector.collect(next(requests(60))).experience
+    found = collector.collect(next(requests(60))).batches[""]
     for n in range(N):
         t = 0
-        for row in np.flatnonzero(found.valid[:, n]) if found.valid is not None else range(60):
-            assert names[found.action[row, n]] == ("get_key" if t < 4 else "wait"), t
-            t = 0 if found.ended[row, n] else t + int(found.steps[row, n])
+        for row in valid_rows(found, n):
+            assert names[found["action"][row, n]] == ("get_key" if t < 4 else "wait"), t
+            t = 0 if found.ended[row, n] else t + int(found["steps"][row, n])
 
 
 @pytest.mark.parametrize("tells", [False, True])
@@ -138,7 +138,7 @@ def test_collectors_agree_on_what_they_tell_also_where_no_call_has_ended(tells):
         if rows == 1:  # it waits for two steps
             collector.acting.some = lambda ids, *seen: Acted(np.full(len(ids), 3), None, None)
         found.append(collector.collect(next(requests(rows))))
-    assert not found[0].experience.valid.any(), "no call has ended"
-    joined = side_by_side(found, 1).experience
-    assert (joined.guide is not None) == tells
-    assert joined.reward.shape[1] == 2 * N
+    assert not found[0].batches[""]["valid"].any(), "no call has ended"
+    joined = joined_collected(found, 1).batches[""]
+    assert ("guide" in joined) == tells
+    assert joined.lead[1] == 2 * N

@@ -101,12 +101,12 @@ def collector_of(node, outer_steps, inner_steps, chooser=Selector, env=Walk):
     return collector
 
 
-def asked(rows):
+def asked(rows, collector):
     """Requests for the selector and the five others; the inner selector has its own γ."""
     for request in requests(rows, GAMMA):
-        own = [request] * 5
-        own[2] = replace(request, gamma=np.array([INNER]))
-        yield replace(request, parts=tuple(own))
+        inner = replace(request, gamma=np.array([INNER]))
+        below = {k: inner if k.endswith("/selector") else request for k in collector.learners}
+        yield replace(request, below=below)
 
 
 def choose(obs, actions, allowed=None):
@@ -202,8 +202,7 @@ class One:
 @pytest.mark.parametrize(("outer", "inner"), [(4, 3), (3, 5), (1, 2), (9, 1), (6, 6)])
 def test_decisions_of_both_levels_are_what_calls_mean(node, outer, inner):
     collector = collector_of(node, outer, inner)
-    found = [collector.collect(r).experience for r in itertools.islice(asked(ROWS), 6)]
-    rows = [dict(zip(collector.learners, e.parts, strict=True)) for e in found]
+    rows = [collector.collect(r).batches for r in itertools.islice(asked(ROWS, collector), 6)]
     name = node().name
     seeds = seeds_of((Seeds(7) / "env").integer(), N)
     ends = np.zeros(3, int)
@@ -236,7 +235,7 @@ def test_decisions_of_both_levels_are_what_calls_mean(node, outer, inner):
         for row, (obs, skill, reward, stops, cut, begins) in zip(own, one.critic, strict=True):
             np.testing.assert_array_equal(row["obs"], obs)
             assert (row["action"], row["terminated"], row["truncated"]) == (skill, stops, cut)
-            assert row["decided"] == begins
+            assert row["call_start"] == begins
             assert row["reward"] == pytest.approx(reward, abs=1e-4)
     assert ends[1] > 5
     assert ends.sum() > 60
@@ -244,71 +243,69 @@ def test_decisions_of_both_levels_are_what_calls_mean(node, outer, inner):
 
 def _rows(experience, n):
     names = ["obs", "action", "reward", "steps", "terminated", "truncated", "next_obs"]
-    if experience.decided is not None:
-        names.append("decided")
+    if experience.get("call_start") is not None:
+        names.append("call_start")
     for t in valid_rows(experience, n):
-        yield {k: getattr(experience, k)[t, n] for k in names}
+        yield {k: experience[k][t, n] for k in names}
 
 
 def test_a_trajectory_of_a_leaf_goes_on_where_it_acts_again_at_once():
     collector = collector_of(Plain, 2, 5)
     seen = 0
-    for request in itertools.islice(asked(ROWS), 4):
-        experience = collector.collect(request).experience
-        rows = dict(zip(collector.learners, experience.parts, strict=True))["plain/down"]
-        for t, n in zip(*np.nonzero(rows.valid), strict=True):
-            if rows.terminated[t, n]:
-                assert not rows.truncated[t, n]
+    for request in itertools.islice(asked(ROWS, collector), 4):
+        rows = collector.collect(request).batches["plain/down"]
+        for t, n in zip(*np.nonzero(rows["valid"]), strict=True):
+            if rows["terminated"][t, n]:
+                assert not rows["truncated"][t, n]
                 continue
-            ended = rows.obs[t, n, 1] != (rows.obs[t + 1, n, 1] if t + 1 < ROWS else -1)
-            again = t + 1 < ROWS and rows.valid[t + 1, n] and not ended
+            ended = rows["obs"][t, n, 1] != (rows["obs"][t + 1, n, 1] if t + 1 < ROWS else -1)
+            again = t + 1 < ROWS and rows["valid"][t + 1, n] and not ended
             if again:
-                assert not rows.truncated[t, n], "the same leaf acts on"
+                assert not rows["truncated"][t, n], "the same leaf acts on"
                 seen += 1
             elif t + 1 < ROWS:
-                assert rows.truncated[t, n]
+                assert rows["truncated"][t, n]
     assert seen > 8
 
 
 def test_what_a_selector_below_remembers_begins_with_each_new_call():
     collector = collector_of(Plain, 3, 1, Remembering)
-    for request in itertools.islice(asked(ROWS), 3):
-        experience = collector.collect(request).experience
-        rows = dict(zip(collector.learners, experience.parts, strict=True))["plain/selector"]
+    for request in itertools.islice(asked(ROWS, collector), 3):
+        rows = collector.collect(request).batches["plain/selector"]
         for n in range(N):
             counted = None
             for row, t in enumerate(valid_rows(rows, n)):
                 if row == 0:
-                    counted = rows.memory[n, 0]
-                if rows.starts[t, n]:
+                    counted = rows["recurrent_state"][n, 0]
+                if rows["episode_start"][t, n]:
                     counted = 0
-                assert rows.head[t, n, 0] == counted, "what it remembered when it chose"
+                assert rows["dist_params"][t, n, 0] == counted, "what it remembered when it chose"
                 counted += 1
-    assert rows.starts.any()
+    assert rows["episode_start"].any()
 
 
 def test_no_environment_waits_and_every_step_has_one_owner():
     collector = collector_of(Paid, 4, 3)
-    for request in itertools.islice(asked(ROWS), 3):
-        experience = collector.collect(request).experience
-        assert experience.spent == ROWS * N
-        parts = dict(zip(collector.learners, experience.parts, strict=True))
-        owned = sum(parts[k].valid.astype(int) for k in ("up", "paid/down"))
+    for request in itertools.islice(asked(ROWS, collector), 3):
+        collected = collector.collect(request)
+        assert collected.steps == ROWS * N
+        parts = collected.batches
+        owned = sum(parts[k]["valid"].astype(int) for k in ("up", "paid/down"))
         assert owned.max() == 1
 
 
 def test_a_collector_goes_on_where_a_state_was_taken():
     other = collector_of(Paid, 4, 5, env=Again)
-    first, second, third = itertools.islice(asked(17), 3)
+    first, second, third = itertools.islice(asked(17, other), 3)
     other.collect(first)
     state = other.state()
     restored = collector_of(Paid, 4, 5, env=Again)
     restored.restore(state)
     for request in (second, third):
-        a, b = other.collect(request).experience, restored.collect(request).experience
-        for mine, theirs in zip((a, *a.parts), (b, *b.parts), strict=True):
+        a, b = other.collect(request).batches, restored.collect(request).batches
+        for mine, theirs in zip(a.values(), b.values(), strict=True):
             for name in ("obs", "action", "reward", "steps", "terminated", "truncated", "valid"):
-                np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
+                np.testing.assert_array_equal(mine.get(name), theirs.get(name))
 
 
 class Early(Skill):
@@ -326,7 +323,7 @@ def test_apart_a_hierarchy_is_judged_as_the_skill_that_it_is(call_steps):
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
     collector = DecisionCollector(engine, Choices(N, 1), skills, as_skill=Paid())
     collector.start(Seeds(7))
-    rows = collector.collect(next(requests(60, GAMMA))).experience
+    rows = collector.collect(next(requests(60, GAMMA))).batches[""]
     for n in range(N):
         for row in _rows(rows, n):
             t, tau = row["obs"][T], row["steps"]

@@ -53,15 +53,19 @@ def test_rows_of_a_skill_that_learns_by_itself(skill):
     collector = SkillCollector(engine, Choices(N, 3), skill, (BACK,))
     collector.start(Seeds(0))
     for request in itertools.islice(requests(30), 2):
-        found = collector.collect(request).experience
-        moved = found.next_obs[..., POSITION] - found.obs[..., POSITION]
-        np.testing.assert_array_equal(found.overridden, found.obs[..., POSITION] > 1)
-        own = ~found.overridden if found.valid is None else found.valid & ~found.overridden
-        np.testing.assert_array_equal(moved[own], found.action[own] - 1)
-        assert found.overridden.any()
+        found = collector.collect(request).batches[""]
+        moved = found["next_obs"][..., POSITION] - found["obs"][..., POSITION]
+        np.testing.assert_array_equal(found["overridden"], found["obs"][..., POSITION] > 1)
+        own = (
+            ~found["overridden"]
+            if found.get("valid") is None
+            else found["valid"] & ~found["overridden"]
+        )
+        np.testing.assert_array_equal(moved[own], found["action"][own] - 1)
+        assert found["overridden"].any()
     without = SkillCollector(make_engine(EnvSpec(Walk, engine="sync"), N), Choices(N, 3), skill)
     without.start(Seeds(0))
-    assert without.collect(next(requests(5))).experience.overridden is None
+    assert without.collect(next(requests(5))).batches[""].get("overridden") is None
 
 
 def test_rows_of_skills_that_learn_under_a_selector():
@@ -72,16 +76,17 @@ def test_rows_of_skills_that_learn_under_a_selector():
     collector.start(Seeds(7))
     seen = 0
     for request in itertools.islice(asked(40), 3):
-        *own, stream = collector.collect(request).experience.parts
-        assert stream.overridden is None
+        batches = collector.collect(request).batches
+        own = batches["up"], batches["down"]
+        assert "overridden" not in batches["skill_critic"]
         for rows in own:
-            moved = rows.next_obs[..., POSITION] - rows.obs[..., POSITION]
-            np.testing.assert_array_equal(rows.overridden, far(rows.obs.reshape(-1, 4)).reshape(
-                rows.overridden.shape))  # fmt: skip
-            mine = rows.valid & rows.overridden
+            moved = rows["next_obs"][..., POSITION] - rows["obs"][..., POSITION]
+            beyond = far(rows["obs"].reshape(-1, 4)).reshape(rows.lead)
+            np.testing.assert_array_equal(rows["overridden"], beyond)
+            mine = rows["valid"] & rows["overridden"]
             assert (moved[mine] == -1).all()
-            clear = rows.valid & ~rows.overridden
-            np.testing.assert_array_equal(moved[clear], rows.action[clear] - 1)
+            clear = rows["valid"] & ~rows["overridden"]
+            np.testing.assert_array_equal(moved[clear], rows["action"][clear] - 1)
             seen += mine.sum()
     assert seen > 4
 
@@ -100,19 +105,21 @@ def test_reflexes_of_a_hierarchy_below_hold_where_it_acts_and_those_above_come_l
     collector = WovenCollector(engine, Choices(N, 2), skills, learners)
     collector.start(Seeds(7))
     seen = np.zeros(3, int)
-    for request in itertools.islice(asked(40), 4):
-        up, down, _ = collector.collect(request).experience.parts
-        position = up.obs[..., POSITION]
-        moved = up.next_obs[..., POSITION] - position
+    for request in itertools.islice(asked(40, learners), 4):
+        batches = collector.collect(request).batches
+        up, down = batches["up"], batches["inside/down"]
+        position = up["obs"][..., POSITION]
+        moved = up["next_obs"][..., POSITION] - position
         for rows, below in ((up, False), (down, True)):
-            high, beneath = rows.valid & (position > 1), rows.valid & (position < 2)
+            high, beneath = rows["valid"] & (position > 1), rows["valid"] & (position < 2)
             np.testing.assert_array_equal(
-                rows.overridden[rows.valid], ((position > 1) | (below & (position < 2)))[rows.valid]
+                rows["overridden"][rows["valid"]],
+                ((position > 1) | (below & (position < 2)))[rows["valid"]],
             )
             assert (moved[high] == -1).all()
             assert not below or (moved[beneath] == 1).all()
-            own = rows.valid & ~rows.overridden
-            np.testing.assert_array_equal(moved[own], rows.action[own] - 1)
+            own = rows["valid"] & ~rows["overridden"]
+            np.testing.assert_array_equal(moved[own], rows["action"][own] - 1)
             seen += (below * high.sum(), below * beneath.sum(), (not below) * beneath.sum())
     assert (seen > 2).all()
 

@@ -1,7 +1,6 @@
 """What holds of all experience: rows chain, joined collectors find what they find alone."""
 
 import itertools
-from dataclasses import fields
 
 import gymnasium as gym
 import numpy as np
@@ -16,12 +15,12 @@ from skillweave.algorithms.config import PPO, SAC
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.collector import Collected, joined_from, parted, side_by_side
+from skillweave.collecting.collector import Collected, joined_collected, joined_from, parted
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.joined import JoinedEngines
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -81,11 +80,11 @@ def chained(experiences):
         before = None
         for e in experiences:
             for t in valid_rows(e, n):
-                assert not (e.terminated[t, n] and e.truncated[t, n])
+                assert not (e["terminated"][t, n] and e["truncated"][t, n])
                 if before is not None:
-                    np.testing.assert_array_equal(e.obs[t, n], before)
+                    np.testing.assert_array_equal(e["obs"][t, n], before)
                     count += 1
-                before = None if e.ended[t, n] else e.next_obs[t, n]
+                before = None if e.ended[t, n] else e["next_obs"][t, n]
     return count
 
 
@@ -119,7 +118,7 @@ def test_rows_of_skills_chain_in_every_space(shows, asks, skill):
         learns, params = learner(kind, algorithm)
         collector = SkillCollector(engine, Acting([(learns, 1)], 3), skill)
         collector.start(Seeds(2))
-        found = [collector.collect(r).experience for r in itertools.islice(asked(params, 7), 5)]
+        found = [collector.collect(r).batches[""] for r in itertools.islice(asked(params, 7), 5)]
         assert sum(e.spent for e in found) == 105
         assert chained(found) > 20
         assert np.concatenate([e.ended for e in found]).sum() > 4
@@ -142,12 +141,12 @@ def test_decisions_chain_in_every_space(shows):
         learns, params = learner(chooses, "memory")
         collector = DecisionCollector(engine, Acting([(learns, 1)], 3), calls)
         collector.start(Seeds(2))
-        found = [collector.collect(r).experience for r in itertools.islice(asked(params, 9), 5)]
+        found = [collector.collect(r).batches[""] for r in itertools.islice(asked(params, 9), 5)]
         assert sum(e.spent for e in found) == 135
         assert chained(found) > 10
         for e in found:
-            valid = ... if e.valid is None else e.valid
-            chosen = np.take_along_axis(e.obs_mask, e.action[..., None], 2)[..., 0]
+            valid = ... if e.get("valid") is None else e["valid"]
+            chosen = np.take_along_axis(e["mask"], e["action"][..., None], 2)[..., 0]
             assert chosen[valid].all(), "a skill was chosen that may not start"
 
 
@@ -199,23 +198,20 @@ def long_part(kind):
 
 def compare(one, two):
     """Two experiences are the same in their valid rows; rewards of steps may be padded."""
-    a, b = one.experience, two.experience
-    assert a.reward.shape[1] == b.reward.shape[1]
-    for n in range(a.reward.shape[1]):
+    a, b = one.batches[""], two.batches[""]
+    assert a.lead[1] == b.lead[1]
+    for n in range(a.lead[1]):
         rows, others = valid_rows(a, n), valid_rows(b, n)
         assert len(rows) == len(others)
-        for field in fields(Experience):
-            x, y = getattr(a, field.name), getattr(b, field.name)
-            apart = field.name in ("spent", "parts", "valid", "memory")
-            if apart or x is None:
-                assert apart or y is None
-                continue
-            x, y = x[rows, n], y[others, n]
-            if field.name == "rewards":
+        apart = {"valid", "recurrent_state"}
+        assert a.keys() - apart == b.keys() - apart
+        for name in a.keys() - apart:
+            x, y = a[name][rows, n], b[name][others, n]
+            if name == "rewards":
                 width = max(x.shape[1], y.shape[1])
                 x, y = (np.pad(z, ((0, 0), (0, width - z.shape[1]))) for z in (x, y))
             np.testing.assert_array_equal(x, y)
-    assert a.spent == b.spent
+    assert one.steps == two.steps
     np.testing.assert_array_equal(np.sort(one.episodes, axis=0), np.sort(two.episodes, axis=0))
 
 
@@ -246,7 +242,7 @@ def test_joined_collectors_find_what_they_find_alone(kind, rows):
         joined = joined_from(parts, JoinedEngines([p.engine for p in parts]), Choices(6, actions))
         for request in itertools.islice(stream, 3):
             whole = joined.collect(request)
-            compare(whole, side_by_side([c.collect(request) for c in alone], 1))
+            compare(whole, joined_collected([c.collect(request) for c in alone], 1))
         parted(joined, parts)
 
 
@@ -257,14 +253,14 @@ def test_joined_collectors_go_on_with_the_search_for_a_start():
     stream, found = requests(5), []
     for _ in range(4):
         joined = joined_from(parts, JoinedEngines([p.engine for p in parts]), Choices(6, 3))
-        found += [joined.collect(r).experience for r in itertools.islice(stream, 3)]
+        found += [joined.collect(r).batches[""] for r in itertools.islice(stream, 3)]
         parted(joined, parts)
         for name, rows in joined.kept.items():
             np.testing.assert_array_equal(np.concatenate([p.kept[name] for p in parts]), rows)
         for i, part in enumerate(parts):
             np.testing.assert_array_equal(part.obs, joined.obs[2 * i : 2 * i + 2])
     assert chained(found) > 40
-    valid = np.concatenate([e.valid for e in found if e.valid is not None])
+    valid = np.concatenate([e["valid"] for e in found if e.get("valid") is not None])
     assert 0 < valid.sum() < valid.size
 
 
@@ -276,27 +272,30 @@ SIZES = st.lists(st.integers(1, 4), min_size=1, max_size=4)
 @given(heights=SIZES, members=st.integers(1, 3), each=st.integers(1, 2), data=st.data())
 def test_ragged_parts_stand_side_by_side_member_by_member(heights, members, each, data):
     parts = [part_of(h, i, members * each, data) for i, h in enumerate(heights)]
-    found = side_by_side(parts, members).experience
+    collected = joined_collected(parts, members)
+    found = collected.batches[""]
     own = each  # environments of a member in one part
     columns = members * each * len(parts)
-    assert found.reward.shape == (max(heights), columns)
-    assert found.spent == sum(p.experience.spent for p in parts)
+    assert found["reward"].shape == (max(heights), columns)
+    assert collected.steps == sum(p.steps for p in parts)
     for column in range(columns):
         member, rest = divmod(column, own * len(parts))
         number, at = divmod(rest, own)
-        part, n = parts[number].experience, member * own + at
+        part, n = parts[number].batches[""], member * own + at
         rows, others = valid_rows(found, column), valid_rows(part, n)
         assert len(rows) == len(others)
-        np.testing.assert_array_equal(found.reward[rows, column], part.reward[others, n])
-        np.testing.assert_array_equal(found.obs[rows, column], part.obs[others, n])
-        np.testing.assert_array_equal(found.memory[column], part.memory[n])
-        width = part.rewards.shape[2]
-        np.testing.assert_array_equal(found.rewards[rows, column, :width], part.rewards[others, n])
-        assert not found.rewards[rows, column, width:].any()
-        if found.obs_mask is not None:
-            mask = np.ones_like(part.obs_mask) if part.obs_mask is None else part.obs_mask
-            wanted = np.ones((len(others), 2)) if part.obs_mask is None else mask[others, n]
-            np.testing.assert_array_equal(found.obs_mask[rows, column], wanted)
+        np.testing.assert_array_equal(found["reward"][rows, column], part["reward"][others, n])
+        np.testing.assert_array_equal(found["obs"][rows, column], part["obs"][others, n])
+        np.testing.assert_array_equal(found["recurrent_state"][column], part["recurrent_state"][n])
+        width = part["rewards"].shape[2]
+        np.testing.assert_array_equal(
+            found["rewards"][rows, column, :width], part["rewards"][others, n]
+        )
+        assert not found["rewards"][rows, column, width:].any()
+        if found.get("mask") is not None:
+            known = part.get("mask")
+            wanted = np.ones((len(others), 2)) if known is None else known[others, n]
+            np.testing.assert_array_equal(found["mask"][rows, column], wanted)
 
 
 def part_of(height, number, columns, data):
@@ -307,14 +306,12 @@ def part_of(height, number, columns, data):
     width = data.draw(st.integers(1, 3))
     no = np.zeros(lead, bool)
     masked, ragged = data.draw(st.booleans()), data.draw(st.booleans())
-    return Collected(
-        Experience(
+    rows = Batch(
             obs=base[..., None].astype(np.float32), action=base, reward=base.astype(np.float32),
             steps=base, terminated=no, truncated=no, next_obs=base[..., None].astype(np.float32),
-            obs_mask=base[..., None] % 3 != np.arange(2) if masked else None,
+            mask=base[..., None] % 3 != np.arange(2) if masked else None,
             valid=np.arange(height)[:, None] < counts if ragged else None,
-            memory=np.arange(columns)[:, None] + 100.0 * number, starts=no,
-            rewards=base[..., None] + np.arange(width) / 8, spent=int(base.sum()),
-        ),
-        np.zeros((0, 4)),
+            recurrent_state=np.arange(columns)[:, None] + 100.0 * number, episode_start=no,
+            rewards=base[..., None] + np.arange(width) / 8,
     )  # fmt: skip
+    return Collected({"": rows}, int(base.sum()), np.zeros((0, 4)))

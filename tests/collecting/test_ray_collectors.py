@@ -105,8 +105,8 @@ def here(make, count=2):
 
 def equal(one, two):
     for name in NAMES:
-        np.testing.assert_array_equal(getattr(one.experience, name), getattr(two.experience, name))
-    assert one.experience.spent == two.experience.spent
+        np.testing.assert_array_equal(one.batches[""].get(name), two.batches[""].get(name))
+    assert one.steps == two.steps
     np.testing.assert_array_equal(one.episodes, two.episodes)
 
 
@@ -168,7 +168,7 @@ def test_collectors_of_a_lost_node_are_made_again_on_others(on_ray, cluster, onl
             cluster.add_node(num_cpus=3)  # nodes may join
         found = apart.collect(request)
         equal(plain.collect(request), found)
-        found.experience.reward[:] = 0.0  # it can be written to
+        found.batches[""]["reward"][:] = 0.0  # it can be written to
     lost = "worker 0 (was lost with its node|is out of reach); it is made again"
     assert on_ray.told
     assert all(re.fullmatch(lost, line) for line in on_ray.told)

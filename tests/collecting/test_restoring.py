@@ -1,7 +1,6 @@
 """Collectors that are brought back stand where they stood, or begin anew and say where."""
 
 import itertools
-from dataclasses import fields
 
 import gymnasium as gym
 import numpy as np
@@ -22,13 +21,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
 
 def equal(one, two):
     """Whether two collectors have found the same, and that is all there is."""
-    for field in fields(one.experience):
-        first, second = (getattr(c.experience, field.name) for c in (one, two))
-        assert (first is None) == (second is None), field.name
-        if field.name == "spent":
-            assert first == second
-        elif first is not None:
-            np.testing.assert_array_equal(first, second)
+    assert one.batches.keys() == two.batches.keys()
+    for path, batch in one.batches.items():
+        assert batch.keys() == two.batches[path].keys()
+        for name, x in batch.items():
+            np.testing.assert_array_equal(x, two.batches[path][name])
+    assert one.steps == two.steps
     np.testing.assert_array_equal(one.episodes, two.episodes)
 
 
@@ -160,7 +158,7 @@ def test_an_episode_that_ends_early_when_it_is_played_again_begins_anew(monkeypa
     monkeypatch.setattr(Hasty, "hurry", True)
     assert second.restore(first.state()).tolist() == [1]
     monkeypatch.setattr(Hasty, "hurry", False)
-    assert step(second, [0, 0, 0]).experience.terminated.tolist() == [[False] * 3]
+    assert step(second, [0, 0, 0]).batches[""]["terminated"].tolist() == [[False] * 3]
     assert second.state()["kept.elapsed"].tolist() == [6, 1, 6]
 
 
@@ -171,9 +169,9 @@ def test_an_episode_that_nothing_ends_is_truncated_wherever_checkpoints_are_writ
     monkeypatch.setattr("skillweave.envs.checks.LONGEST_EPISODE", 10)
     env, truncated = given(Moody, 2), []
     for at in range(25):
-        rows = step(env, [0, 0]).experience
-        assert not rows.terminated.any()
-        truncated.append(bool(rows.truncated.all()))
+        rows = step(env, [0, 0]).batches[""]
+        assert not rows["terminated"].any()
+        truncated.append(bool(rows["truncated"].all()))
         if at in saves:
             env.state()
     assert [at for at, over in enumerate(truncated) if over] == [9, 19]
@@ -186,7 +184,7 @@ def test_the_steps_of_an_open_episode_count_on_after_a_resume(monkeypatch):
     for _ in range(6):
         step(first, [0, 0])
     assert not len(again.restore(first.state()))
-    truncated = [bool(step(again, [0, 0]).experience.truncated.all()) for _ in range(5)]
+    truncated = [bool(step(again, [0, 0]).batches[""]["truncated"].all()) for _ in range(5)]
     assert truncated == [False, False, False, True, False]
 
 

@@ -95,22 +95,24 @@ def test_every_row_is_that_of_a_scalar_loop(collector, skill, rows, reflexes):
     seen = {"terminated": 0, "truncated": 0, "searching": 0, "episodes": 0}
     for request in itertools.islice(requests(rows), -(-180 // rows)):
         collected = env.collect(request)
-        experience, told = collected.experience, []
-        assert experience.spent == rows * n, "a step is not counted"
-        assert (experience.steps == 1).all()
+        experience, told = collected.batches[""], []
+        assert collected.steps == rows * n, "a step is not counted"
+        assert (experience["steps"] == 1).all()
         for t, i in itertools.product(range(rows), range(n)):
             scalar, before = scalars[i], len(scalars[i].episodes)
             done = walks[i].log[scalar.env.steps][-1]  # in the environment itself
             if not scalar.searching:
-                assert done == scalar.overridden(int(experience.action[t, i]))
+                assert done == scalar.overridden(int(experience["action"][t, i]))
             want = scalar.row(done)
-            np.testing.assert_array_equal(experience.next_obs[t, i], want.next_obs)
-            np.testing.assert_array_equal(experience.obs[t, i], want.obs)
-            assert (experience.valid is None or bool(experience.valid[t, i])) == want.valid
-            assert experience.terminated[t, i] == want.terminated
-            assert experience.truncated[t, i] == want.truncated
+            np.testing.assert_array_equal(experience["next_obs"][t, i], want.next_obs)
+            np.testing.assert_array_equal(experience["obs"][t, i], want.obs)
+            assert (
+                experience.get("valid") is None or bool(experience["valid"][t, i])
+            ) == want.valid
+            assert experience["terminated"][t, i] == want.terminated
+            assert experience["truncated"][t, i] == want.truncated
             if want.valid:
-                assert experience.reward[t, i] == np.float32(want.reward)
+                assert experience["reward"][t, i] == np.float32(want.reward)
             told += scalar.episodes[before:]
             seen["terminated"] += want.terminated
             seen["truncated"] += want.truncated
@@ -129,17 +131,17 @@ def test_memory_is_empty_where_an_episode_begins_and_starts_say_so(collector, sk
     begun, remembered = 0, np.zeros(4)
     walks = [e.unwrapped for e in env.engine._envs.envs]
     for request in itertools.islice(requests(rows), 140 // rows):
-        experience = env.collect(request).experience
+        experience = env.collect(request).batches[""]
         first = [True] * 4
         for t, i in itertools.product(range(rows), range(4)):
             want = scalars[i].row(walks[i].log[scalars[i].env.steps][-1])
             if not want.valid:
                 continue
-            assert experience.starts[t, i] == want.starts
+            assert experience["episode_start"][t, i] == want.starts
             remembered[i] = 0 if want.starts else remembered[i]
-            assert experience.head[t, i, 0] == remembered[i]
+            assert experience["dist_params"][t, i, 0] == remembered[i]
             if first[i] and not want.starts:
-                assert experience.memory[i, 0] == remembered[i]
+                assert experience["recurrent_state"][i, 0] == remembered[i]
             first[i], begun = False, begun + want.starts
             remembered[i] += 1
     assert begun > 10
@@ -154,13 +156,13 @@ def test_no_step_is_ignored_and_none_invented(collector, name):
     obs, ends = env.obs.copy(), 0
     for t in range(60):
         action = actions(3, 0) if t % 3 else actions(3, 1)
-        row = step(env, action).experience
-        for before, a, after in zip(obs, action, row.next_obs[0], strict=True):
+        row = step(env, action).batches[""]
+        for before, a, after in zip(obs, action, row["next_obs"][0], strict=True):
             np.testing.assert_allclose(after, cartpole(before, a), atol=1e-5)
         ended = row.ended[0]
-        assert np.array_equal(env.obs[~ended], row.next_obs[0][~ended])
+        assert np.array_equal(env.obs[~ended], row["next_obs"][0][~ended])
         assert (np.abs(env.obs[ended]) <= 0.05).all(), "not reset"
-        assert (row.reward == 1.0).all()
+        assert (row["reward"] == 1.0).all()
         ends += ended.sum()
         obs = env.obs.copy()
     assert ends > 3
@@ -174,9 +176,9 @@ def test_the_same_seeds_give_the_same_rows_and_others_do_not(collector, name):
 
     def play(seed):
         env = collector(name, "CartPole-v1", Late(), acting=lambda n: Choices(n, 2), seed=seed)
-        seen = [env.collect(r).experience for r in itertools.islice(requests(9), 3)]
+        seen = [env.collect(r).batches[""] for r in itertools.islice(requests(9), 3)]
         assert not seen[0].valid.all()
-        return np.concatenate([e.obs for e in seen])
+        return np.concatenate([e["obs"] for e in seen])
 
     first = play(1)
     assert np.array_equal(play(1), first)
@@ -191,13 +193,13 @@ def test_max_steps_truncates_and_really_resets(collector, name):
     env = collector(name, "CartPole-v1", Short())
     for t in range(1, 10):
         before = env.obs.copy()
-        row = step(env, np.ones(3, np.int64)).experience
-        for was, after in zip(before, row.next_obs[0], strict=True):
+        row = step(env, np.ones(3, np.int64)).batches[""]
+        for was, after in zip(before, row["next_obs"][0], strict=True):
             np.testing.assert_allclose(after, cartpole(was, 1), atol=1e-5)
-        assert not row.terminated.any()
-        assert row.truncated[0].tolist() == [t % 3 == 0] * 3
+        assert not row["terminated"].any()
+        assert row["truncated"][0].tolist() == [t % 3 == 0] * 3
         if t % 3 == 0:
-            assert (row.next_obs[0, :, 1] > 0.4).all(), "not the true successor"
+            assert (row["next_obs"][0, :, 1] > 0.4).all(), "not the true successor"
             assert (np.abs(env.obs) <= 0.05).all(), "not reset"
 
 
@@ -215,17 +217,17 @@ def test_environments_that_search_act_at_random_while_the_others_go_on(collector
     for t in range(60):
         before, elapsed = env.obs.copy(), env.kept["elapsed"].copy()
         action = np.eye(3, dtype=np.int64)[t % 3]  # one of them stops
-        row = step(env, action).experience
+        row = step(env, action).batches[""]
         assert row.spent == 3
-        valid = np.ones(3, bool) if row.valid is None else row.valid[0]
+        valid = np.ones(3, bool) if row.get("valid") is None else row["valid"][0]
         waited, acted = waited + int((~valid).sum()), acted + int(valid.sum())
         for i in range(3):
             ways = [cartpole(before[i], a) for a in (0, 1)]
-            found = [np.allclose(row.next_obs[0, i], way, atol=1e-5) for way in ways]
+            found = [np.allclose(row["next_obs"][0, i], way, atol=1e-5) for way in ways]
             if valid[i]:
                 assert np.abs(before[i, 1]) > 0.3 or elapsed[i]
                 assert found[action[i]]
-                assert row.terminated[0, i] == (action[i] == 1)
+                assert row["terminated"][0, i] == (action[i] == 1)
             else:
                 assert any(found)
                 sides.add(found.index(True))
@@ -248,10 +250,10 @@ def test_a_skills_termination_terminates_and_resets_at_once(collector):
     env = collector(skill=UntilTwo())
     for _ in range(5):
         assert not step(env, np.zeros(3, np.int64)).experience.ended.any()
-        row = step(env, np.zeros(3, np.int64)).experience
-        assert row.terminated.all()
-        assert not row.truncated.any()
-        assert (row.next_obs[0, :, STEP] == 2).all()
+        row = step(env, np.zeros(3, np.int64)).batches[""]
+        assert row["terminated"].all()
+        assert not row["truncated"].any()
+        assert (row["next_obs"][0, :, STEP] == 2).all()
         assert (env.obs[:, STEP] == 0).all()
     assert (env.obs[:, EPISODE] == 5).all()
 
@@ -274,15 +276,15 @@ def test_a_skill_sees_the_whole_step_and_its_reward_replaces_the_tasks(collector
     for t in range(4):
         before, action = env.obs.copy(), np.array([t % 3, 2])
         collected = step(env, action)
-        row, (told,) = collected.experience, seen[t:]
+        row, (told,) = collected.batches[""], seen[t:]
         assert np.array_equal(told.obs, before)
         assert np.array_equal(told.action, action)
-        assert np.array_equal(told.next_obs, row.next_obs[0])
+        assert np.array_equal(told.next_obs, row["next_obs"][0])
         assert told.reward.tolist() == [10 * (t % 2 + 1) + t % 3, 10 * (t % 2 + 1) + 2]
         assert told.timed_out.tolist() == [t % 2 == 1 and not told.terminated[0]] * 2
         assert told.info["t"].tolist() == [t % 2 + 1] * 2
-        assert row.reward[0].tolist() == [0.5 * (t % 2 + 1)] * 2
-        assert row.reward.dtype == np.float32
+        assert row["reward"][0].tolist() == [0.5 * (t % 2 + 1)] * 2
+        assert row["reward"].dtype == np.float32
         if t % 2:  # return, the task's, length, success
             paid = 10 + (t - 1) % 3 + 20 + t % 3
             wanted = [[1.5, paid, 2.0, t % 3 == 2], [1.5, 34.0, 2.0, 1.0]]
@@ -302,8 +304,8 @@ def test_elapsed_counts_from_one_in_every_episode(collector):
 
     env = collector(skill=Count())
     for _ in range(20):
-        row = step(env, np.zeros(3, np.int64)).experience
-        assert np.array_equal(elapsed[-1], row.next_obs[0, :, STEP])
+        row = step(env, np.zeros(3, np.int64)).batches[""]
+        assert np.array_equal(elapsed[-1], row["next_obs"][0, :, STEP])
 
 
 def test_a_reflex_overrides_the_action_in_the_environment_and_in_the_skills_eyes(collector):
@@ -315,20 +317,20 @@ def test_a_reflex_overrides_the_action_in_the_environment_and_in_the_skills_eyes
     env = collector(skill=Watch(), reflexes=(Reflex(lambda obs: obs[:, STEP] >= 1, 2),))
     for _ in range(12):
         before = env.obs.copy()
-        row = step(env, given).experience
+        row = step(env, given).batches[""]
         taken = np.where(before[:, STEP] >= 1, 2, 0)
-        assert np.array_equal(row.next_obs[0, :, ACTION], taken)
-        assert np.array_equal(row.reward[0], taken)
-        assert row.action[0].tolist() == [0] * 3, "what the learner chose is what it learns of"
+        assert np.array_equal(row["next_obs"][0, :, ACTION], taken)
+        assert np.array_equal(row["reward"][0], taken)
+        assert row["action"][0].tolist() == [0] * 3, "what the learner chose is what it learns of"
     assert not given.any(), "the policy's own array was written to"
 
 
 def test_a_task_without_a_skill_keeps_its_reward_and_ends(collector):
     env = collector("sync", "CartPole-v1")
-    row = step(env, np.zeros(3, np.int64)).experience
-    assert row.reward[0].tolist() == [1.0] * 3
-    assert row.obs_mask is None
-    assert row.valid is None
+    row = step(env, np.zeros(3, np.int64)).batches[""]
+    assert row["reward"][0].tolist() == [1.0] * 3
+    assert row.get("mask") is None
+    assert row.get("valid") is None
     for _ in range(40):
         episodes = step(env, np.zeros(3, np.int64)).episodes
         if len(episodes):
@@ -349,14 +351,15 @@ def test_an_episode_of_a_skill_begins_only_where_it_may_start(collector):
             return obs[:, STEP] == 2
 
     env = collector(skill=FromStepTwo(), acting=lambda n: Choices(n, 3))
-    experience = env.collect(next(requests(120))).experience
-    valid = experience.valid
-    assert (experience.obs[valid][:, STEP] == 2).all()
-    assert (experience.next_obs[valid][:, STEP] == 3).all(), "no transition but its own"
+    collected = env.collect(next(requests(120)))
+    experience = collected.batches[""]
+    valid = experience["valid"]
+    assert (experience["obs"][valid][:, STEP] == 2).all()
+    assert (experience["next_obs"][valid][:, STEP] == 3).all(), "no transition but its own"
     assert experience.ended[valid].all()
     assert not experience.ended[~valid].any()
     assert valid.sum(0).min() > 10
-    assert experience.spent == 360
+    assert collected.steps == 360
 
 
 class Nowhere(Skill):
@@ -408,7 +411,7 @@ def test_an_initiation_that_holds_somewhere_is_searched_for_ever_after_a_resume_
     Once.open = True
     env = fresh()
     Once.open = False
-    assert step(env, np.zeros(2, np.int64)).experience.valid is None
+    assert step(env, np.zeros(2, np.int64)).batches[""]["valid"] is None
     for _ in range(70):
         step(env, np.zeros(2, np.int64))
     again = fresh()
@@ -487,7 +490,7 @@ def test_the_step_named_is_that_of_the_environment_named(collector):
 def test_the_environment_named_is_the_right_one_where_others_search(collector, monkeypatch):
     monkeypatch.setattr(SourLater, "shut", collector().obs[0, TAG])
     env = collector(skill=SourLater())
-    assert step(env, np.array([0, 1, 0])).experience.valid.tolist() == [[False, True, True]]
+    assert step(env, np.array([0, 1, 0])).batches[""]["valid"].tolist() == [[False, True, True]]
     with pytest.raises(SkillweaveError, match="at step 1 for environment 1"):
         step(env, np.array([0, 2, 0]))
 

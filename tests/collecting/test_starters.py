@@ -90,28 +90,29 @@ def collector_of(
 
 
 def test_it_is_led_to_where_it_may_start_and_only_its_own_rows_are_valid():
-    experience = collector_of(Forward).collect(next(requests(120))).experience
-    valid = experience.valid
+    collected = collector_of(Forward).collect(next(requests(120)))
+    experience = collected.batches[""]
+    valid = experience["valid"]
     assert valid.any(0).all(), "chance alone would need 5^20 tries"
     started = valid[1:] & ~valid[:-1]
-    assert (experience.obs[1:][started][:, X] >= 20).all()
-    led = ~valid & (experience.obs[:, :, X] < 20)
-    assert (experience.next_obs[led][:, X] == experience.obs[led][:, X] + 1).all()
-    assert experience.spent == 120 * N
+    assert (experience["obs"][1:][started][:, X] >= 20).all()
+    led = ~valid & (experience["obs"][:, :, X] < 20)
+    assert (experience["next_obs"][led][:, X] == experience["obs"][led][:, X] + 1).all()
+    assert collected.steps == 120 * N
 
 
 def test_each_of_its_ends_begins_anew_and_it_is_led_again():
-    experience = collector_of(Forward).collect(next(requests(200))).experience
-    ends = experience.valid & (experience.terminated | experience.truncated)
+    experience = collector_of(Forward).collect(next(requests(200))).batches[""]
+    ends = experience["valid"] & (experience["terminated"] | experience["truncated"])
     assert ends.sum() >= 2 * N
     after = np.argwhere(ends[:-1])
-    assert all(experience.obs[t + 1, n, T] == 0 for t, n in after)
+    assert all(experience["obs"][t + 1, n, T] == 0 for t, n in after)
 
 
 @pytest.mark.slow
 def test_where_no_starter_may_start_chance_acts():
     collector, asked = collector_of(OnlyFar), requests(600)
-    first = collector.collect(next(asked)).experience
+    first = collector.collect(next(asked)).batches[""]
     assert len(np.unique(first.action[~first.valid])) == 5
     with pytest.raises(SkillweaveError, match="steps of calling 'only_far'"):
         collector.collect(next(requests(6_000)))
@@ -127,10 +128,10 @@ def test_without_starters_it_says_that_chance_found_nothing():
 @pytest.mark.parametrize(("kinds", "skill"), [((Five,), Anywhere), ((Five,), Far)])
 def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill):
     collector = collector_of(*kinds, skill=skill, start_calls=6)
-    found = collector.collect(next(requests(6_000))).experience
-    before = np.concatenate([np.zeros((1, N), bool), found.valid[:-1]])
-    began = found.valid & (~before | (found.obs[:, :, T] == 0))
-    at = found.obs[:, :, X][began]
+    found = collector.collect(next(requests(6_000))).batches[""]
+    before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
+    began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
+    at = found["obs"][:, :, X][began]
     calls = at / 5
     least = 4 if skill is Far else 0  # it may start at 20, after four calls
     counts = np.array([np.mean(calls == k) for k in range(7)])
@@ -142,22 +143,22 @@ def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill
 
 @pytest.mark.slow
 def test_an_episode_in_which_it_may_not_start_begins_anew():
-    found = collector_of(search_steps=9).collect(next(requests(200))).experience
-    assert not found.valid.any()
-    assert set(np.unique(found.obs[:, :, T])) == set(range(9))
+    found = collector_of(search_steps=9).collect(next(requests(200))).batches[""]
+    assert not found["valid"].any()
+    assert set(np.unique(found["obs"][:, :, T])) == set(range(9))
     # The step that leads there counts still, and who has started is not disturbed.
-    found = collector_of(Forward, search_steps=20).collect(next(requests(200))).experience
-    assert set(np.unique(found.obs[:, :, T][found.valid])) == set(range(20, 25))
+    found = collector_of(Forward, search_steps=20).collect(next(requests(200))).batches[""]
+    assert set(np.unique(found["obs"][:, :, T][found["valid"]])) == set(range(20, 25))
     with pytest.raises(SkillweaveError, match=r"begun anew after 19 of them \(search_steps\)"):
         collector_of(Forward, search_steps=19).collect(next(requests(6_000)))
 
 
 def test_where_it_may_start_the_calls_that_come_first_take_their_time():
     collector = collector_of(Five, skill=Anywhere, start_calls=6, search_steps=3)
-    found = collector.collect(next(requests(2_000))).experience
-    before = np.concatenate([np.zeros((1, N), bool), found.valid[:-1]])
-    began = found.valid & (~before | (found.obs[:, :, T] == 0))
-    assert set(np.unique(found.obs[:, :, X][began] / 5)) == set(range(7))
+    found = collector.collect(next(requests(2_000))).batches[""]
+    before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
+    began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
+    assert set(np.unique(found["obs"][:, :, X][began] / 5)) == set(range(7))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +196,7 @@ def goes_on_the_same(make, rows):
     assert not len(again.restore(first.state()))
     kept = first.state()
     for request in itertools.islice(asked, 9):
-        one, two = first.collect(request).experience, again.collect(request).experience
+        one, two = first.collect(request).batches[""], again.collect(request).batches[""]
         for name in ("obs", "action", "reward", "next_obs", "valid", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     return kept
@@ -239,10 +240,10 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
 @pytest.mark.slow
 def test_an_episode_may_have_several_calls_with_those_of_others_between_them():
     collector = collector_of(Five, skill=Anywhere, start_calls=2, episode_calls=3)
-    found = collector.collect(next(requests(3_000))).experience
+    found = collector.collect(next(requests(3_000))).batches[""]
     for n in range(N):
-        clock, valid = found.obs[:, n, T], found.valid[:, n]
-        ends = np.flatnonzero(valid & found.truncated[:, n])
+        clock, valid = found["obs"][:, n, T], found["valid"][:, n]
+        ends = np.flatnonzero(valid & found["truncated"][:, n])
         starts = [0, *np.flatnonzero(clock[1:] == 0) + 1]
         calls = [int(((ends >= a) & (ends < b)).sum()) for a, b in itertools.pairwise(starts)]
         assert set(calls) == {3}, "three calls of 7 and at most six of 5 fit into 60 steps"
@@ -266,11 +267,11 @@ def test_no_call_is_left_over_where_the_environments_own_episode_ends(env, max_s
 
     Long.max_steps = max_steps
     found = collector_of(env=env, skill=Long, episode_calls=9).collect(next(requests(400)))
-    clock = found.experience.obs[:, 0, T]
-    over = found.experience.truncated[:, 0] | found.experience.terminated[:, 0]
+    clock = found.batches[""]["obs"][:, 0, T]
+    over = found.batches[""]["truncated"][:, 0] | found.batches[""]["terminated"][:, 0]
     ends = [24, 49, 59] if max_steps == 25 else [29, 59]
     assert clock[over][: 2 * len(ends)].tolist() == 2 * ends
-    by_itself = found.experience.terminated[:, 0][over]
+    by_itself = found.batches[""]["terminated"][:, 0][over]
     assert by_itself[: len(ends)].tolist() == [False] * (len(ends) - 1) + [env is Corridor]
     assert clock.max() == 59
 
@@ -288,8 +289,8 @@ class OnTime(Skill):
 @pytest.mark.parametrize(("start_calls", "ends"), [(0, {4}), (2, {4, 19, 34})])
 def test_after_a_call_it_is_called_again_only_where_the_calls_between_lead_to(start_calls, ends):
     how = {"start_calls": start_calls, "episode_calls": 3, "search_steps": 9}
-    found = collector_of(Five, skill=OnTime, **how).collect(next(requests(2_000))).experience
-    at = found.obs[:, :, T][found.valid & found.truncated]
+    found = collector_of(Five, skill=OnTime, **how).collect(next(requests(2_000))).batches[""]
+    at = found["obs"][:, :, T][found["valid"] & found["truncated"]]
     assert set(at) == ends
 
 
@@ -306,7 +307,7 @@ def test_a_skill_that_may_start_at_a_reset_alone_does_not_wait_for_ever():
             return obs[:, T] == 0
 
     collector = collector_of(Five, env=Endless, skill=AtReset, episode_calls=8)
-    assert collector.collect(next(requests(600))).experience.valid.mean() > 0.8
+    assert collector.collect(next(requests(600))).batches[""]["valid"].mean() > 0.8
 
 
 def test_an_evaluated_episode_is_its_first_call():

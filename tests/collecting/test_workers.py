@@ -137,16 +137,16 @@ def test_what_goes_wrong_in_a_process_is_told_with_who_it_was(collectors, action
 
 
 def test_an_info_that_cannot_leave_its_process_does_no_harm(collectors):
-    experience = collectors(action=6).collect(next(requests(3))).experience
-    assert (experience.reward[:, :3] > 0).all()
-    assert experience.reward[1, 3] == 0.0
+    experience = collectors(action=6).collect(next(requests(3))).batches[""]
+    assert (experience["reward"][:, :3] > 0).all()
+    assert experience["reward"][1, 3] == 0.0
 
 
 @pytest.mark.parametrize("env", [Faulty, Stubborn])
 def test_closing_ends_every_process_whatever_it_does(collectors, env):
     made = collectors(env=env)
     processes = pids(made)
-    rewards = made.collect(next(requests(2))).experience.reward
+    rewards = made.collect(next(requests(2))).batches[""]["reward"]
     assert rewards[0].tolist() == [p % 2**20 for p in processes for _ in range(2)]
     assert len({*processes, os.getpid()}) == 3
     made.close()

@@ -89,17 +89,17 @@ def collector_of(call_steps, margin=None, n=N):
     return collector
 
 
-def asked(rows):
-    """Requests of ``rows`` rows for the selector, two skills and the critic."""
+def asked(rows, paths=("up", "down", "skill_critic")):
+    """Requests of ``rows`` rows for the selector and those that learn below it."""
     for request in requests(rows):
-        yield replace(request, parts=(request, request, request))
+        yield replace(request, below=dict.fromkeys(paths, request))
 
 
 def calls_of(experience, n):
     """(choice, steps) of the decisions of a column, in order."""
-    valid = experience.valid
-    rows = range(len(experience.reward)) if valid is None else np.flatnonzero(valid[:, n])
-    return [(int(experience.action[t, n]), int(experience.steps[t, n])) for t in rows]
+    valid = experience["valid"]
+    rows = range(len(experience["reward"])) if valid is None else np.flatnonzero(valid[:, n])
+    return [(int(experience["action"][t, n]), int(experience["steps"][t, n])) for t in rows]
 
 
 @pytest.mark.fast_cases(3)
@@ -111,12 +111,13 @@ def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
     ended, continued = 0, 0
     for request in itertools.islice(asked(40), 5):
         open_steps = collector.kept["tau"] * ~collector.kept["over"]
-        experience = collector.collect(request).experience
-        *own, stream = experience.parts
-        owner = stream.action
+        batches = collector.collect(request).batches
+        experience, stream = batches["selector"], batches["skill_critic"]
+        own = batches["up"], batches["down"]
+        owner = stream["action"]
         for k in (0, 1):
-            np.testing.assert_array_equal(own[k].valid, owner == k)
-            assert own[k].obs is stream.obs, "columns are shared, not copied"
+            np.testing.assert_array_equal(own[k]["valid"], owner == k)
+            assert own[k]["obs"] is stream["obs"], "columns are shared, not copied"
         for n in range(N):
             last = np.zeros(40, bool)
             at = -int(open_steps[n])
@@ -138,14 +139,14 @@ def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
                     np.zeros(1, bool), np.array([elapsed]), {},
                 )  # fmt: skip
                 row, episode = own[k], stream.terminated[t, n] | stream.truncated[t, n]
-                assert row.reward[t, n] == np.float32(skill.reward(step)[0])
-                assert row.head[t, n, 0] == row.action[t, n]
+                assert row["reward"][t, n] == np.float32(skill.reward(step)[0])
+                assert row["dist_params"][t, n, 0] == row["action"][t, n]
                 stops = bool(stream.terminated[t, n] or skill.termination(step)[0])
-                assert row.terminated[t, n] == stops
+                assert row["terminated"][t, n] == stops
                 assert over or not (stops or episode)
                 timed_out = skill.max_steps is not None and elapsed >= skill.max_steps
                 again = t < 39 and owner[t + 1, n] == k and not episode and not timed_out
-                assert row.truncated[t, n] == (over and not stops and not again)
+                assert row["truncated"][t, n] == (over and not stops and not again)
                 seen[k] += 1
                 ended, continued = ended + stops, continued + (over and again and not stops)
                 elapsed = 1 if over else elapsed + 1
@@ -202,16 +203,16 @@ def test_a_critic_is_told_where_calls_begin(margin):
     collector = collector_of(5, margin)
     for request in itertools.islice(asked(40), 3):
         open_steps = collector.kept["tau"] * ~collector.kept["over"]
-        experience = collector.collect(request).experience
-        *_, stream = experience.parts
+        batches = collector.collect(request).batches
+        experience, stream = batches["selector"], batches["skill_critic"]
         for n in range(N):
             begins = np.zeros(40, bool)
             at = -int(open_steps[n])
             for _, steps in calls_of(experience, n):
                 begins[max(0, at)] |= at >= 0
                 at += steps
-            assert (stream.decided[:at, n] == begins[:at]).all()
-            assert stream.decided[at:, n].sum() <= 1  # the call that is open at the end
+            assert (stream["call_start"][:at, n] == begins[:at]).all()
+            assert stream["call_start"][at:, n].sum() <= 1  # the call that is open at the end
             assert begins.sum() > 3
 
 
@@ -240,13 +241,13 @@ def test_a_learner_of_the_library_acts_and_its_head_is_kept():
     collector.start(Seeds(1))
     request = next(requests(30))
     own = replace(request, params=(algorithm.acting_params(state),))
-    (rows,) = collector.collect(replace(request, parts=(own,))).experience.parts
-    _, head, _ = algorithm.act(own.params[0], _tensor(rows.obs[rows.valid]), None, None)
-    np.testing.assert_allclose(rows.head[rows.valid], head[0].numpy(), atol=1e-5)
-    assert not rows.head[~rows.valid].any()
-    assert rows.valid.any()
-    assert not rows.valid.all()
-    assert rows.obs[..., EPISODE].max() > 1
+    rows = collector.collect(replace(request, below={"down": own})).batches["down"]
+    _, head, _ = algorithm.act(own.params[0], _tensor(rows["obs"][rows["valid"]]), None, None)
+    np.testing.assert_allclose(rows["dist_params"][rows["valid"]], head[0].numpy(), atol=1e-5)
+    assert not rows["dist_params"][~rows["valid"]].any()
+    assert rows["valid"].any()
+    assert not rows["valid"].all()
+    assert rows["obs"][..., EPISODE].max() > 1
 
 
 def _tensor(rows):

@@ -13,7 +13,7 @@ from reference_calls import EPISODE, Walk
 
 from skillweave.collecting.acting import Acted, Request
 from skillweave.collecting.collector import Collected
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.seeding import Seeds
 from skillweave.types import Array
 
@@ -82,11 +82,9 @@ def step(collector: Any, action: Any) -> Collected:
     return found
 
 
-def valid_rows(experience: Experience, column: int) -> Array:
+def valid_rows(experience: Batch, column: int) -> Array:
     """Which rows of a column count, in order."""
-    if experience.valid is None:
-        return np.arange(len(experience.reward))
-    return np.flatnonzero(experience.valid[:, column])
+    return np.flatnonzero(experience.valid_rows[:, column])
 
 
 def requests(rows: int, gamma: float | Array = 0.97) -> Any:

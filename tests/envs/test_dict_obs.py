@@ -159,13 +159,13 @@ def test_a_skill_starts_after_random_actions_of_any_kind_and_reads_parts(engine,
     acting, params = learner(made.action_space)
     collector = SkillCollector(made, acting, Onwards())
     collector.start(Seeds(0))
-    experience = collector.collect(Request(20, (params,), np.array([0.9]), Seeds(1))).experience
-    assert experience.obs.dtype == experience.next_obs.dtype == obs_dtype(PLACES)
-    valid = experience.valid
-    assert (valid == (experience.obs["inside"]["0"] >= 1)).all()
-    forwards = experience.next_obs["position"][..., 1] - experience.obs["position"][..., 1]
-    np.testing.assert_allclose(experience.reward[valid], forwards[valid], atol=1e-5)
-    np.testing.assert_allclose(experience.reward[valid], 0.5, atol=1e-5)
+    experience = collector.collect(Request(20, (params,), np.array([0.9]), Seeds(1))).batches[""]
+    assert experience["obs"].dtype == experience["next_obs"].dtype == obs_dtype(PLACES)
+    valid = experience["valid"]
+    assert (valid == (experience["obs"]["inside"]["0"] >= 1)).all()
+    forwards = experience["next_obs"]["position"][..., 1] - experience["obs"]["position"][..., 1]
+    np.testing.assert_allclose(experience["reward"][valid], forwards[valid], atol=1e-5)
+    np.testing.assert_allclose(experience["reward"][valid], 0.5, atol=1e-5)
     assert 10 < valid.sum() < 60
 
 
@@ -252,16 +252,16 @@ def test_decisions_are_packed_arrays_with_both_masks(options):
     stuck = 0
     for i in range(3):
         asked = Request(15, (params,), np.array([0.9]), Seeds(i))
-        experience = collector.collect(asked).experience
-        assert experience.obs.dtype == experience.next_obs.dtype == obs_dtype(PLACES)
-        assert experience.valid is None, "all calls are of one step"
-        time, after = experience.obs["inside"]["0"], experience.next_obs["inside"]["0"]
+        experience = collector.collect(asked).batches[""]
+        assert experience["obs"].dtype == experience["next_obs"].dtype == obs_dtype(PLACES)
+        assert experience.get("valid") is None, "all calls are of one step"
+        time, after = experience["obs"]["inside"]["0"], experience["next_obs"]["inside"]["0"]
         assert np.array_equal(after, time + 1)
-        assert np.array_equal(experience.obs_mask, np.stack([time < 4, time <= 1], -1))
+        assert np.array_equal(experience["mask"], np.stack([time < 4, time <= 1], -1))
         found = np.stack([after < 4, after <= 1], -1)
-        found[experience.terminated | ~found.any(-1)] = True
-        assert np.array_equal(experience.next_obs_mask, found)
-        stuck += (experience.truncated & (after == 4)).sum()
+        found[experience["terminated"] | ~found.any(-1)] = True
+        assert np.array_equal(experience["next_mask"], found)
+        stuck += (experience["truncated"] & (after == 4)).sum()
         goes_on = ~experience.ended[:-1]
-        assert np.array_equal(experience.next_obs[:-1][goes_on], experience.obs[1:][goes_on])
+        assert np.array_equal(experience["next_obs"][:-1][goes_on], experience["obs"][1:][goes_on])
     assert stuck

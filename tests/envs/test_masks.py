@@ -232,13 +232,13 @@ def test_rows_have_the_masks_of_what_was_acted_on_and_of_true_successors(
     how = {"at_random": at_random and learner.store == "replay"}
     for i in range(3):
         asked = Request(30, (params,), np.array([0.9]), Seeds(i), **how)
-        experience = collector.collect(asked).experience
-        valid = np.ones((30, 4), bool) if experience.valid is None else experience.valid
+        experience = collector.collect(asked).batches[""]
+        valid = experience.valid_rows
         assert valid.all() == (not isinstance(skill, Late))
-        assert experience.obs_mask[valid].tolist() == wanted(experience.obs[valid]).tolist()
-        goes_on = valid & ~experience.terminated
-        after = experience.next_obs_mask[goes_on]
-        assert after.tolist() == wanted(experience.next_obs[goes_on]).tolist()
+        assert experience["mask"][valid].tolist() == wanted(experience["obs"][valid]).tolist()
+        goes_on = valid & ~experience["terminated"]
+        after = experience["next_mask"][goes_on]
+        assert after.tolist() == wanted(experience["next_obs"][goes_on]).tolist()
         assert experience.ended[valid].sum() > 10
 
 
@@ -335,8 +335,8 @@ def test_each_skill_is_told_the_masks_of_its_own_environments(nested):
     params = learner.acting_params(learner.init([Seeds(0)]), 0.0)
     decides = DecisionCollector(make_engine(EnvSpec(Gate), 4), Acting([(learner, 1)], 4), skills)
     decides.start(Seeds(0))
-    told = decides.collect(Request(60, (params,), np.array([0.9]), Seeds(1))).experience
-    assert told.obs_mask is None, "the selector's masks are of skills"
+    told = decides.collect(Request(60, (params,), np.array([0.9]), Seeds(1))).batches[""]
+    assert told.mask is None, "the selector's masks are of skills"
     policy = HierarchyPolicy(constant(1, 2), skills)
     evaluate(policy, EnvSpec(Gate), episodes=7, num_envs=3)
     for part in masked:

@@ -238,7 +238,7 @@ def test_a_selector_near_its_guide_does_what_the_guide_does(tmp_path):
             **plainly(how),
         )
         run = hierarchy.train(tmp_path / str(len(how)), seed=1, quiet=True)
-        told = [line for line in lines(run.path) if "anchor_kl" in line]
+        told = [line for line in lines(run.path) if "reference_kl" in line]
         found = run.evaluate(20, deterministic=False).skill_steps
         return found["other"] / sum(found.values()), told
 
@@ -247,7 +247,7 @@ def test_a_selector_near_its_guide_does_what_the_guide_does(tmp_path):
     near, told = shares(guide=lambda obs: ["other"] * len(obs), guide_restrict=False,
                         guide_kl=0.02)  # fmt: skip
     assert near > 0.8 > free
-    assert told[-1]["anchor_kl"] < 0.2 * told[0]["anchor_kl"]
+    assert told[-1]["reference_kl"] < 0.2 * told[0]["reference_kl"]
 
 
 def test_a_function_that_is_told_of_calls_hears_of_those_that_were_made(tmp_path):

@@ -10,23 +10,23 @@ import torch
 from skillweave import Together
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.experience import Experience
+from skillweave.experience import Batch
 from skillweave.seeding import Seeds
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.woven_learner import WovenLearner, how_it_acted
 from skillweave.types import Array
 
 
-def rows(valid: Array | None = None, steps: Array | None = None) -> Experience:
+def rows(valid: Array | None = None, steps: Array | None = None) -> Batch:
     """Three rows of two columns, with the rewards 0 to 5."""
     shape, never = (3, 2), np.zeros((3, 2), bool)
     obs = np.zeros((*shape, 1), np.float32)
     reward = np.arange(6, dtype=np.float32).reshape(shape)
     steps = np.ones(shape, np.int64) if steps is None else steps
-    return Experience(obs, np.zeros(shape), reward, steps, never, never, obs, valid=valid)
+    return Batch(obs, np.zeros(shape), reward, steps, never, never, obs, valid=valid)
 
 
-def told(name: str, experience: Experience) -> dict[str, float]:
+def told(name: str, experience: Batch) -> dict[str, float]:
     return {k: float(v) for k, v in how_it_acted(name, experience).items()}
 
 

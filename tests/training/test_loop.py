@@ -166,7 +166,7 @@ class Spy(PPOAlgorithm):
 
     def update(self, state, batch, rng):
         self.versions.append(self.acting_params(state))
-        obs, head = batch.obs.flatten(1, 2), batch.head.flatten(1, 2)
+        obs, head = batch.obs.flatten(1, 2), batch.dist_params.flatten(1, 2)
         with torch.no_grad():
             heads = [self.act(a, obs, None, None)[1] for a in self.versions]
             acted = [torch.allclose(h, head) for h in heads]
