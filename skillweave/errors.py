@@ -52,3 +52,35 @@ class Interrupted(ShortTraceback, KeyboardInterrupt):
 
     def __init__(self, message: str = "") -> None:
         super().__init__(printable(message))
+
+
+KINDS = {
+    kind.__name__: kind
+    for kind in (
+        SkillweaveError,
+        DeclarationError,
+        EnvError,
+        SkillError,
+        PolicyError,
+        TrainingError,
+        RunError,
+        MissingExtra,
+    )
+}
+
+
+def kind_of(error: SkillweaveError) -> str:
+    """Return the name of an error's kind, one of ``KINDS``."""
+    return next(c.__name__ for c in type(error).__mro__ if KINDS.get(c.__name__) is c)
+
+
+def make_error(kind: str, message: str) -> SkillweaveError:
+    """Return an error of the kind with this name."""
+    error = KINDS[kind].__new__(KINDS[kind])
+    SkillweaveError.__init__(error, message)  # MissingExtra takes no message
+    return error
+
+
+def reworded(error: SkillweaveError, message: str) -> SkillweaveError:
+    """Return an error of the same kind with another message."""
+    return make_error(kind_of(error), message)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from skillweave.buffers.held import check_columns
 from skillweave.buffers.ram import check_memory
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.experience import Batch
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array
@@ -35,7 +35,8 @@ class Columns:
         keep_rewards: of calls, keep the reward of every step, so that any γ can be applied.
 
     Raises:
-        SkillweaveError: it is larger than the free memory, or holds not even one row.
+        TrainingError: it is larger than the free memory.
+        DeclarationError: it holds not even one row.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class Columns:
         keep_rewards: bool,
     ) -> None:
         if capacity < num_envs:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"buffer_size is {capacity}; it must be at least num_envs, {num_envs}"
             )
         action = np.dtype(action_dtype)
@@ -145,7 +146,7 @@ class Columns:
         """Go on from what ``written`` gave, of columns that were made with the same arguments.
 
         Raises:
-            SkillweaveError: it is of other settings.
+            RunError: it is of other settings.
             ValueError: a number in it is none that is written here.
         """
         self.data["kind"][:] = NOTHING
@@ -278,7 +279,7 @@ def copy_into(arrays: dict[str, Array], state: dict[str, Tensor]) -> None:
         into, kept = to_tensor(array), state.get(name)
         if kept is None or kept.shape != into.shape or kept.dtype != into.dtype:
             found = "missing" if kept is None else f"{kept.dtype} {tuple(kept.shape)}"
-            raise SkillweaveError(
+            raise RunError(
                 f"the checkpoint's replay buffer does not fit: {name!r} is {found}, where "
                 f"{into.dtype} {tuple(into.shape)} belongs; go on with the settings that it was "
                 "written with, or begin a new run"

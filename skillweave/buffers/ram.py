@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import TrainingError
 
 try:
     import resource
@@ -24,13 +24,13 @@ FILES = {
 
 
 def check_memory(count: int, each: int, what: str, lower: str) -> None:
-    """Raise a SkillweaveError where ``count`` times ``each`` bytes do not fit.
+    """Raise a TrainingError where ``count`` times ``each`` bytes do not fit.
 
     ``what`` begins the message, and ``lower`` names the settings that make it smaller.
     """
     free = free_memory()
     if free is not None and count * each > free:
-        raise SkillweaveError(
+        raise TrainingError(
             f"{what} needs {count * each / 2**30:.1f} GiB, but {free / 2**30:.1f} GiB are free: "
             f"lower {lower} (at most about {free // each:,})"
         )

@@ -52,7 +52,8 @@ def replay_store(
         between: as ``OffPolicyAlgorithm.between`` says.
 
     Raises:
-        SkillweaveError: it is larger than the machine's memory, or holds not even one row.
+        TrainingError: it is larger than the machine's memory.
+        DeclarationError: it holds not even one row.
     """
     return ReplayStore(
         config.buffer_size * (1 if shared else members),
@@ -85,7 +86,8 @@ class ReplayStore:
         device: of the samples.
 
     Raises:
-        SkillweaveError: it is larger than the free memory, or holds not even one row.
+        TrainingError: it is larger than the free memory.
+        DeclarationError: it holds not even one row.
     """
 
     def __init__(
@@ -222,7 +224,7 @@ class ReplayStore:
         """Go on from the ``state`` of a store that was made with the same arguments.
 
         Raises:
-            SkillweaveError: it is of other settings.
+            RunError: it is of other settings.
             ValueError: a number in it is none that is written here.
         """
         self._columns.load(state)

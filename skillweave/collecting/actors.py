@@ -29,7 +29,7 @@ from skillweave.collecting.collector import Collected
 from skillweave.collecting.shipping import packed
 from skillweave.collecting.stationed import COMPUTING, actor_class
 from skillweave.collecting.workers import MakeStanding, WorkerCollectors, WorkerLost, Workers
-from skillweave.errors import SkillweaveError
+from skillweave.errors import TrainingError, make_error
 from skillweave.messages import told
 
 PATIENCE = 1.0
@@ -104,7 +104,7 @@ class Actors:
         """Until an actor has answered.
 
         Raises:
-            SkillweaveError: there was no room for it for too long.
+            TrainingError: there was no room for it for too long.
         """
         began = monotonic()
         while not ray.wait([ref], timeout=LOOK)[0]:
@@ -120,7 +120,7 @@ class Actors:
                 f"it has {total:g}, of which {free:g} are free"
             )
             if self._waited > self.patience:
-                raise SkillweaveError(
+                raise TrainingError(
                     f"{says}, and waiting {self.patience:g} s for more was in vain. Ask for fewer "
                     "collectors, give each less (cpus), or add nodes"
                 )
@@ -158,7 +158,7 @@ class RayCollectors(RayWorkers, WorkerCollectors):
         name: what messages call the environment.
 
     Raises:
-        SkillweaveError: a node has another version of Skillweave or Python, or there is no room.
+        TrainingError: a node has another version of Skillweave or Python, or there is no room.
     """
 
     def __init__(
@@ -220,7 +220,7 @@ class ActorWorker:
         except FULL as full:
             raise _full(full) from full
         if error is not None:
-            raise SkillweaveError(error)
+            raise make_error(*error)
         return answer
 
     def let_close(self) -> None:
@@ -247,8 +247,8 @@ def _put(thing: Any) -> Any:
         raise _full(full) from full
 
 
-def _full(error: Exception) -> SkillweaveError:
-    return SkillweaveError(
+def _full(error: Exception) -> TrainingError:
+    return TrainingError(
         f"the object store of the Ray cluster is full ({told(error)}). Experience goes through it: "
         "give it more memory (ray start --object-store-memory=BYTES), or ask for less at once "
         "(num_envs, n_steps)"
@@ -256,18 +256,18 @@ def _full(error: Exception) -> SkillweaveError:
 
 
 def check_versions(there: dict[str, Any]) -> None:
-    """Raise a SkillweaveError where a node runs something else."""
+    """Raise a TrainingError where a node runs something else."""
     here = {"Skillweave": metadata.version("skillweave"), "Python": platform.python_version()}
     for name, mine in here.items():
         theirs = there[name]
         if theirs is None:
-            raise SkillweaveError(
+            raise TrainingError(
                 f"node {there['node']} of the Ray cluster has no {name}: install the same version "
                 f"on all nodes, {mine}"
             )
         digits = 2 if name == "Python" else None
         if theirs.split(".")[:digits] != mine.split(".")[:digits]:
-            raise SkillweaveError(
+            raise TrainingError(
                 f"node {there['node']} of the Ray cluster has {name} {theirs}, but here is {mine}: "
                 "all nodes need the same"
             )

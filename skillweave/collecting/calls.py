@@ -14,7 +14,7 @@ import numpy as np
 from skillweave.collecting.ends import ENDED, Interruption, Why, skill_step
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.infos import allowed_rows
-from skillweave.errors import SkillweaveError
+from skillweave.errors import PolicyError, SkillError
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked, path_of
 from skillweave.skills.outputs import blame
@@ -81,7 +81,7 @@ class SkillSet:
             age: (n,), steps of the episodes so far, for messages.
 
         Raises:
-            SkillweaveError: in some observation no skill may start.
+            SkillError: in some observation no skill may start.
         """
         if not self.restricts:
             return None
@@ -91,7 +91,7 @@ class SkillSet:
             names = ", ".join(repr(path_of(s)) for s in self.skills)
             where = observed(obs[row])
             where += "" if age is None else f", after {int(age[row])} steps of the episode"
-            raise SkillweaveError(
+            raise SkillError(
                 f"no skill may start in observation {where}: the initiation() of {names} is False "
                 "there. Let at least one start everywhere"
             )
@@ -127,7 +127,7 @@ class SkillSet:
         for i, (skill, policy) in enumerate(zip(self.skills, self.policies, strict=True)):
             for k, v in policy.start(n).items():
                 if v.dtype.kind not in "biuf":  # a checkpoint could not hold it
-                    raise SkillweaveError(
+                    raise PolicyError(
                         f"skill {skill.name!r}: its policy remembers {k!r} as {v.dtype}; a memory "
                         "is an array of numbers whose first axis is the environment"
                     )

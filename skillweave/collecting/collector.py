@@ -13,7 +13,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.restored import check_numbers, opened
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import info_numbers
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.experience import Batch, padded_last_axis, side_by_side
 from skillweave.seeding import Seeds, seed_global_generators
 from skillweave.skills.info_words import info_keys
@@ -142,7 +142,7 @@ class Collector:
             (k,) environments that begin anew, as they did not repeat themselves.
 
         Raises:
-            SkillweaveError: the state is another collector's.
+            RunError: the state is another collector's.
         """
         # Environments that draw from global generators go on otherwise than they began.
         seed_global_generators(Seeds(_checksum(state)) / "global")
@@ -150,7 +150,7 @@ class Collector:
         for name, own in self.kept.items():
             found = kept[name]
             if found.shape != own.shape or found.dtype != own.dtype:
-                raise SkillweaveError(
+                raise RunError(
                     f"the checkpoint's {name!r} of open episodes is {found.dtype} {found.shape}, "
                     f"where {own.dtype} {own.shape} belongs: it is not of this stage, or damaged"
                 )

@@ -18,7 +18,7 @@ from skillweave.collecting.restored import ranges_of, ranges_of_guide
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import told_success
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillError
 from skillweave.experience import Batch
 from skillweave.skills import Skill, path_of
 from skillweave.types import Array, Memory, Step, prefixed
@@ -192,12 +192,12 @@ class DecisionCollector(Collector):
         kept["sums"][:, 2] += 1
 
     def _check_lengths(self) -> None:
-        """Raise a SkillweaveError where a call has run for so long that nothing seems to end it."""
+        """Raise a SkillError where a call has run for so long that nothing seems to end it."""
         steps = self.kept["tau"]
         if steps.max() >= LONGEST_EPISODE:
             row = int(steps.argmax())
             name = path_of(self.skills.skills[int(self._calls["skill"][row])])
-            raise SkillweaveError(
+            raise SkillError(
                 f"skill {name!r} has run for {int(steps[row]):,} steps in environment {row}, and "
                 "neither its termination() nor the episode's end has come: give it max_steps, or "
                 "the hierarchy call_steps"

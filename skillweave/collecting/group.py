@@ -9,7 +9,7 @@ import numpy as np
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected, Collector, joined_collected
 from skillweave.collecting.start_methods import runs_again, why_no_processes
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.notices import notice
 from skillweave.seeding import Seeds
 from skillweave.types import Array, prefixed, unprefixed
@@ -94,11 +94,11 @@ def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
     """The states of each of ``count`` collectors.
 
     Raises:
-        SkillweaveError: it is that of another number of collectors.
+        RunError: it is that of another number of collectors.
     """
     saved = int(state["collectors"][0])
     if saved != count:
-        raise SkillweaveError(
+        raise RunError(
             f"the checkpoint is of {saved} collectors, but there are {count}: a run goes on with "
             "as many as it began with"
         )
@@ -119,7 +119,7 @@ def make_collectors(
         workers: 0 and 1: in this thread.
 
     Raises:
-        SkillweaveError: the environments cannot be shared out equally.
+        DeclarationError: the environments cannot be shared out equally.
     """
     if workers <= 1:
         return Collectors([make(num_envs, 0)], members)
@@ -138,10 +138,10 @@ def share_of(num_envs: int, workers: int, members: int, name: str) -> int:
     """Environments of each of ``workers``; those of every member are shared out equally.
 
     Raises:
-        SkillweaveError: they cannot be.
+        DeclarationError: they cannot be.
     """
     if num_envs % (workers * members):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{name}: num_envs is {num_envs // members}; it must be a multiple of workers, "
             f"{workers}, so that each has as many environments"
         )

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 
 
@@ -22,14 +22,14 @@ class Lengths:
             twice the one before.
 
     Raises:
-        SkillweaveError: they do not rise, or one is less than 1.
+        DeclarationError: they do not rise, or one is less than 1.
     """
 
     def __init__(self, *steps: Any) -> None:
         self.steps = tuple(self._all(steps))
         rising = all(a < b for a, b in pairwise(self.steps))
         if not self.steps or self.steps[0] < 1 or not rising:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._written(steps)}: lengths are environment steps, at least 1, and each is "
                 "more than the one before"
             )
@@ -49,7 +49,7 @@ class Lengths:
             whole = type(value) is int
             between = value is ... and 0 < i < len(steps) - 1
             if not (whole or (between and type(steps[i - 1]) is int)):
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{self._written(steps)}: it holds {short(value)}, which is no whole number; "
                     "write Lengths(1, 4, 16) or Lengths(1, ..., 128)"
                 )

@@ -28,7 +28,7 @@ from skillweave.collecting.workers import (
     Workers,
     environments_of,
 )
-from skillweave.errors import SkillweaveError
+from skillweave.errors import TrainingError, make_error
 from skillweave.messages import told
 from skillweave.notices import notice
 
@@ -75,12 +75,12 @@ class ProcessWorker:
         """Start the process, which makes the collector.
 
         Raises:
-            SkillweaveError: the system does not let it start.
+            TrainingError: the system does not let it start.
         """
         try:
             _in_starter(self._start)
         except OSError as error:
-            raise SkillweaveError(
+            raise TrainingError(
                 f"{self._who} could not be started: {told(error)}. The system limits descriptors "
                 "(ulimit -n), processes (ulimit -u) and memory: raise the limit, or have fewer "
                 "processes, EnvSpec(workers=...)"
@@ -111,7 +111,7 @@ class ProcessWorker:
 
         Raises:
             WorkerLost: the process has ended.
-            SkillweaveError: the process runs, but the task cannot be sent.
+            TrainingError: the process runs, but the task cannot be sent.
         """
         assert self.channel is not None
         self._expect(_described(what, task))
@@ -120,7 +120,7 @@ class ProcessWorker:
         except (BrokenPipeError, ConnectionResetError):
             raise WorkerLost(self._end()) from None
         except Exception as error:
-            raise SkillweaveError(
+            raise TrainingError(
                 f"{self._who}: its next task ({self._asked}) could not be sent: {told(error)}"
             ) from error
 
@@ -129,7 +129,7 @@ class ProcessWorker:
 
         Raises:
             WorkerLost: the process has ended.
-            SkillweaveError: the request failed there.
+            SkillweaveError: the request failed there; the kind is the kind of that error.
         """
         assert self.channel is not None
         pipe = self.channel.pipe
@@ -148,7 +148,7 @@ class ProcessWorker:
         for text in notices:
             notice(text)
         if error is not None:
-            raise SkillweaveError(error)
+            raise make_error(*error)
         return answer
 
     def release(self) -> None:

@@ -18,7 +18,7 @@ import cloudpickle
 import gymnasium as gym
 
 from skillweave.algorithms.config import add_registration, own_registrations
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import told
 
 _FOLDERS: list[str] = []
@@ -46,14 +46,14 @@ def packed(thing: Any, who: str) -> bytes:
         who: what messages call it.
 
     Raises:
-        SkillweaveError: something in it belongs to this process, such as an open file.
+        DeclarationError: something in it belongs to this process, such as an open file.
     """
     with _own_code():
         try:
             known = dict(gym.registry), own_registrations(), tuple(_FOLDERS)
             found: bytes = cloudpickle.dumps((*known, thing))
         except Exception as error:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{who} cannot be sent to another process: {told(error)}. Make what cannot be sent "
                 "where it is used: in the function that makes the environment, or in a method"
             ) from error

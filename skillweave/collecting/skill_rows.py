@@ -14,7 +14,7 @@ from skillweave.collecting.columns import Columns
 from skillweave.collecting.starters import Starters
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import info_rows, told_success
-from skillweave.errors import SkillweaveError
+from skillweave.errors import TrainingError
 from skillweave.experience import Batch
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
@@ -208,7 +208,7 @@ class SkillCollector(Collector):
         self._starters.stop(found)
         self.kept["searched"][waiting] += 1
         if self.kept["searched"].max() > PATIENCE and not self.kept["found"].any():
-            raise SkillweaveError(
+            raise TrainingError(
                 f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps "
                 f"{self._sought()}, so there is nothing to train on; the latest observation was "
                 f"{observed(self.obs[waiting[0]])}. Widen it; or put the skills that lead to where "

@@ -11,7 +11,7 @@ from types import FrameType, ModuleType
 from typing import Any
 
 from skillweave.collecting.shipping import packed
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 
 GUARD = "put what trains inside a block that begins with: if __name__ == '__main__':"
 
@@ -54,7 +54,7 @@ def cannot_be_sent(things: Any) -> str:
         return ""
     try:
         packed(things, "this declaration")
-    except SkillweaveError as error:
+    except DeclarationError as error:
         return str(error)
     return ""
 

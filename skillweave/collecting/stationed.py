@@ -13,9 +13,7 @@ import numpy as np
 import ray
 
 from skillweave.collecting.shipping import unpacked
-from skillweave.collecting.workers import Station
-from skillweave.errors import SkillweaveError
-from skillweave.messages import told
+from skillweave.collecting.workers import SentError, Station, error_to_send
 
 COMPUTING = "torch", "numpy", "gymnasium", "envpool", "mujoco"
 """Packages of which another version may compute other numbers."""
@@ -46,7 +44,7 @@ def actor_class() -> type:
             try:
                 from skillweave.collecting.stationed import Stationed
             except ImportError as error:
-                return str(error), None
+                return ("TrainingError", str(error)), None
             self.stationed = Stationed()
             return self.stationed.make(code, each, number)
 
@@ -67,7 +65,7 @@ class Stationed:
 
     station: Station | None = None
 
-    def make(self, code: bytes, each: int, number: int) -> tuple[str | None, None]:
+    def make(self, code: bytes, each: int, number: int) -> tuple[SentError | None, None]:
         """Make the collector."""
         import torch
 
@@ -78,7 +76,7 @@ class Stationed:
 
         return _tried(made)
 
-    def answer(self, what: str, task: Any) -> tuple[str | None, Any]:
+    def answer(self, what: str, task: Any) -> tuple[SentError | None, Any]:
         """What the station answers."""
         if isinstance(task, dict):  # a state; arrays of the object store cannot be written to
             task = {k: np.array(v) for k, v in task.items()}
@@ -93,10 +91,8 @@ class Stationed:
                 station.collector.close()
 
 
-def _tried(do: Callable[[], Any]) -> tuple[str | None, Any]:
+def _tried(do: Callable[[], Any]) -> tuple[SentError | None, Any]:
     try:
         return None, do()
-    except SkillweaveError as error:
-        return str(error), None
     except BaseException as error:
-        return told(error), None
+        return error_to_send(error), None

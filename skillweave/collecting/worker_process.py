@@ -14,9 +14,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from skillweave.collecting.channel import Channel
-from skillweave.collecting.workers import Station
-from skillweave.errors import SkillweaveError
-from skillweave.messages import told
+from skillweave.collecting.workers import SentError, Station, error_to_send
 from skillweave.notices import Notices, collect_notices
 from skillweave.signals import handle_here
 
@@ -95,10 +93,8 @@ def work(
                 _send(channel, None, station.answer(what, task), notices)
         except _Ended:
             raise
-        except SkillweaveError as error:
-            _send(channel, str(error), None, notices)
         except BaseException as error:
-            _send(channel, told(error), None, notices)
+            _send(channel, error_to_send(error), None, notices)
         finally:
             if station is not None:
                 with suppress(Exception, SystemExit):
@@ -122,7 +118,7 @@ def _tasks(channel: Channel) -> Iterator[tuple[str, Any]]:
         yield what, task
 
 
-def _send(channel: Channel, error: str | None, answer: Any, notices: Notices) -> None:
+def _send(channel: Channel, error: SentError | None, answer: Any, notices: Notices) -> None:
     """Send an answer; end this process if the parent has closed the connection."""
     try:
         channel.send((error, answer, notices.take()))

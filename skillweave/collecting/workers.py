@@ -19,7 +19,8 @@ from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected
 from skillweave.collecting.group import Collectors, joined_states, split_states
 from skillweave.envs.engine import checksums
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, TrainingError, kind_of, reworded
+from skillweave.messages import told
 from skillweave.seeding import Seeds
 from skillweave.types import Array
 
@@ -29,6 +30,17 @@ SNAPSHOT_EVERY = 16
 
 MakeStanding = Callable[[int, int], Any]
 """Makes what stands at a worker and does its tasks, as ``MakeCollector`` makes a collector."""
+
+
+SentError = tuple[str, str]
+"""The kind of an error and its message, as a worker sends them."""
+
+
+def error_to_send(error: BaseException) -> SentError:
+    """Return the kind of an error and its message; the environment's own errors are EnvErrors."""
+    if isinstance(error, SkillweaveError):
+        return kind_of(error), str(error)
+    return "TrainingError" if isinstance(error, MemoryError) else "EnvError", told(error)
 
 
 class WorkerLost(Exception):
@@ -55,7 +67,7 @@ class Worker(Protocol):
 
         Raises:
             WorkerLost: nobody is there any more.
-            SkillweaveError: the collector failed; it says why.
+            SkillweaveError: the collector failed; the kind and the message are those of its error.
         """
         ...
 
@@ -132,8 +144,8 @@ class Workers:
         name: what messages call the environment.
 
     Raises:
-        SkillweaveError: a task failed, or a worker was lost again and again at the same place; the
-            message names it.
+        SkillweaveError: a task failed; the kind is the kind of its error.
+        TrainingError: a worker was lost again and again at the same place; the message names it.
     """
 
     tries = 1
@@ -225,11 +237,11 @@ class Workers:
                 if must:
                     raise self._failed(i, lost) from None
             except SkillweaveError as error:
-                raise SkillweaveError(f"{error} (in worker {i})") from error
+                raise reworded(error, f"{error} (in worker {i})") from error
         return found
 
-    def _failed(self, number: int, lost: WorkerLost) -> SkillweaveError:
-        return SkillweaveError(
+    def _failed(self, number: int, lost: WorkerLost) -> TrainingError:
+        return TrainingError(
             f"{self._name}: worker {number}{self._whose(number)} {lost}, and again when it was "
             "made anew"
         )

@@ -15,7 +15,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.levels import CRITIC, SELECTOR, Inside, Level, woven
 from skillweave.collecting.woven_rows import Rows
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.experience import Batch
 from skillweave.skills import Skill
 from skillweave.types import Array, Step
@@ -64,7 +64,7 @@ class WovenCollector(DecisionCollector):
 
     def like(self, engine: Engine, acting: Acting) -> Any:
         """Not possible: populations of hierarchies that learn as a whole are not built."""
-        raise SkillweaveError("hierarchies that learn as a whole do not evolve")
+        raise DeclarationError("hierarchies that learn as a whole do not evolve")
 
     def _collect(self, request: Request) -> dict[str, Batch]:
         self._rows = Rows(self, request.rows, self.root.all())

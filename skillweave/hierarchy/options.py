@@ -13,7 +13,7 @@ from skillweave.collecting.calls import SkillSet, Why
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import allowed_rows
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.seeding import Seeds
 from skillweave.spaces import unpack
 from skillweave.types import Array, Step
@@ -69,10 +69,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             Observations (N, *obs_shape), and infos.
 
         Raises:
-            SkillweaveError: more than one seed was given.
+            DeclarationError: more than one seed was given.
         """
         if isinstance(seed, list):
-            raise SkillweaveError("OptionsEnv.reset takes one seed for all environments")
+            raise DeclarationError("OptionsEnv.reset takes one seed for all environments")
         self._seed = self._seed + 1 if seed is None else seed
         self._calls = 0
         self._memory = self.skills.start(self.num_envs)
@@ -91,7 +91,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             Observations (N, *obs_shape); rewards, terminated, truncated (N,); ``info``, see above.
 
         Raises:
-            SkillweaveError: an action is no skill, or the skill may not start there.
+            DeclarationError: an action is no skill, or the skill may not start there.
         """
         n = self.num_envs
         skill = np.asarray(actions).reshape(n)
@@ -185,11 +185,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         """One more step of the calls of ``skill`` that still run, in environments ``rows``.
 
         Raises:
-            SkillweaveError: there have been so many that nothing seems to end them.
+            SkillError: there have been so many that nothing seems to end them.
         """
         if turns >= LONGEST_EPISODE:
             name = self._named(skill[rows[0]])
-            raise SkillweaveError(
+            raise SkillError(
                 f"skill {name!r} has run for {turns:,} steps in environment {int(rows[0])}, and "
                 "neither its termination() nor the episode's end has come: give it max_steps, or "
                 "the hierarchy call_steps"
@@ -203,11 +203,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         count = self.skills.choices
         wrong = skill[(skill < 0) | (skill >= count)]
         if len(wrong):
-            raise SkillweaveError(f"action {int(wrong[0])} is no skill: there are {count}")
+            raise DeclarationError(f"action {int(wrong[0])} is no skill: there are {count}")
         if self._mask is not None and not self._mask[np.arange(self.num_envs), skill].all():
             row = int(np.flatnonzero(~self._mask[np.arange(self.num_envs), skill])[0])
             name = self._named(skill[row])
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"skill {name!r} may not start in environment {row}: its initiation() is False "
                 "there; choose among info['action_mask']"
             )

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.runs.command_words import resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
@@ -126,20 +126,20 @@ class TrainCallback:
 
 
 def check_callback(callback: Any) -> None:
-    """Raise a SkillweaveError where ``callback`` is no function of one event, and not None."""
+    """Raise a DeclarationError where ``callback`` is no function of one event, and not None."""
     if callback is None:
         return
     advice = "give a function of one event: def callback(event): ..."
     if not callable(callback):
-        raise SkillweaveError(f"callback is {short(callback)}; {advice}")
+        raise DeclarationError(f"callback is {short(callback)}; {advice}")
     if isinstance(callback, type):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"callback is the class {callback.__name__}; give a function of one event, or an "
             "object of a class with __call__(self, event)"
         )
     if inspect.iscoroutinefunction(callback) or inspect.isgeneratorfunction(callback):
         kind = "a generator" if inspect.isgeneratorfunction(callback) else "an async function"
-        raise SkillweaveError(f"callback is {kind}, which would not run when called; {advice}")
+        raise DeclarationError(f"callback is {kind}, which would not run when called; {advice}")
     try:
         signature = inspect.signature(callback)
     except (TypeError, ValueError):  # of some functions written in C
@@ -147,6 +147,6 @@ def check_callback(callback: Any) -> None:
     try:
         signature.bind(object())
     except TypeError:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"callback takes {signature}, but it is called with one event: def callback(event): ..."
         ) from None

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from skillweave.collecting.collector import FIRST_INFO
-from skillweave.errors import SkillweaveError
+from skillweave.errors import TrainingError
 from skillweave.types import Array
 
 WINDOW = 100  # episodes in the reported means
@@ -123,7 +123,7 @@ def to_numbers(
             continue
         if not bool(finite.all()):
             member = int((~finite).nonzero()[0])
-            raise SkillweaveError(
+            raise TrainingError(
                 f"{name} of member {member} is {float(value[member])} at update {update}: training "
                 "has diverged. Lower learning_rate or max_grad_norm; the last checkpoint is intact"
             )

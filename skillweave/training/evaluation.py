@@ -18,7 +18,7 @@ from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import told_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, PolicyError, SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
@@ -46,7 +46,7 @@ class Evaluation:
     """Scores of whole episodes; ``str()`` is a line for people.
 
     Raises:
-        SkillweaveError: there is not one length for each return, or no episode at all.
+        DeclarationError: there is not one length for each return, or no episode at all.
     """
 
     returns: tuple[float, ...]  # of each episode, in the environment's own reward
@@ -63,12 +63,12 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         if not self.returns or len(self.returns) != len(self.lengths):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{len(self.returns)} returns and {len(self.lengths)} lengths; every episode has "
                 "one of each, and there is at least one episode"
             )
         if self.alone is not None and self.alone not in self.skills:
-            raise SkillweaveError(f"no report of the skill that acted alone, {short(self.alone)}")
+            raise DeclarationError(f"no report of the skill that acted alone, {short(self.alone)}")
 
     @property
     def mean(self) -> float:
@@ -216,8 +216,8 @@ def evaluate(
         Returns, lengths, and what each skill did.
 
     Raises:
-        SkillweaveError: the policy was made for other spaces; or there is no such engine, or no
-            pool.
+        PolicyError: the policy was made for other spaces.
+        DeclarationError: there is no such engine, or no pool.
     """
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
@@ -338,6 +338,6 @@ def _check_spaces(policy: Policy, observation: Any, action: Any, name: str) -> N
         ("action", policy.action_space, action),
     ):
         if not same_space(mine, theirs):
-            raise SkillweaveError(
+            raise PolicyError(
                 f"the policy was made for the {kind} space {mine}, but {name} has {theirs}"
             )

@@ -11,7 +11,7 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any, NotRequired, TypedDict
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.reading import Count, fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
@@ -57,7 +57,7 @@ def save_evaluation(
     One that samples on request (``deterministic=False``) replaces only the one that sampled before.
 
     Raises:
-        SkillweaveError: the disk is full or cannot be written; what was there is intact. Or the
+        RunError: the disk is full or cannot be written; what was there is intact. Or the
             run is one of ``from_hub``.
     """
     must_be_own(run.path)
@@ -98,7 +98,7 @@ def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEv
         deterministic: True: the run's score. False: the evaluation that sampled on request.
 
     Raises:
-        SkillweaveError: the file is damaged, or belongs to another run.
+        RunError: the file is damaged, or belongs to another run.
     """
     path = run.path / _name(deterministic)
     if not path.exists():
@@ -109,7 +109,7 @@ def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEv
     ours = found.get("run") == run.manifest.get("id")
     told = {name.partition("/")[0] for name in found["evaluation"].skills}
     if not ours or not told <= names:  # a ready hierarchy's own skills are not the run's
-        raise SkillweaveError(f"{path} belongs to another run; delete it, and evaluate again")
+        raise RunError(f"{path} belongs to another run; delete it, and evaluate again")
     return SavedEvaluation(
         found["made"], found["seed"], found["deterministic"], found["evaluation"]
     )

@@ -142,7 +142,7 @@ def train(
         Where training stands.
 
     Raises:
-        SkillweaveError: parameters or losses are no longer finite.
+        TrainingError: parameters or losses are no longer finite.
         KeyboardInterrupt: an interrupt came, and a checkpoint is written.
     """
     loop = _Loop(learner, collectors, episodes, seeds, resume_from or Progress(), on_tick)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from skillweave.collecting.collector import RETURN, SUCCESS, Collector
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, reworded
 from skillweave.seeding import Seeds
 from skillweave.training.learner import crossed
 from skillweave.training.scene import Scene
@@ -23,7 +23,7 @@ class PeriodicEvaluation:
         num_envs: of training; there are no more here.
 
     Raises:
-        SkillweaveError: no more environments can be made beside those of training.
+        EnvError: no more environments can be made beside those of training.
     """
 
     def __init__(
@@ -44,10 +44,11 @@ class PeriodicEvaluation:
         try:
             return scene.collector(num_envs, None)
         except SkillweaveError as error:
-            raise SkillweaveError(
+            raise reworded(
+                error,
                 f"{error}. Evaluations during training (eval_every) need {num_envs} more "
                 "beside the environments of training: leave eval_every out, and evaluate the "
-                "finished run"
+                "finished run",
             ) from error
 
     def due(

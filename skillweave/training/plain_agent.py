@@ -30,7 +30,7 @@ class PlainAgent:
     """An environment and who learns its own reward, with a budget in environment steps.
 
     Raises:
-        SkillweaveError: a setting is wrong; the message names it.
+        DeclarationError: a setting is wrong; the message names it.
     """
 
     env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec
@@ -55,7 +55,7 @@ class PlainAgent:
         """Check every setting; training and loading do it again, as attributes may be set.
 
         Raises:
-            SkillweaveError: something is wrong; the message names it.
+            DeclarationError: something is wrong; the message names it.
         """
         check_env(self.env)
         check_algorithm(self.algorithm, "algorithm")
@@ -72,7 +72,7 @@ class PlainAgent:
         """Make the environment once; its observation space and action space.
 
         Raises:
-            SkillweaveError: the algorithm does not fit it.
+            DeclarationError: the algorithm does not fit it.
         """
         env = self.spec.make()
         try:

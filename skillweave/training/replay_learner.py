@@ -246,7 +246,8 @@ def store_of(
         shared: members learn from what all did.
 
     Raises:
-        SkillweaveError: it is larger than the machine's memory, or holds not even one row.
+        TrainingError: it is larger than the machine's memory.
+        DeclarationError: it holds not even one row.
     """
     return replay_store(
         algorithm.config, algorithm.codec, algorithm.observation_space, num_envs, members,

@@ -19,7 +19,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting import levels
 from skillweave.collecting.start_methods import cannot_be_sent, runs_again, why_no_processes
 from skillweave.envs.make import EnvSpec, cores, workers_for
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, EnvError, SkillweaveError, reworded
 from skillweave.messages import short
 from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
@@ -60,12 +60,12 @@ class Target:
             stage: its name, for messages.
 
         Raises:
-            SkillweaveError: it cannot tell, as nobody says which episodes succeed.
+            EnvError: it cannot tell, as nobody says which episodes succeed.
         """
         if not evaluation:
             return None
         if (value := evaluation.get(f"eval_{self.of}")) is None:
-            raise SkillweaveError(
+            raise EnvError(
                 f"stage {stage!r} has target_success, but its environment does not say which "
                 "episodes succeed: info['success'] must be there in an episode's last step"
             )
@@ -82,20 +82,20 @@ def target_of(
         field: what the settings' names begin with.
 
     Raises:
-        SkillweaveError: both are given, or one is no number in its range.
+        DeclarationError: both are given, or one is no number in its range.
     """
     given = {"return": target_return, "success": target_success}
     given = {k: v for k, v in given.items() if v is not None}
     if len(given) > 1:
-        raise SkillweaveError(f"{where}: give target_return or target_success, not both")
+        raise DeclarationError(f"{where}: give target_return or target_success, not both")
     for of, value in given.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) <= LARGEST_FLOAT:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: {field}_{of} is {short(value)}; it must be a number, of float32's range"
             )
         if of == "success" and not 0.0 < value <= 1.0:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: target_success is {short(value)}; it is a share of episodes, more than "
                 "0 and at most 1"
             )
@@ -109,7 +109,7 @@ class Together:
     """Settings of a selector and skills that learn from the same steps.
 
     Raises:
-        SkillweaveError: a value is out of its range.
+        DeclarationError: a value is out of its range.
     """
 
     steps: int | None = None
@@ -235,10 +235,10 @@ class Stage:
 def check_stages(
     entries: Sequence[dict[str, Any]], eval_every: int | None, keep: str = "last"
 ) -> None:
-    """Raise a SkillweaveError where a stage of a manifest could not do what it is to do."""
+    """Raise a DeclarationError where a stage of a manifest could not do what it is to do."""
     alone = any(entry.get("evolution") is None for entry in entries)
     if keep == "best" and eval_every is None and alone:
-        raise SkillweaveError(
+        raise DeclarationError(
             "keep is 'best', but nothing is evaluated while it trains: set eval_every to the "
             "environment steps between evaluations"
         )
@@ -247,30 +247,30 @@ def check_stages(
         try:
             resolve_device(entry["algorithm"].get("device", "cpu"))
         except SkillweaveError as error:
-            raise SkillweaveError(f"{where}: {error}") from error
+            raise reworded(error, f"{where}: {error}") from error
         members = 1 if population is None else population["population"]
         starts, budget = entry["algorithm"].get("learning_starts", 0), entry["budget"] // members
         if budget <= starts:
             each = " for each member" if members > 1 else ""
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: its budget is {budget:,} steps{each}, but it begins to learn only after "
                 f"{starts:,} (learning_starts). Give it more steps, or start earlier"
             )
         for name, own in entry.get("algorithms", {}).items():
             if budget <= (starts := own.get("learning_starts", 0)):
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{where}: its budget is {budget:,} steps, but {name!r} begins to learn only "
                     f"after {starts:,} (learning_starts). Give the stage more steps, or start "
                     "earlier"
                 )
         target = entry.get("target")
         if target is not None and population is not None and target["of"] != "return":
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: it evolves, and members are compared by their mean return, so its "
                 "target must be target_return"
             )
         if target is not None and population is None and eval_every is None:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: it has a target_{target['of']}, but is not evaluated while it trains: "
                 "set eval_every to the environment steps between evaluations"
             )
@@ -291,7 +291,7 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any =
         sent: what processes get, beside the environment.
 
     Raises:
-        SkillweaveError: a number that the user gave does not divide ``num_envs``, or a population
+        DeclarationError: a number that the user gave does not divide ``num_envs``, or a population
             is to be split whose members learn on a GPU.
     """
     alone = any(entry.get("evolution") is None for entry in entries)
@@ -310,7 +310,7 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any =
         if entry.get("evolution") is not None:
             entry["workers"] = workers_of(entry, spec.workers or 1)
             if entry["workers"] > 1 and entry["algorithm"].get("device") == "cuda":
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"stage {entry['name']!r}: device is 'cuda', but the parts of a population "
                     f"learn on processors alone: set device='cpu', or have {ONE}"
                 )
@@ -318,7 +318,7 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any =
             fitting = (k for k in range(workers, 0, -1) if num_envs % k == 0)
             entry["workers"] = next(fitting)
         elif num_envs % workers:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"stage {entry['name']!r}: num_envs is {num_envs}; it must be a multiple of "
                 f"workers, {workers}, so that each has as many environments; or have {ONE}"
             )
@@ -333,7 +333,9 @@ def workers_of(entry: Mapping[str, Any], asked: int) -> int:
 
 
 def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
-    """Raise a SkillweaveError where a stage's replay buffer cannot be made.
+    """Raise a DeclarationError where a stage's replay buffer cannot be made.
+
+    A buffer that is larger than the free memory is a TrainingError.
 
     Args:
         entry: the manifest's; "evolution" says of how many members.
@@ -344,7 +346,7 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
         return
     members = int((entry.get("evolution") or {"population": 1})["population"])
     if members > 1 and entry.get("workers", 1) > 1:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"stage {entry['name']!r}: it evolves, and all members of {type(config).__name__} "
             f"learn from one replay buffer, so they cannot be split into {entry['workers']} parts. "
             f"Have {ONE}, take PPO, or name other stages: evolve={{...}}"
@@ -352,4 +354,4 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
     try:  # what is not written takes no memory
         store_of(algorithm, config.num_envs * members, members, shared=members > 1)
     except SkillweaveError as error:
-        raise SkillweaveError(f"stage {entry['name']!r}: {error}") from error
+        raise reworded(error, f"stage {entry['name']!r}: {error}") from error

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError, reworded
 from skillweave.messages import close_matches
 from skillweave.notices import notice
 from skillweave.reading import shown
@@ -309,7 +309,7 @@ class StageLog:
         lines = [line for line in self.run.metrics() if line.get("stage") == self.entry["name"]]
         told = [line[k] for line in lines for k in ("success", "eval_success") if k in line]
         if wrong := [value for value in told if type(value) not in (int, float)]:
-            raise SkillweaveError(
+            raise RunError(
                 f"{self.run.path / 'metrics.jsonl'}: {self.entry['name']!r} has a share of calls "
                 f"that succeeded of {shown(wrong[0])}, which is no number; remove that line, then "
                 f"{resume_words(self.run)}"
@@ -321,15 +321,15 @@ def resumed(log: StageLog, restore: Callable[[], T]) -> T:
     """What ``restore`` returns, which brings environments back to where a checkpoint left them.
 
     Raises:
-        SkillweaveError: the checkpoint does not hold what belongs there.
+        RunError: the checkpoint does not hold what belongs there.
     """
     try:
         return restore()
     except SkillweaveError as error:
         run = str(log.run.path)
-        raise error if run in str(error) else SkillweaveError(f"{run}: {error}") from error
+        raise error if run in str(error) else reworded(error, f"{run}: {error}") from error
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError) as error:
-        raise SkillweaveError(
+        raise RunError(
             f"{log.run.path}: training cannot go on from the checkpoint of stage "
             f"{log.entry['name']!r}: {error!r}"
         ) from error

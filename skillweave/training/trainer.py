@@ -16,7 +16,7 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
@@ -51,7 +51,7 @@ class OneAgent:
 
     def __init__(self, stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> None:
         if stage.entry.get("evolution") is not None:
-            raise SkillweaveError(f"stage {stage.name!r} evolves: it needs a population to train")
+            raise DeclarationError(f"stage {stage.name!r} evolves: it needs a population to train")
         self.stage, self._open = stage, ExitStack()
         self._make_collectors = make_collectors
 
@@ -277,7 +277,8 @@ def train_stage(
         make_learner: who is to learn, by the stage's entry.
 
     Raises:
-        SkillweaveError: training diverged, or a checkpoint is damaged.
+        TrainingError: training diverged.
+        RunError: a checkpoint is damaged.
     """
     entry = run.stage(stage.name)
     if entry["status"] == "done":

@@ -21,7 +21,7 @@ from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.experience import Reference
 from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
@@ -141,9 +141,7 @@ class WovenAgents(OneAgent):
         if extra:
             told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
             if not ((told >= 0) & (told < 2**53)).all():
-                raise SkillweaveError(
-                    f"{log.run.path}: its counts of rows and updates are out of range"
-                )
+                raise RunError(f"{log.run.path}: its counts of rows and updates are out of range")
             found.counts = dict(zip(parts, told.tolist(), strict=True))
         return found
 

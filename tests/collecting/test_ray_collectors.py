@@ -209,7 +209,8 @@ def test_what_goes_wrong_in_an_actor_is_an_answer():
     assert stationed.answer("start", Seeds(0)) == (None, None)
     error, answer = stationed.answer("collect", next(requests(5)))
     assert answer is None
-    assert re.search("environment [3-5], step 3.*the arm is stuck", error)
+    assert error[0] == "EnvError"
+    assert re.search("environment [3-5], step 3.*the arm is stuck", error[1])
     stationed.close()
 
 
