@@ -67,7 +67,9 @@ def ours(transitions: int, **kwargs: Any) -> dict[str, float]:
 
     def add(obs: Any, true: Any, action: Any, reward: Any, ended: Any) -> None:
         seen, acted = obs[None], action[None]
-        store.add(Batch(seen, acted, reward[None], ones, ended[None], never, true[None]))
+        rows = {"obs": seen, "action": acted, "reward": reward[None], "steps": ones}
+        ends = {"terminated": ended[None], "truncated": never}
+        store.add(Batch(**rows, **ends, next_obs=true[None]))
 
     speed = filled(transitions, add)
     grown = resident() - before

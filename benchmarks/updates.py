@@ -31,7 +31,7 @@ def rollout(members: int, samples: int) -> Rollout:
         discount=torch.full(lead, 0.99),
         next_obs=following,
         last=last,
-        head=torch.randn(*lead, 4, generator=g),
+        dist_params=torch.randn(*lead, 4, generator=g),
     )
 
 

@@ -109,7 +109,7 @@ def rollout(space: gym.Space[Any], seed: int) -> Rollout:
         discount=0.9 * (torch.rand(lead, generator=g) < 0.9),
         next_obs=torch.where(last[..., None], ends, obs.roll(-1, dims=1)),
         last=last,
-        head=torch.randn(*lead, 3 if discrete else 2, generator=g),
+        dist_params=torch.randn(*lead, 3 if discrete else 2, generator=g),
         log_std=None if discrete else torch.zeros(P, 1, 1, 2),
         mask=mask if discrete else None,
         valid=valid,

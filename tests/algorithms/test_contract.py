@@ -356,9 +356,9 @@ class TenSteps(SkillCollector):
     """Says of every row that it took ten steps."""
 
     def _collect(self, request):
-        experience = super()._collect(request)
-        experience.steps[:] = 10
-        return experience
+        batches = super()._collect(request)
+        batches[""]["steps"][:] = 10
+        return batches
 
 
 class LongCalls(Toy):
@@ -506,19 +506,21 @@ def test_learning_begins_at_the_very_probabilities_that_acting_had(kind):
     assert len(algorithm.seen) == 3
     for i, (rollout, params) in enumerate(algorithm.seen):
         views, tr, cut = algorithm.layout.views(params), rollout, algorithm.memory_size // 2
-        assert rollout.starts[:, 1:].any()
-        assert bool(rollout.memory.any()) == (i > 0)  # what went on from the rollout before
-        memory = rollout.memory[..., :cut]
+        assert rollout.episode_start[:, 1:].any()
+        assert bool(rollout.recurrent_state.any()) == (
+            i > 0
+        )  # what went on from the rollout before
+        memory = rollout.recurrent_state[..., :cut]
         inputs = {"vector": tr.obs}
-        head, _ = algorithm.actor_net.sequence(views, inputs, memory, rollout.starts)
-        torch.testing.assert_close(head, rollout.head, rtol=1e-4, atol=1e-6)
-        old, _ = algorithm.head.stats(rollout.head, None, None, tr.action)
+        head, _ = algorithm.actor_net.sequence(views, inputs, memory, rollout.episode_start)
+        torch.testing.assert_close(head, rollout.dist_params, rtol=1e-4, atol=1e-6)
+        old, _ = algorithm.head.stats(rollout.dist_params, None, None, tr.action)
         new, _ = algorithm.head.stats(head, None, None, tr.action)
         torch.testing.assert_close(new, old, rtol=1e-4, atol=1e-5)
         # A version that forgets where episodes began would not agree:
-        never = torch.zeros_like(rollout.starts)
+        never = torch.zeros_like(rollout.episode_start)
         other, _ = algorithm.actor_net.sequence(views, inputs, memory, never)
-        assert (other - rollout.head).abs().max() > 1e-4
+        assert (other - rollout.dist_params).abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("kind", MEMORIES)
@@ -542,14 +544,14 @@ def test_the_value_after_an_end_remembers_what_led_to_it():
     )
     state.params = algorithm.seen[1][1]
     with torch.no_grad():
-        own = tr.memory[..., cut:]
-        out, after = net.sequence(views, {"vector": tr.obs}, own, tr.starts)
+        own = tr.recurrent_state[..., cut:]
+        out, after = net.sequence(views, {"vector": tr.obs}, own, tr.episode_start)
         params = algorithm.learning_params(state)
         value = out[..., 0]
         following = next_values(algorithm, state, params, tr, value, after.flatten(1, 2))
         memory = own
         for t in range(16):
-            memory = memory.masked_fill(tr.starts[:, t, :, None], 0.0)
+            memory = memory.masked_fill(tr.episode_start[:, t, :, None], 0.0)
             now, memory = net.step(views, {"vector": tr.obs[:, t]}, memory)
             later, _ = net.step(views, {"vector": tr.next_obs[:, t]}, memory)
             torch.testing.assert_close(value[:, t], now[..., 0], rtol=1e-4, atol=1e-5)

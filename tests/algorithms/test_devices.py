@@ -101,10 +101,10 @@ def test_ppo_learns_and_acts_where_its_state_is(name, monkeypatch):
     last = torch.zeros(lead, dtype=torch.bool)
     batch = Rollout(
         rows(algorithm, lead), actions(algorithm, lead), torch.zeros(lead), torch.zeros(lead),
-        rows(algorithm, lead), last, head=torch.zeros(*lead, width),
+        rows(algorithm, lead), last, dist_params=torch.zeros(*lead, width),
         mask=torch.ones(*lead, width, dtype=torch.bool) if algorithm.codec.discrete else None,
         log_std=None if algorithm.codec.discrete else torch.zeros(P, 1, 1, width),
-        memory=memory, starts=None if memory is None else last,
+        recurrent_state=memory, episode_start=None if memory is None else last,
         overridden=last,
     )  # fmt: skip
     rng = [Seeds(m).torch() for m in range(P)]
@@ -126,7 +126,8 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
     lead, width = (P, T, B), algorithm.head.width
     batch = Rollout(
         rows(algorithm, lead), actions(algorithm, lead), torch.zeros(lead), torch.zeros(lead),
-        rows(algorithm, lead), torch.zeros(lead, dtype=torch.bool), head=torch.zeros(*lead, width),
+        rows(algorithm, lead), torch.zeros(lead, dtype=torch.bool),
+        dist_params=torch.zeros(*lead, width),
         guide=torch.zeros(*lead, width),
     )  # fmt: skip
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:

@@ -27,7 +27,8 @@ CONFIG = PPO(
 RECURRENT = replace(CONFIG, network=Network((8,), rnn=RNN("gru", 4)))
 NAN = float("nan")
 CELLS = (
-    "obs", "action", "reward", "discount", "next_obs", "last", "mask", "head", "starts",
+    "obs", "action", "reward", "discount", "next_obs", "last", "mask",
+    "dist_params", "episode_start",
 )  # fmt: skip
 
 
@@ -54,9 +55,9 @@ def full(algorithm: PPOAlgorithm, members: int, steps: int = T, columns: int = B
     return Rollout(
         obs, torch.zeros(lead, dtype=torch.int64), torch.randn(lead, generator=g),
         0.9 * ~terminated, next_obs, last, mask,
-        head=torch.randn(*lead, ACTIONS, generator=g),
-        memory=memory if algorithm.memory_size else None,
-        starts=starts if algorithm.memory_size else None,
+        dist_params=torch.randn(*lead, ACTIONS, generator=g),
+        recurrent_state=memory if algorithm.memory_size else None,
+        episode_start=starts if algorithm.memory_size else None,
     )  # fmt: skip
 
 
@@ -80,8 +81,10 @@ def with_gaps(rollout: Rollout, seed: int = 0, more: int = 5) -> Rollout:
     values = {name: getattr(rollout, name) for name in CELLS}
     changed: dict[str, Any] = {k: None if v is None else spread(v) for k, v in values.items()}
     changed["last"] &= valid
-    if rollout.memory is not None:
-        changed["memory"] = torch.cat([rollout.memory, rollout.memory[:, :1] * NAN], 1)
+    if rollout.recurrent_state is not None:
+        changed["recurrent_state"] = torch.cat(
+            [rollout.recurrent_state, rollout.recurrent_state[:, :1] * NAN], 1
+        )
     return replace(rollout, **changed, valid=valid)
 
 
@@ -94,10 +97,12 @@ def packed(rollout: Rollout) -> Rollout:
 
     rows = {k: columns(x) for k in (*CELLS, "valid") if (x := getattr(rollout, k)) is not None}
     last, terminated = rows.pop("last"), rows.pop("discount") == 0.0
-    memory = None if rollout.memory is None else rollout.memory.flatten(0, 1).numpy()
+    memory = (
+        None if rollout.recurrent_state is None else rollout.recurrent_state.flatten(0, 1).numpy()
+    )
     store = RolloutStore(members)
     store.add(Batch(
-        **rows, terminated=terminated, truncated=last & ~terminated, memory=memory,
+        **rows, terminated=terminated, truncated=last & ~terminated, recurrent_state=memory,
         steps=np.ones(last.shape, np.int64),
     ))  # fmt: skip
     found = store.rollout(torch.full((members,), 0.9))
@@ -146,9 +151,9 @@ def test_columns_of_different_lengths_are_learnt_from_row_by_row(config):
     # Column 0 after column 1, in one column: the same rows, as all of them are one minibatch.
     algorithm, state = made(replace(config, batch_size=T * B, update_epochs=3), 1)
     rollout = full(algorithm, 1)
-    if rollout.memory is not None and rollout.starts is not None:
-        rollout.memory[:, 0] = 0.0
-        rollout.starts[:, 0, 0] = True
+    if rollout.recurrent_state is not None and rollout.episode_start is not None:
+        rollout.recurrent_state[:, 0] = 0.0
+        rollout.episode_start[:, 0, 0] = True
     ragged = with_gaps(rollout, more=T)
     ragged.valid.zero_()
     ragged.valid[:, :T, 1:B] = ragged.valid[:, T:, 1] = True

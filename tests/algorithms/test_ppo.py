@@ -69,7 +69,7 @@ def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool =
     log_std = actor.views.get("actor.log_std")
     return Rollout(
         obs, action.unflatten(1, (T, B)), torch.randn(p, T, B, generator=g),
-        0.9 * (~terminated), next_obs, last, mask, head=head.unflatten(1, (T, B)),
+        0.9 * (~terminated), next_obs, last, mask, dist_params=head.unflatten(1, (T, B)),
         log_std=None if log_std is None else log_std[:, None],
     )  # fmt: skip
 
@@ -171,7 +171,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
     cfg = algorithm.config
     data = rollout(algorithm, state, masked=masked)
     tr = data
-    acted, _ = algorithm.head.stats(data.head, data.log_std, tr.mask, tr.action)
+    acted, _ = algorithm.head.stats(data.dist_params, data.log_std, tr.mask, tr.action)
     if late:  # what learns is no longer what acted
         state = algorithm.init([Seeds(7)])
         random_critic(algorithm, state)
@@ -368,7 +368,7 @@ def test_kl_counts_from_the_first_policy_of_an_update():
         heads.append(one.act(one.acting_params(same), tr.obs.flatten(1, 2), None, None)[1])
     taken = tr.action.flatten(1, 2)
     first, second = (algorithm.head.stats(h, None, None, taken)[0] for h in heads)
-    acted = algorithm.head.stats(data.head, None, None, tr.action)[0].flatten(1, 2)
+    acted = algorithm.head.stats(data.dist_params, None, None, tr.action)[0].flatten(1, 2)
     ratio = (second - first).exp()
     expected = ((first - acted).exp() * (ratio - 1.0 - ratio.log())).mean() / 2  # the first is 0
     _, report = algorithm.update(state, data, rngs(0))

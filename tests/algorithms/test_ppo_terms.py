@@ -100,7 +100,7 @@ def rollout_of(algorithm, state, seed=0, **more):
     action, head, _ = algorithm.act(params, obs.flatten(1, 2), None, noise)
     lead = (1, 16, 4)
     return Rollout(
-        obs=obs, action=action.unflatten(1, lead[1:]), head=head.unflatten(1, lead[1:]),
+        obs=obs, action=action.unflatten(1, lead[1:]), dist_params=head.unflatten(1, lead[1:]),
         reward=torch.randn(lead, generator=rng), discount=torch.full(lead, 0.9),
         next_obs=torch.randn(1, 16, 4, 3, generator=rng),
         last=torch.arange(16)[None, :, None].expand(lead) == 15,
@@ -144,7 +144,7 @@ def test_the_tasks_advantage_counts_beside_the_learners_own():
     algorithm = make_algorithm(config, SEEN, gym.spaces.Discrete(2))
     state = algorithm.init([Seeds(0)])
     rollout = rollout_of(algorithm, state)
-    before = rollout.head.softmax(-1)[..., 0].mean()
+    before = rollout.dist_params.softmax(-1)[..., 0].mean()
     # For the task, action 0 is always much better; the learner's own reward is chance.
     rollout.advantage = 20.0 * (1.0 - 2.0 * rollout.action)
     state, _ = algorithm.update(state, rollout, [torch.Generator().manual_seed(1)])

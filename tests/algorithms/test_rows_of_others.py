@@ -40,10 +40,10 @@ def acted(algorithm, state, seed=0):
     last = torch.zeros(1, T, B, dtype=torch.bool)
     last[:, -1] = last[:, 2, 1] = True
     return Rollout(
-        obs=obs, action=torch.stack(actions, 1), head=torch.stack(heads, 1),
+        obs=obs, action=torch.stack(actions, 1), dist_params=torch.stack(heads, 1),
         reward=torch.randn(1, T, B, generator=rng), discount=torch.full((1, T, B), 0.9),
-        next_obs=torch.randn(1, T, B, 3, generator=rng), last=last, memory=memory,
-        starts=None if memory is None else starts,
+        next_obs=torch.randn(1, T, B, 3, generator=rng), last=last, recurrent_state=memory,
+        episode_start=None if memory is None else starts,
         log_std=None if log_std is None else log_std[:, None],
     )  # fmt: skip
 
@@ -102,7 +102,7 @@ def test_each_rollout_that_was_held_counts_by_the_deviation_it_was_acted_with():
     one, two = acted(algorithm, first), acted(algorithm, second, 1)
     both = {
         k: torch.cat([getattr(one, k), getattr(two, k)], 2)
-        for k in ("obs", "action", "reward", "discount", "next_obs", "last", "head")
+        for k in ("obs", "action", "reward", "discount", "next_obs", "last", "dist_params")
     }
     each = torch.cat([x.log_std.expand(1, 1, B, 2) for x in (one, two)], 2)
     whole = Rollout(**both, log_std=each)
@@ -110,7 +110,9 @@ def test_each_rollout_that_was_held_counts_by_the_deviation_it_was_acted_with():
     importance = samples.importance.view(1, T, 2 * B)
     torch.testing.assert_close(importance[..., B:], torch.ones(1, T, B))
     std = [x.log_std[0, 0, 0].exp() for x in (one, two)]
-    log_prob = [torch.distributions.Normal(one.head, s).log_prob(one.action).sum(-1) for s in std]
+    log_prob = [
+        torch.distributions.Normal(one.dist_params, s).log_prob(one.action).sum(-1) for s in std
+    ]
     torch.testing.assert_close(importance[..., :B], (log_prob[1] - log_prob[0]).exp())
 
 
@@ -121,7 +123,7 @@ def test_an_anchor_is_no_distance_from_the_policy_that_it_is_a_copy_of(space, ne
     rollout.reference = Reference(algorithm.acting_params(state), torch.ones(1))
     samples, _ = samples_of(algorithm, state, rollout, Terms.of(algorithm.config, state, rollout))
     assert samples.reference.shape[-1] == algorithm.head.width
-    torch.testing.assert_close(samples.reference.reshape(1, T, B, -1), rollout.head)
+    torch.testing.assert_close(samples.reference.reshape(1, T, B, -1), rollout.dist_params)
 
 
 @pytest.mark.slow

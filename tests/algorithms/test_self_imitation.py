@@ -42,7 +42,7 @@ def rollout(reward, *, action=1, ends=(), members=1, **more):
     obs = torch.rand(*lead[1:], 2, generator=g).expand(*lead, 2)
     return Rollout(
         obs=obs, next_obs=obs, action=torch.full(lead, action), reward=paid, discount=discount,
-        last=last, head=torch.zeros(*lead, 3), **more,
+        last=last, dist_params=torch.zeros(*lead, 3), **more,
     )  # fmt: skip
 
 

@@ -95,7 +95,7 @@ def test_it_learns_what_deciding_is_worth_where_one_decided():
     rollout = Rollout(
         obs=eye[at][None], next_obs=eye[at][None], action=action[None],
         reward=(action[None] == 0).float(), discount=0.0 * one, last=one.bool(),
-        decided=(at != 2)[None],
+        call_start=(at != 2)[None],
     )  # fmt: skip
     for i in range(200):
         rollout.progress = i / 200

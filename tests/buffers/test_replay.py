@@ -48,13 +48,13 @@ def line(rewards, ends="", capacity=100, steps=None, at_once=1, **kwargs) -> Rep
         part = slice(t, t + at_once)
         store.add(
             Batch(
-                obs[part],
-                (np.arange(len(rewards)) % A)[part, None],
-                np.float32(rewards)[part, None],
-                np.array(steps or [1] * len(rewards))[part, None],
-                np.array([[end == "t"] for end in ends])[part],
-                np.array([[end == "l"] for end in ends])[part],
-                after[part],
+                obs=obs[part],
+                action=(np.arange(len(rewards)) % A)[part, None],
+                reward=np.float32(rewards)[part, None],
+                steps=np.array(steps or [1] * len(rewards))[part, None],
+                terminated=np.array([[end == "t"] for end in ends])[part],
+                truncated=np.array([[end == "l"] for end in ends])[part],
+                next_obs=after[part],
             )
         )
         if ends[t] == "c":
@@ -252,9 +252,14 @@ def rows_of(obs, action, after, truncated=None) -> Batch:
     n = len(action)
     no = np.zeros((1, n), bool)
     return Batch(
-        obs[None], action[None], np.zeros((1, n), np.float32), np.ones((1, n), np.int64), no,
-        no if truncated is None else truncated[None], after[None],
-    )  # fmt: skip
+        obs=obs[None],
+        action=action[None],
+        reward=np.zeros((1, n), np.float32),
+        steps=np.ones((1, n), np.int64),
+        terminated=no,
+        truncated=no if truncated is None else truncated[None],
+        next_obs=after[None],
+    )
 
 
 def test_boxes_of_actions_stay_as_they_are_and_choices_become_int64():
@@ -314,8 +319,8 @@ def test_the_store_keeps_copies_and_so_does_its_state():
     for _ in range(7):
         e = world.collect(2)
         store.add(e)
-        e["obs"] += 99
-        e["next_obs"] += 99
+        e["obs"][:] += 99
+        e["next_obs"][:] += 99
     state, before = store.state(), store.sample(9, GAMMA[:1], generators(1))
     for _ in range(5):
         world.add()
@@ -366,8 +371,8 @@ def test_a_million_lunar_lander_transitions_take_at_most_90_megabytes():
         )
         assert store.nbytes <= (43e6 if prioritized else 39e6)
         e = rows_of(np.zeros((16, 8)), np.zeros(16), np.zeros((16, 8)))
-        e["steps"][:], e["mask"] = 2, np.ones((1, 16, 4), bool)
-        store.add(e)
+        e["steps"][:] = 2
+        store.add(e.replace(mask=np.ones((1, 16, 4), bool)))
         assert store.nbytes <= 90e6  # with masks and calls
 
 
@@ -529,8 +534,8 @@ def call(rewards: np.ndarray) -> Batch:
     zeros = np.zeros((len(rewards), 2), np.float32)
     e = rows_of(zeros, np.zeros(len(rewards)), zeros)
     # Who acted discounted by γ = 0: to them a call paid its first reward alone.
-    e["reward"][:], e["steps"][:], e["rewards"] = rewards[:, 0], rewards.shape[1], rewards[None]
-    return e
+    e["reward"][:], e["steps"][:] = rewards[:, 0], rewards.shape[1]
+    return e.replace(rewards=rewards[None])
 
 
 def shared_calls(capacity: int) -> ReplayStore:
@@ -558,8 +563,7 @@ def test_rewards_of_calls_that_are_gone_take_no_room_though_a_column_stands_stil
     store.add(call(np.float32([[1, 2, 4]] * 2)))
     for i in range(200):
         e = call(np.full((2, 1 + i % 7), 0.5, np.float32))
-        e["valid"] = np.array([[False, True]])
-        store.add(e)
+        store.add(e.replace(valid=np.array([[False, True]])))
     assert len(store.state()["rewards"]) <= 64
     s = store.sample(200, torch.tensor([1.0, 0.5]), generators(2))
     first = s.reward[torch.from_numpy(s.index == 0)]

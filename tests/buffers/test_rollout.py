@@ -28,12 +28,17 @@ def experience(rows=T, terminated=(), truncated=(), steps=1, columns=P * B) -> B
         for cell in cells:
             end[cell] = True
     return Batch(
-        obs, 100 * time + column, (10 * time + column).astype(np.float32),
-        np.broadcast_to(steps, (rows, columns)).copy(), *ends, obs + np.float32([0.5, 0]),
-        head=np.repeat(obs[..., :1] + 7, A, -1),
-        memory=np.repeat(np.float32(column[:1].T), M, 1) if rows else None,
-        starts=time == 0,
-    )  # fmt: skip
+        obs=obs,
+        action=100 * time + column,
+        reward=(10 * time + column).astype(np.float32),
+        steps=np.broadcast_to(steps, (rows, columns)).copy(),
+        terminated=ends[0],
+        truncated=ends[1],
+        next_obs=obs + np.float32([0.5, 0]),
+        dist_params=np.repeat(obs[..., :1] + 7, A, -1),
+        recurrent_state=np.repeat(np.float32(column[:1].T), M, 1) if rows else None,
+        episode_start=time == 0,
+    )
 
 
 def rollout(*experiences: Batch, quota=0, **kwargs) -> Rollout:
@@ -100,8 +105,8 @@ def test_rows_of_one_member_are_not_copied():
     store = RolloutStore(1)
     store.add(e)
     r = store.rollout(torch.ones(1))
-    for name in ("obs", "action", "reward", "next_obs", "head", "memory"):
-        assert np.shares_memory(getattr(r, name).numpy(), getattr(e, name))
+    for name in ("obs", "action", "reward", "next_obs", "dist_params", "recurrent_state"):
+        assert np.shares_memory(getattr(r, name).numpy(), e[name])
     assert not e.ended[-1].any()  # and the experience is as it was
 
 
@@ -217,8 +222,8 @@ def test_a_quota_collects_until_every_member_has_enough():
 def test_experiences_lie_side_by_side_with_their_memory():
     """The second is longer, has steps and a mask, which the first has not."""
     first, second = experience(2), experience(3, terminated=[(0, 0)], steps=2)
-    second.mask = np.zeros((3, P * B, A), bool)
-    second.memory += 50
+    second = second.replace(mask=np.zeros((3, P * B, A), bool))
+    second["recurrent_state"][:] += 50
     r = rollout(first, second)
     assert r.valid.tolist() == [[[True] * 4, [True] * 4, [False, False, True, True]]] * P
     assert r.reward[r.valid].tolist() == [
@@ -267,11 +272,9 @@ def test_every_valid_row_is_there_once_in_its_order_and_cut_at_its_end(seed, sha
     expected: list[list[list[tuple]]] = [[] for _ in range(P)]  # by member and column, its rows
     for i, rows in enumerate(shapes):
         e = experience(rows, steps=rng.integers(1, 4, (rows, P * B)))
-        e["reward"] += np.float32(1000 * i)
-        e["terminated"], e["truncated"] = (
-            rng.random((rows, P * B)) < 0.3,
-            rng.random((rows, P * B)) < 0.1,
-        )
+        e["reward"][:] += np.float32(1000 * i)
+        e["terminated"][:] = rng.random((rows, P * B)) < 0.3
+        e["truncated"][:] = rng.random((rows, P * B)) < 0.1
         e = e.replace(valid=rng.random((rows, P * B)) < filled)
         store.add(e)
         for c in range(P * B) if e["valid"].any() else ():  # else it is not kept
@@ -315,6 +318,6 @@ def test_a_state_goes_on_exactly_and_is_a_copy():
     alone = RolloutStore(1)
     alone.add(e)
     state = alone.state()
-    e["recurrent_state"] += 99
-    assert (state["0.memory"] < 99).all()
+    e["recurrent_state"][:] += 99
+    assert (state["0.recurrent_state"] < 99).all()
     assert RolloutStore(1).state() == {}

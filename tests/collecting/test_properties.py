@@ -76,7 +76,7 @@ def half(obs):
 def chained(experiences):
     """How many times a row begins where the one before ended, in all columns together."""
     count = 0
-    for n in range(experiences[0].reward.shape[1]):
+    for n in range(experiences[0].lead[1]):
         before = None
         for e in experiences:
             for t in valid_rows(e, n):
@@ -118,8 +118,9 @@ def test_rows_of_skills_chain_in_every_space(shows, asks, skill):
         learns, params = learner(kind, algorithm)
         collector = SkillCollector(engine, Acting([(learns, 1)], 3), skill)
         collector.start(Seeds(2))
-        found = [collector.collect(r).batches[""] for r in itertools.islice(asked(params, 7), 5)]
-        assert sum(e.spent for e in found) == 105
+        collected = [collector.collect(r) for r in itertools.islice(asked(params, 7), 5)]
+        assert sum(c.steps for c in collected) == 105
+        found = [c.batches[""] for c in collected]
         assert chained(found) > 20
         assert np.concatenate([e.ended for e in found]).sum() > 4
 
@@ -141,11 +142,12 @@ def test_decisions_chain_in_every_space(shows):
         learns, params = learner(chooses, "memory")
         collector = DecisionCollector(engine, Acting([(learns, 1)], 3), calls)
         collector.start(Seeds(2))
-        found = [collector.collect(r).batches[""] for r in itertools.islice(asked(params, 9), 5)]
-        assert sum(e.spent for e in found) == 135
+        collected = [collector.collect(r) for r in itertools.islice(asked(params, 9), 5)]
+        assert sum(c.steps for c in collected) == 135
+        found = [c.batches[""] for c in collected]
         assert chained(found) > 10
         for e in found:
-            valid = ... if e.get("valid") is None else e["valid"]
+            valid = e.valid_rows
             chosen = np.take_along_axis(e["mask"], e["action"][..., None], 2)[..., 0]
             assert chosen[valid].all(), "a skill was chosen that may not start"
 
@@ -260,7 +262,7 @@ def test_joined_collectors_go_on_with_the_search_for_a_start():
         for i, part in enumerate(parts):
             np.testing.assert_array_equal(part.obs, joined.obs[2 * i : 2 * i + 2])
     assert chained(found) > 40
-    valid = np.concatenate([e["valid"] for e in found if e.get("valid") is not None])
+    valid = np.concatenate([e.valid_rows for e in found])
     assert 0 < valid.sum() < valid.size
 
 

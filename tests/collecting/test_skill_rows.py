@@ -177,7 +177,7 @@ def test_the_same_seeds_give_the_same_rows_and_others_do_not(collector, name):
     def play(seed):
         env = collector(name, "CartPole-v1", Late(), acting=lambda n: Choices(n, 2), seed=seed)
         seen = [env.collect(r).batches[""] for r in itertools.islice(requests(9), 3)]
-        assert not seen[0].valid.all()
+        assert not seen[0]["valid"].all()
         return np.concatenate([e["obs"] for e in seen])
 
     first = play(1)
@@ -217,9 +217,10 @@ def test_environments_that_search_act_at_random_while_the_others_go_on(collector
     for t in range(60):
         before, elapsed = env.obs.copy(), env.kept["elapsed"].copy()
         action = np.eye(3, dtype=np.int64)[t % 3]  # one of them stops
-        row = step(env, action).batches[""]
-        assert row.spent == 3
-        valid = np.ones(3, bool) if row.get("valid") is None else row["valid"][0]
+        collected = step(env, action)
+        row = collected.batches[""]
+        assert collected.steps == 3
+        valid = row.valid_rows[0]
         waited, acted = waited + int((~valid).sum()), acted + int(valid.sum())
         for i in range(3):
             ways = [cartpole(before[i], a) for a in (0, 1)]
@@ -249,7 +250,7 @@ def test_a_skills_termination_terminates_and_resets_at_once(collector):
 
     env = collector(skill=UntilTwo())
     for _ in range(5):
-        assert not step(env, np.zeros(3, np.int64)).experience.ended.any()
+        assert not step(env, np.zeros(3, np.int64)).batches[""].ended.any()
         row = step(env, np.zeros(3, np.int64)).batches[""]
         assert row["terminated"].all()
         assert not row["truncated"].any()
@@ -411,7 +412,7 @@ def test_an_initiation_that_holds_somewhere_is_searched_for_ever_after_a_resume_
     Once.open = True
     env = fresh()
     Once.open = False
-    assert step(env, np.zeros(2, np.int64)).batches[""]["valid"] is None
+    assert step(env, np.zeros(2, np.int64)).batches[""].get("valid") is None
     for _ in range(70):
         step(env, np.zeros(2, np.int64))
     again = fresh()

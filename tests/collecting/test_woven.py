@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference_calls import EPISODE, POSITION, T, Walk
-from toy_acting import Choices, requests
+from toy_acting import Choices, requests, valid_rows
 
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.calls import Interruption, SkillSet, Why
@@ -73,7 +73,7 @@ class Values(Learner):
     def these(self, obs, mask, memory):
         found = super().these(obs, mask, memory)
         odd = obs[:, POSITION] % 2 == 1
-        return replace(found, head=odd[:, None] * np.array([0, 1, 2, 2], np.float32))
+        return replace(found, dist_params=odd[:, None] * np.array([0, 1, 2, 2], np.float32))
 
 
 def collector_of(call_steps, margin=None, n=N):
@@ -97,8 +97,7 @@ def asked(rows, paths=("up", "down", "skill_critic")):
 
 def calls_of(experience, n):
     """(choice, steps) of the decisions of a column, in order."""
-    valid = experience["valid"]
-    rows = range(len(experience["reward"])) if valid is None else np.flatnonzero(valid[:, n])
+    rows = valid_rows(experience, n)
     return [(int(experience["action"][t, n]), int(experience["steps"][t, n])) for t in rows]
 
 
@@ -134,14 +133,15 @@ def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
                     continue
                 skill, one = skills.skills[k], slice(n, n + 1)
                 step = Step(
-                    stream.obs[t, one], owner[t, one], stream.next_obs[t, one],
-                    stream.reward[t, one], stream.terminated[t, one], stream.truncated[t, one],
+                    stream["obs"][t, one], owner[t, one], stream["next_obs"][t, one],
+                    stream["reward"][t, one], stream["terminated"][t, one],
+                    stream["truncated"][t, one],
                     np.zeros(1, bool), np.array([elapsed]), {},
                 )  # fmt: skip
-                row, episode = own[k], stream.terminated[t, n] | stream.truncated[t, n]
+                row, episode = own[k], stream["terminated"][t, n] | stream["truncated"][t, n]
                 assert row["reward"][t, n] == np.float32(skill.reward(step)[0])
                 assert row["dist_params"][t, n, 0] == row["action"][t, n]
-                stops = bool(stream.terminated[t, n] or skill.termination(step)[0])
+                stops = bool(stream["terminated"][t, n] or skill.termination(step)[0])
                 assert row["terminated"][t, n] == stops
                 assert over or not (stops or episode)
                 timed_out = skill.max_steps is not None and elapsed >= skill.max_steps

@@ -23,7 +23,9 @@ def rows(valid: Array | None = None, steps: Array | None = None) -> Batch:
     obs = np.zeros((*shape, 1), np.float32)
     reward = np.arange(6, dtype=np.float32).reshape(shape)
     steps = np.ones(shape, np.int64) if steps is None else steps
-    return Batch(obs, np.zeros(shape), reward, steps, never, never, obs, valid=valid)
+    ends = {"terminated": never, "truncated": never}
+    rows = {"obs": obs, "action": np.zeros(shape), "reward": reward, "steps": steps}
+    return Batch(**rows, **ends, next_obs=obs, valid=valid)
 
 
 def told(name: str, experience: Batch) -> dict[str, float]:
