@@ -157,22 +157,19 @@ class Acting:
 
     @torch.inference_mode()
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """Act in environments ``rows`` (n,) only; all arguments are of all N."""
-        if self.members > 1:  # rows of several members: all act, and some of it counts
-            acted = self._act(lambda stack: self._draw(stack, self.each), obs, mask, memory)
-            head, after = acted.dist_params, acted.recurrent_state
-            return Acted(
-                acted.action[rows],
-                None if head is None else head[rows],
-                None if after is None else after[rows],
-            )
-        own = None if memory is None else memory[rows]
-        return self.these(obs[rows], None if mask is None else mask[rows], own)
-
-    @torch.inference_mode()
-    def these(self, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """Act in some environments, where there is one member; all arguments are of these n."""
-        return self._act(lambda stack: self._draw(stack, len(obs)), obs, mask, memory)
+        """Act in environments ``rows`` (n,) only; all arguments are of these."""
+        if self.members == 1:
+            return self._act(lambda stack: self._draw(stack, len(obs)), obs, mask, memory)
+        # Networks of several members take equally many rows of each, so all act, and some count.
+        n = self.each * self.members
+        whole = (_spread(x, rows, n) for x in (obs, mask, memory))
+        acted = self._act(lambda stack: self._draw(stack, self.each), *whole)
+        head, after = acted.dist_params, acted.recurrent_state
+        return Acted(
+            acted.action[rows],
+            None if head is None else head[rows],
+            None if after is None else after[rows],
+        )
 
     def _draw(self, stack: int, each: int) -> Any:
         return self.stacks[stack][0].noise(self._generators[stack], 1, each)[0]
@@ -231,6 +228,15 @@ def _rows(x: Tensor) -> Array:
 
 def _rows_or_none(x: Tensor | None) -> Array | None:
     return None if x is None else _rows(x)
+
+
+def _spread(x: Array | None, rows: Array, n: int) -> Any:
+    """Return arrays of n environments that hold ``x`` in ``rows``, and elsewhere its first row."""
+    if x is None or len(rows) == n:
+        return x
+    whole = np.repeat(x[:1], n, axis=0)
+    whole[rows] = x
+    return whole
 
 
 def _part(x: Array | None, part: slice) -> Array | None:

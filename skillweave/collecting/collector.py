@@ -50,20 +50,16 @@ class Collector:
 
     Args:
         engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
-        acting: the learners; None where only ``like`` is to act.
     """
 
-    def __init__(self, engine: Engine, acting: Acting | None) -> None:
+    def __init__(self, engine: Engine) -> None:
         self.engine, self.num_envs = engine, engine.num_envs
-        n, size = self.num_envs, 0 if acting is None else acting.memory_size
-        if acting is not None:
-            self.acting = acting
+        n = self.num_envs
         self.obs: Array = np.empty(0)
         """(N, *obs_shape), what to act on next."""
         self.kept: dict[str, Array] = {
             "age": np.zeros(n, np.int64),  # steps of the open episode
             "sums": np.zeros((n, 3)),  # of it: return, return of the task, length as the skill's
-            "memory": np.zeros((n, size), np.float32),  # the learner's
         }
         """What is kept of each environment, (N, …) each; changed in place."""
         self.ranges: dict[str, range] = {}
@@ -219,11 +215,6 @@ class Collector:
         self._ended.append(told)
         self._who.append(ids)
 
-    @property
-    def memory(self) -> Array | None:
-        """(N, M), what the learners remember; None: nothing."""
-        return self.kept["memory"] if self.kept["memory"].shape[1] else None
-
 
 def _checksum(state: Mapping[str, Array]) -> int:
     """Return a number that follows from all arrays of a state."""
@@ -233,7 +224,7 @@ def _checksum(state: Mapping[str, Array]) -> int:
     return found
 
 
-_OF_LEARNERS = {"memory", "before"}
+_OF_LEARNERS = {"memory", "before", "player.selector.rnn"}
 """What is kept of the learners' memory: others begin without."""
 
 

@@ -11,14 +11,13 @@ from skillweave.experience import Batch
 from skillweave.types import Array
 
 if TYPE_CHECKING:
-    from skillweave.collecting.collector import Collector
-    from skillweave.collecting.skill_rows import Judged
+    from skillweave.collecting.skill_rows import Judged, SkillCollector
 
 
 class Columns:
     """T rows of N columns, filled from the first row to the last."""
 
-    def __init__(self, collector: Collector, rows: int) -> None:
+    def __init__(self, collector: SkillCollector, rows: int) -> None:
         n, obs = collector.num_envs, collector.obs
         lead, self._at = (rows, n), 0
         self._obs = np.empty((rows, *obs.shape), obs.dtype)

@@ -11,17 +11,18 @@ import numpy as np
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.ends import Why, judged, skill_step
-from skillweave.collecting.guide import ActiveGuide, tell_guide
+from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.guide import ActiveGuide
+from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.open_calls import Decisions, OpenCalls
-from skillweave.collecting.restored import ranges_of, ranges_of_guide
+from skillweave.collecting.player import LearnerActor, Player, Turn
+from skillweave.collecting.restored import ranges_of
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import told_success
 from skillweave.errors import SkillError
 from skillweave.experience import Batch
 from skillweave.skills import Skill, path_of
-from skillweave.types import Array, Memory, Step, prefixed
+from skillweave.types import Array, Step, prefixed
 
 
 class DecisionCollector(Collector):
@@ -50,21 +51,19 @@ class DecisionCollector(Collector):
         guide: ActiveGuide | None = None,
         as_skill: Skill | None = None,
     ) -> None:
-        super().__init__(engine, acting)
+        super().__init__(engine)
         n = self.num_envs
         self.skills, self.keep_rewards = skills, keep_rewards
         self.guide, self.as_skill = guide, as_skill
-        self._watches = skills.watches or guide is not None or as_skill is not None
-        self._calls: Memory = skills.start(n)  # what the skills remember of each environment
-        self._never = np.zeros(n, bool)
-        self.kept |= prefixed("skills", self._calls)
-        self.ranges |= prefixed("skills", ranges_of(skills)) | ranges_of_guide(guide)
-        self.kept["over"] = np.zeros(n, bool)  # there is no call: the selector must decide
-        if guide is not None:
-            self.kept |= guide.start(n)
-            self.kept["chances"] = np.zeros((n, skills.choices), np.float32)  # when it was asked
-        size = self.kept["memory"].shape[1]
-        self._open = OpenCalls(self, skills, size, keep_rewards, guide, self.kept)
+        self.selector = None if acting is None else LearnerActor(acting)
+        self.player = Player(skills, self.selector, guide)
+        self.memory = self.player.start(n)
+        """The player's, (N, …) each; changed in place."""
+        self.kept |= prefixed("player", self.memory)
+        self.ranges |= prefixed("player", ranges_of(self.player))
+        self._open: OpenCalls | None = None
+        if self.selector is not None:
+            self._open = OpenCalls(self, self.player, self.selector, self.memory, keep_rewards)
 
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:
         """The same over other environments."""
@@ -74,12 +73,9 @@ class DecisionCollector(Collector):
 
     def _forget(self, ids: Array) -> None:
         super()._forget(ids)
-        self.skills.forget(self._calls, ids)
-        self.kept["over"][ids] = True
-        self.kept["first"][ids] = True
-        if self.guide is not None:
-            for name, value in self.guide.start(len(ids)).items():
-                self.kept[name][ids] = value
+        self.player.restart(self.memory, ids)
+        if self._open is not None:
+            self._open.kept["first"][ids] = True
 
     def _collect(self, request: Request) -> dict[str, Batch]:
         self._prepare(request)
@@ -87,116 +83,84 @@ class DecisionCollector(Collector):
         for _ in range(request.rows):
             self._step(out)
         self._check_lengths()
-        return {"": out.batch(self._open, self.obs)}
+        return {} if self._open is None else {"": out.batch(self._open, self.obs)}
 
     def _prepare(self, request: Request) -> None:
-        self.acting.begin(request, every_step=False)
-        self._gamma = request.gamma.astype(np.float64).repeat(self.acting.each)
-        self._rng, self._greedy = (request.seeds / "skills").numpy(), request.greedy
+        if self.selector is not None:
+            self.selector.acting.begin(request, every_step=False)
+            self._gamma = request.gamma.astype(np.float64).repeat(self.selector.acting.each)
+        rng = (request.seeds / "skills").numpy()
+        self._turn = Turn(request.greedy, rng, self.kept["age"])
 
     def _step(self, out: Decisions | None = None) -> None:
         """One step of every environment."""
-        rows = np.flatnonzero(self.kept["over"])
-        if len(rows):
-            self._decide(rows)
         obs, mask = self.obs, self.engine.mask()
+        if self.selector is not None:
+            self.selector.latest = None
         action = self._act(obs, mask)
+        if self._open is not None:
+            self._open.begin()
         raw = self.engine.step(action)
-        seen = self._seen(obs, action, raw) if self._watches else None
-        why = self.skills.observe(self._calls, self._all, seen)
-        counts = raw if self.as_skill is None else self._judged(self.as_skill, seen, raw, why)
-        self._count(counts)
+        self.kept["age"] += 1
+        step = Step(
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            np.zeros(self.num_envs, bool), self.kept["age"].copy(), raw.info,
+        )  # fmt: skip
+        end = self.player.observe(self.memory, self._all, step)
+        counts = raw if self.as_skill is None else self._judged(self.as_skill, step, end)
+        self.kept["sums"][:, 0] += counts.reward
+        self.kept["sums"][:, 2] += 1
+        if self._open is not None:
+            self._open.count(self._all, counts.reward, self._gamma)
         ended = counts.terminated | counts.truncated
-        why[ended] = Why.EPISODE
-        if self.guide is not None and seen is not None:
-            tell_guide(self.guide, self.kept, self.skills, self._calls, seen, why)
-        if out is not None and seen is not None:
-            self._record(seen, counts, mask, why)
+        end[ended] = CallEnd.EPISODE
+        if out is not None:
+            self._record(step, counts, mask, end)
         self.obs = raw.next_obs
-        ids = np.flatnonzero(why != Why.RUNNING)
+        ids = np.flatnonzero(end != CallEnd.RUNNING)
+        if not len(ids):
+            return
+        if out is not None and self._open is not None:
+            out.put(ids, self._row(self._open, ids, counts))
+        if self._open is not None:
+            self._open.kept["first"][ids] = False
+        ids = np.flatnonzero(ended)
         if len(ids):
-            self.kept["over"][ids] = True
-            if out is not None:
-                out.put(ids, self._row(ids, counts))
-            self.kept["first"][ids] = False
-            if ended.any():
-                ids = np.flatnonzero(ended)
-                success = told_success(raw.info, self.num_envs)
-                succeeded = None if success is None else success[ids]
-                self._tell(ids, raw.info, succeeded, task=False)
-                self._begin_anew(ids)
+            success = judge(None, step).success
+            succeeded = None if success is None else success[ids]
+            self._tell(ids, raw.info, succeeded, task=False)
+            self._begin_anew(ids)
 
     def _act(self, obs: Array, mask: Array | None) -> Array:
-        """What the skills that are called do in all environments."""
-        return self.skills.act(self._calls, self._all, obs, self._rng, mask)
+        """Return the actions of the running skills, after decisions where calls have ended."""
+        return self.player.act(self.memory, self._all, obs, mask, self._turn)
 
-    def _seen(self, obs: Array, action: Array, raw: RawStep) -> Step:
-        """The step as skills are shown it."""
-        return Step(
-            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            self._never, self._calls["elapsed"], raw.info,
-        )  # fmt: skip
+    def _judged(self, skill: Skill, step: Step, end: Array) -> RawStep:
+        """Return a step with the reward and the ends of the skill that all of it is.
 
-    def _judged(self, skill: Skill, seen: Step | None, raw: RawStep, why: Array) -> RawStep:
-        """A step with the reward and the ends of the skill that all of it is.
-
-        Where a call is over (``why``) and no skill may start, it ends, too; its value goes on.
+        Where a call has ended and no skill may start, its own call ends, too; its value goes on.
         """
-        assert seen is not None
-        step = skill_step(seen, self._all, self.kept["age"] + 1, skill.max_steps)
-        reward, terminated = judged(skill, step, self._all)
-        truncated = raw.truncated | step.timed_out
+        outcome = judge(skill, seen_by(skill, step, step.elapsed), self._all)
+        terminated, truncated = outcome.terminated, step.truncated | outcome.truncated
         if self.skills.restricts:
-            waits = np.flatnonzero(why != Why.RUNNING)
-            truncated[waits] |= ~self.skills.startable(raw.next_obs[waits]).any(axis=1)
+            waits = np.flatnonzero(end != CallEnd.RUNNING)
+            truncated[waits] |= ~self.skills.startable(step.next_obs[waits]).any(axis=1)
         truncated &= ~terminated
-        return RawStep(raw.next_obs, reward, terminated, truncated, raw.info)
+        return RawStep(step.next_obs, outcome.reward, terminated, truncated, dict(step.info))
 
-    def _row(self, ids: Array, raw: RawStep) -> dict[str, Array]:
-        """The decisions of environments ``ids`` (k,), whose calls are over."""
-        return self._open.row(ids, raw.terminated[ids], raw.truncated[ids], raw.next_obs[ids])
+    def _row(self, calls: OpenCalls, ids: Array, raw: RawStep) -> dict[str, Array]:
+        """Return the decisions of environments ``ids`` (k,), whose calls are over."""
+        return calls.row(ids, raw.terminated[ids], raw.truncated[ids], raw.next_obs[ids])
 
-    def _record(self, step: Step, raw: RawStep, mask: Array | None, why: Array) -> None:
+    def _record(self, step: Step, raw: RawStep, mask: Array | None, end: Array) -> None:
         """Keep the step for skills that learn; here they do not."""
-
-    def _decide(self, rows: Array) -> None:
-        """The selector chooses a skill in environments ``rows`` (k,), and its call begins."""
-        kept, here = self.kept, self.obs[rows]
-        allowed = None
-        if "allowed" in kept:
-            kept["allowed"][rows] = self._allowed(rows, here)
-            allowed = kept["allowed"]
-        acted = self.acting.some(rows, self.obs, allowed, self.memory)
-        choice = np.asarray(self.acting.to_env(acted.action))
-        kept["over"][rows] = False
-        self._open.begin(rows, here, choice, acted, kept["memory"][rows])
-        if acted.recurrent_state is not None:
-            kept["memory"][rows] = acted.recurrent_state
-        self.skills.begin(self._calls, rows, choice)
-
-    def _allowed(self, rows: Array, here: Array) -> Array:
-        """Choices that are allowed in environments ``rows`` (k,), in observations ``here``."""
-        may = self.skills.mask(here, self.kept["age"][rows])
-        if self.guide is None:
-            assert may is not None
-            return may
-        may = self.skills.startable(here) if may is None else may
-        return self.guide.mask(self.kept, rows, here, may, self._greedy, self._rng)
-
-    def _count(self, raw: RawStep) -> None:
-        """Add a step to the open calls and episodes."""
-        kept = self.kept
-        self._open.count(slice(None), raw.reward, self._gamma)
-        kept["age"] += 1
-        kept["sums"][:, 0] += raw.reward
-        kept["sums"][:, 2] += 1
 
     def _check_lengths(self) -> None:
         """Raise a SkillError where a call has run for so long that nothing seems to end it."""
-        steps = self.kept["tau"]
+        steps = self.memory["elapsed"]
         if steps.max() >= LONGEST_EPISODE:
             row = int(steps.argmax())
-            name = path_of(self.skills.skills[int(self._calls["skill"][row])])
+            name = path_of(self.skills.skills[int(self.memory["skill"][row])])
             raise SkillError(
                 f"skill {name!r} has run for {int(steps[row]):,} steps in environment {row}, and "
                 "neither its termination() nor the episode's end has come: give it max_steps, or "

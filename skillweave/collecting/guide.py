@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.calls import SkillSet
 from skillweave.types import Array, Memory, Step, prefixed, unprefixed
 
 SMOOTHED = 0.05
@@ -21,7 +19,7 @@ class LastCall:
     """How the last call of n environments ended; where one still runs, that is said."""
 
     skill: Array  # (n,) int64, its place in the hierarchy's list; −1: the episode has just begun
-    why: Array  # (n,) int8, ``Why`` it ended
+    why: Array  # (n,) int8, ``CallEnd`` it ended
     succeeded: Array  # (n,) bool: by the skill's success(), where it has none by its own end
 
 
@@ -119,23 +117,6 @@ class ActiveGuide:
             memory[f"guide.{k}"][rows] = v
         return chances.repeat(lengths, axis=1) / np.float32(lengths)
 
-    def mask(
-        self,
-        kept: Memory,
-        rows: Array,
-        obs: Array,
-        may: Array,
-        greedy: bool,
-        rng: np.random.Generator,
-    ) -> Array:
-        """Choices that are allowed at decisions of a collector, (k, choices) bool.
-
-        How likely its own choices are is left in ``kept["chances"]``.
-        """
-        chances = self.ask(kept, rows, obs, may, greedy, rng)
-        kept["chances"][rows] = chances
-        return chances > 0.0 if self.restricts else may
-
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
         """What is left of choices (k, choices) bool in environments ``rows`` (k,), as far as known.
 
@@ -147,25 +128,11 @@ class ActiveGuide:
             return may
         return may & allowed.repeat(may.shape[1] // allowed.shape[1], axis=1)
 
-    def watch(self, memory: Memory, step: Step, last: LastCall) -> None:
-        """Tell it of a step of all environments."""
-        after = self.selector.watch(unprefixed("guide", memory), step, last)
-        for k, v in after.items():
-            memory[f"guide.{k}"][:] = v
-
-
-def tell_guide(
-    guide: ActiveGuide, kept: Memory, skills: SkillSet, calls: Memory, step: Step, why: Array
-) -> None:
-    """Tell a collector's guide of a step of all environments, and how calls ended with it.
-
-    Args:
-        kept: with the guide's memory, and ``age``: it sees the time of the episode.
-        calls: what the skills remember.
-    """
-    succeeded = skills.succeeded(calls, np.arange(len(why)), step, why)
-    last = LastCall(calls["skill"], why, succeeded)
-    guide.watch(kept, replace(step, elapsed=kept["age"]), last)
+    def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
+        """Show it a step of environments ``rows`` (k,)."""
+        own = {k: v[rows] for k, v in unprefixed("guide", memory).items()}
+        for k, v in self.selector.watch(own, step, last).items():
+            memory[f"guide.{k}"][rows] = v
 
 
 def as_logits(chances: Array, may: Array) -> Array:
@@ -179,28 +146,3 @@ def as_logits(chances: Array, may: Array) -> Array:
     mixed = (1.0 - SMOOTHED) * chances + SMOOTHED * uniform
     found: Array = np.log(np.maximum(mixed, 1e-8)).astype(np.float32)
     return found
-
-
-class AskedElsewhere:
-    """Stands where ``Acting`` does, where a guide decides: one choice is allowed, and it is made.
-
-    Args:
-        num_envs: N.
-    """
-
-    memory_size, members, keeps_head = 0, 1, False
-
-    def __init__(self, num_envs: int) -> None:
-        self.each = num_envs
-
-    def begin(self, request: Request, every_step: bool = True) -> None:
-        """There is nothing to make ready."""
-
-    def to_env(self, action: Array) -> Array:
-        """Choices are what they are."""
-        return action
-
-    def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """What is allowed in environments ``rows`` (n,); all else is of all N."""
-        assert mask is not None
-        return Acted(mask[rows].argmax(axis=1), None, None)

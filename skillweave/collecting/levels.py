@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.acting import Acted, Acting
-from skillweave.collecting.calls import Interruption, SkillSet, skills_below
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.ends import ENDED, Why
+from skillweave.collecting.ends import CallEnd, Interruption
+from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.open_calls import Decisions, OpenCalls
+from skillweave.collecting.player import LearnerActor, Player
 from skillweave.experience import Batch
 from skillweave.skills import Skill
-from skillweave.types import Array, Memory, Memoryless, Policy, unprefixed
+from skillweave.types import Array, Memory, Policy, unprefixed
 
 SELECTOR = "selector"
 """What a selector is named, after the names of the hierarchies that it is in."""
@@ -23,92 +25,52 @@ CRITIC = "skill_critic"
 """What a critic of skills is named, in the same way."""
 
 
-class LearningSkill(Memoryless):
-    """A skill that learns, or a selector, as a policy; what it did last is kept.
-
-    Args:
-        acting: its learner, one member.
-    """
-
-    def __init__(self, acting: Acting) -> None:
-        ((algorithm, _),) = acting.stacks
-        self.acts, self.observation_space = acting, algorithm.observation_space
-        self.action_space = algorithm.action_space
-        self.acted: Acted | None = None
-        """What it did in the latest step, in the environments where it was asked."""
-        self.mask: Array | None = None  # what was allowed there
-        self.before: Array | None = None  # what it remembered before
-
-    def start(self, n: int) -> Memory:
-        """Zeros, (n, M), where the network has a memory."""
-        size = self.acts.memory_size
-        return {"rnn": np.zeros((n, size), np.float32)} if size else {}
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Actions (n, …) in the environment's units, as the request says."""
-        self.mask, self.before = mask, memory.get("rnn")
-        self.acted = self.acts.these(obs, mask, self.before)
-        after = self.acted.recurrent_state
-        return self.acts.to_env(self.acted.action), {} if after is None else {"rnn": after}
-
-
 @dataclass(frozen=True)
-class Inner:
-    """Stands for a skill that is a hierarchy, and learns, before it is known who acts in it."""
+class UntrainedHierarchy:
+    """Stands for the policy of a skill that is a hierarchy and learns."""
 
     skills: SkillSet
     """Those that learn have any policy."""
     selector: Policy | None
     """None: it learns."""
-    make: Callable[[Any, SkillSet], Any]
-    """The policy of a selector with its skills."""
+    guide: ActiveGuide | None = None
+    """A ready selector beside it."""
 
 
-def woven(
+def with_learners(
     skills: SkillSet, learners: Mapping[str, Acting], margins: Mapping[str, float], path: str = ""
 ) -> SkillSet:
-    """The skills, in which those act that learn.
+    """Return the skills with their learners, and hierarchies that learn, as policies.
 
     Args:
         learners: by their paths, ``inner/skill`` for example, all who learn below the selector.
-        margins: by the paths of critics, those that say where calls are to be cut.
+        margins: by the paths of critics, those that end calls.
         path: of these skills, ``inner/`` for example.
     """
 
     def policy_of(skill: Skill, policy: Any) -> Any:
         name = path + skill.name
         if name in learners:
-            return LearningSkill(learners[name])
-        if not isinstance(policy, Inner):
+            return LearnerActor(learners[name])
+        if not isinstance(policy, UntrainedHierarchy):
             return policy
         chooser = learners.get(f"{name}/{SELECTOR}")
-        selector = policy.selector if chooser is None else LearningSkill(chooser)
-        return policy.make(selector, woven(policy.skills, learners, margins, f"{name}/"))
+        selector = policy.selector if chooser is None else LearnerActor(chooser)
+        below = with_learners(policy.skills, learners, margins, f"{name}/")
+        return Player(below, selector, policy.guide)
 
     pairs = zip(skills.skills, skills.policies, strict=True)
-    critic, cuts = path + CRITIC, None
+    critic, interruption = path + CRITIC, None
     if critic in margins:
-        cuts = Interruption(_worth(learners[critic]), margins[critic])
-    return replace(
-        skills,
-        policies=tuple(policy_of(*p) for p in pairs),
-        interruption=cuts,
-        reflexes_apart=any(name.startswith(path) for name in learners),
-    )
+        interruption = Interruption(_worth(learners[critic]), margins[critic])
+    policies = tuple(policy_of(*pair) for pair in pairs)
+    return replace(skills, policies=policies, interruption=interruption)
 
 
 def _worth(critic: Acting) -> Callable[[Array], Array]:
     def worth(obs: Array) -> Array:
-        """What each skill is worth in observations (n, …), and deciding anew, (n, S + 1)."""
-        found = critic.these(obs, None, None).dist_params
+        """Return the values of skills in observations (n, …), and of a new decision, (n, S + 1)."""
+        found = critic.some(np.arange(len(obs)), obs, None, None).dist_params
         assert found is not None
         return found
 
@@ -120,11 +82,11 @@ class Level:
 
     Args:
         collector: in which they act.
-        memory: of the root's skills.
-        skills: of this level.
+        memory: of the root's player.
+        player: of this level.
         learners: by path, who learns.
         path: of these skills: empty, or ``inner/`` for example.
-        prefix: of what they remember, in the memory of the root's skills.
+        prefix: of its memory in that of the root.
         first: the number of the first leaf.
     """
 
@@ -132,30 +94,30 @@ class Level:
         self,
         collector: Collector,
         memory: Memory,
-        skills: SkillSet,
+        player: Player,
         learners: Mapping[str, Acting],
         path: str = "",
         prefix: str = "",
         first: int = 1,
     ) -> None:
-        self.skills, self.path, self.prefix = skills, path, prefix
+        self.player, self.skills, self.path, self.prefix = player, player.skills, path, prefix
         self.has_critic = path + CRITIC in learners
-        self.below: dict[int, Inside] = {}
+        self.below: dict[int, NestedLevel] = {}
         self.leaves: dict[int, int] = {}  # by the skill's number, the leaf's, from 1
-        self.learning: dict[int, LearningSkill] = {}
+        self.learning: dict[int, LearnerActor] = {}
         at: int = first
-        for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
+        for i, (skill, actor) in enumerate(zip(self.skills.skills, player.actors, strict=True)):
             name = path + skill.name
-            below = skills_below(policy)
-            if any(k.startswith(f"{name}/") for k in learners) and below is not None:
-                self.below[i] = Inside(
-                    collector, memory, below, learners, f"{name}/", f"{prefix}{i}.", at, policy
+            learns = any(k.startswith(f"{name}/") for k in learners)
+            if learns and isinstance(actor, Player):
+                self.below[i] = NestedLevel(
+                    collector, memory, actor, learners, f"{name}/", f"{prefix}{i}.", at
                 )
                 at = self.below[i].end
                 continue
             self.leaves[i], at = at, at + 1
-            if isinstance(policy, LearningSkill):
-                self.learning[i] = policy
+            if isinstance(actor, LearnerActor):
+                self.learning[i] = actor
         self.end: int = at
         """The number after that of the last leaf."""
 
@@ -183,7 +145,7 @@ class Level:
                 yield i, rows
 
 
-class Inside(Level):
+class NestedLevel(Level):
     """The skills of a skill that is a hierarchy, and the decisions of its selector.
 
     Where the hierarchy is called again at once, after a limit, the call that its selector began
@@ -195,27 +157,25 @@ class Inside(Level):
         self,
         collector: Collector,
         memory: Memory,
-        skills: SkillSet,
+        player: Player,
         learners: Mapping[str, Acting],
         path: str,
         prefix: str,
         first: int,
-        policy: Any,
     ) -> None:
-        super().__init__(collector, memory, skills, learners, path, prefix, first)
-        found = policy.selector
-        self.selector = found if isinstance(found, LearningSkill) else None
+        super().__init__(collector, memory, player, learners, path, prefix, first)
+        found = player.selector
+        self.selector = found if isinstance(found, LearnerActor) else None
         """None: it is ready."""
         if self.selector is not None:
-            size = self.selector.acts.memory_size
             own = unprefixed(prefix.removesuffix("."), memory)
-            self.calls = OpenCalls(collector, skills, size, False, policy.guide, own, path)
+            self.calls = OpenCalls(collector, player, self.selector, own, prefix=path)
             self.acted = np.zeros(collector.num_envs, bool)  # in the step before
             self.open = np.zeros(collector.num_envs, bool)  # a call of its selector is under way
             collector.kept |= {f"{path}acted": self.acted, f"{path}open": self.open}
         self.out = Decisions(collector.num_envs)
 
-    def decided(self, memory: Memory, obs: Array, ids: Array) -> None:
+    def decided(self, obs: Array, ids: Array) -> None:
         """In environments ``ids`` (k,) it acts; where its selector has decided, that is kept.
 
         Args:
@@ -229,15 +189,9 @@ class Inside(Level):
         if len(gone):
             cut = np.ones(len(gone), bool)
             self._close(gone, ~cut, cut, obs[gone])
-        new = ids[memory[f"{self.prefix}elapsed"][ids] == 0]
+        new = self.calls.begin()
         if len(new):
-            acted = self.selector.acted
-            assert acted is not None
             self.calls.kept["first"][new] = ~self.acted[new]
-            if "allowed" in self.calls.kept:
-                self.calls.kept["allowed"][new] = self.selector.mask
-            choice = np.asarray(self.selector.acts.to_env(acted.action))
-            self.calls.begin(new, obs[new], choice, acted, self.selector.before)
             self.open[new] = True
         self.acted[:] = here
 
@@ -246,16 +200,17 @@ class Inside(Level):
         out, self.out = self.out, Decisions(len(obs))
         return out.batch(self.calls, obs)
 
-    def ends(self, memory: Memory, ids: Array, why: Array) -> Array:
-        """(k,) why the calls of its skills are over, for what they learn.
+    def ends(self, memory: Memory, ids: Array, end: Array) -> Array:
+        """Return why the calls of its skills ended, for what they learn, (k,).
 
         Args:
-            why: the hierarchy's own calls are over. It cuts those below it, unless it is called
+            end: why the hierarchy's own calls ended. It cuts those below it, unless it is called
                 again at once.
         """
-        found = memory[self.prefix + ENDED][ids].copy()
-        cut = (found == Why.RUNNING) & (why != Why.RUNNING)
-        found[cut] = np.where(why[cut] == Why.EPISODE, np.int8(Why.EPISODE), np.int8(Why.LIMIT))
+        found: Array = memory[f"{self.prefix}end"][ids]
+        cut = (found == CallEnd.RUNNING) & (end != CallEnd.RUNNING)
+        episode = end[cut] == CallEnd.EPISODE
+        found[cut] = np.where(episode, np.int8(CallEnd.EPISODE), np.int8(CallEnd.LIMIT))
         return found
 
     def learn_from(

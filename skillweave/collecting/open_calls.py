@@ -6,10 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from skillweave.collecting.acting import Acted
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.guide import ActiveGuide, as_logits
+from skillweave.collecting.guide import as_logits
+from skillweave.collecting.player import LearnerActor, Player
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, padded_last_axis
 from skillweave.types import Array, Memory
@@ -22,27 +21,26 @@ class OpenCalls:
 
     Args:
         collector: of these environments.
-        skills: what the selector chooses from.
-        memory_size: of the selector's network.
+        player: whose selector it is.
+        selector: the learner that chooses.
+        memory: the player's.
         keep_rewards: of each call, keep the reward of every step.
-        guide: a ready selector that was asked at each decision.
-        memory: where the guide remembers, with ``chances``: how likely its choices were.
         prefix: of all names, where a collector has several selectors.
     """
 
     def __init__(
         self,
         collector: Collector,
-        skills: SkillSet,
-        memory_size: int,
+        player: Player,
+        selector: LearnerActor,
+        memory: Memory,
         keep_rewards: bool = False,
-        guide: ActiveGuide | None = None,
-        memory: Memory | None = None,
         prefix: str = "",
     ) -> None:
         n = collector.num_envs
-        self.skills, self.memory_size, self.keep_rewards = skills, memory_size, keep_rewards
-        self.guide, self._memory = guide, memory or {}
+        self.player, self.selector, self.keep_rewards = player, selector, keep_rewards
+        self.memory_size = selector.acting.memory_size
+        self._memory = memory
         self._collector, self._prefix, self._all = collector, prefix, np.arange(n)
         self.kept: dict[str, Array] = {
             "first": np.zeros(n, bool),  # the selector's memory was empty before this call
@@ -50,36 +48,36 @@ class OpenCalls:
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
             "choice": np.zeros(n, np.int64),
-            "before": np.zeros((n, memory_size), np.float32),  # the selector's memory
+            "before": np.zeros((n, self.memory_size), np.float32),  # the selector's memory
         }
-        if skills.restricts or guide is not None:
-            self.kept["allowed"] = np.ones((n, skills.choices), bool)  # when it decided
+        if player.restricts or player.guide is not None:
+            self.kept["allowed"] = np.ones((n, player.skills.choices), bool)  # when it decided
         collector.kept |= {prefix + k: v for k, v in self.kept.items()}
-        collector.ranges[f"{prefix}choice"] = range(skills.choices)
+        collector.ranges[f"{prefix}choice"] = range(player.skills.choices)
 
-    def begin(
-        self, ids: Array, obs: Array, choice: Array, acted: Acted, before: Array | None
-    ) -> None:
-        """Decisions in environments ``ids`` (k,); all else has a row for each of these.
-
-        Args:
-            before: the selector's memory before it decided.
-        """
-        kept = self.kept
-        kept["choice"][ids] = choice
+    def begin(self) -> Array:
+        """Keep the decisions that the selector has just made; return their environments (k,)."""
+        latest, kept = self.selector.latest, self.kept
+        if latest is None:
+            return self._all[:0]
+        ids, acted = latest.rows, latest.acted
+        kept["choice"][ids] = np.asarray(self.selector.acting.to_env(acted.action))
         kept["reward"][ids], kept["discount"][ids], kept["tau"][ids] = 0.0, 1.0, 0
-        if before is not None:
-            kept["before"][ids] = known(before)
+        if latest.recurrent_state is not None:
+            kept["before"][ids] = known(latest.recurrent_state)
+        if "allowed" in kept:
+            kept["allowed"][ids] = latest.mask
         if (rewards := self.opened("rewards")) is not None:
             rewards[ids] = 0.0
         head = None if acted.dist_params is None else known(acted.dist_params)
-        for name, value in (("obs", obs), ("head", head)):
+        for name, value in (("obs", latest.obs), ("head", head)):
             if value is not None:
                 held = self.opened(name)
                 if held is None or held.shape[1:] != value.shape[1:]:
                     held = np.zeros((len(self._all), *value.shape[1:]), value.dtype)
                     self._collector.open[self._prefix + name] = held
                 held[ids] = value
+        return ids
 
     def count(self, ids: Array | slice, reward: Array, gamma: Array) -> None:
         """Add a step to the calls of environments ``ids`` (k,); ``gamma`` is of all N."""
@@ -103,7 +101,7 @@ class OpenCalls:
         values = {
             "obs": obs[ids],
             "action": kept["choice"][ids],
-            "reward": (kept["reward"][ids] - self.skills.call_cost).astype(np.float32),
+            "reward": (kept["reward"][ids] - self.player.skills.call_cost).astype(np.float32),
             "steps": kept["tau"][ids],
             "terminated": terminated,
             "truncated": truncated,
@@ -125,7 +123,8 @@ class OpenCalls:
     @property
     def chances(self) -> Array | None:
         """How likely the guide's choices were when it was asked, (N, choices); None: not told."""
-        return self._memory["chances"] if self.guide is not None and self.guide.tells else None
+        guide = self.player.guide
+        return self._memory["chances"] if guide is not None and guide.tells else None
 
     def _keep(self, ids: Array, reward: Array) -> None:
         """Keep the reward of this step of the open calls."""
@@ -143,10 +142,7 @@ class OpenCalls:
         mask = np.ones_like(values["mask"])
         on = np.flatnonzero(~values["terminated"])
         if len(on):
-            found = self.skills.startable(values["next_obs"][on])
-            if self.guide is not None:
-                found = self.guide.ahead(self._memory, ids[on], found)
-            mask[on] = found | ~found.any(axis=1, keepdims=True)
+            mask[on] = self.player.allowed(self._memory, ids[on], values["next_obs"][on])
         return mask
 
 

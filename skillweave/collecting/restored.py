@@ -8,16 +8,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet, skills_below
+from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.player import Player
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Memory, prefixed
 
 COUNTS = range(-1, 2**31)
 """What a number of steps or calls may be."""
-OF_OTHERS = ("skills.", "guide.", "starters.")
+OF_OTHERS = ("player.", "starters.")
 """How names begin of what others remember, who may be a user's: that may be anything."""
-RUNNING = (("over", False, "skills.skill"), ("starters.called", True, "starters.skill"))
-"""Where a skill must be running: by what, its value there, and the name of the skill."""
+PLAYERS = ("player", "starters")
+"""What players are called whose memory is kept."""
 
 
 def known(x: Array) -> Array:
@@ -43,8 +44,9 @@ def check_numbers(kept: Mapping[str, Array], ranges: Mapping[str, range]) -> Non
     for name, x in own.items():
         if x.dtype.kind == "f" and not np.isfinite(x).all():
             raise ValueError(f"{name!r} of open episodes is not finite")
-    for about, value, skill in RUNNING:
-        if about in kept and (kept[skill][kept[about] == value] < 0).any():
+    for player in PLAYERS:
+        end, skill = kept.get(f"{player}.end"), kept.get(f"{player}.skill")
+        if end is not None and skill is not None and (skill[end == CallEnd.RUNNING] < 0).any():
             raise ValueError("a call is open, and no skill runs")
 
 
@@ -78,23 +80,24 @@ def opened(
         found[name] = known(value)
         if not np.isfinite(found[name]).all():
             raise ValueError(f"{name!r} of open calls is not finite")
-    if not kept.get("over", np.ones(1, bool)).all() and "obs" not in found:
+    running = kept.get("player.end", np.ones(1, np.int8)) == CallEnd.RUNNING
+    if "choice" in kept and running.any() and "obs" not in found:
         raise ValueError("it does not say where open calls began")
     return found
 
 
-def ranges_of(skills: SkillSet) -> dict[str, range]:
-    """What numbers in the memory of skills may be, by name; of those below them, too."""
-    found = {"skill": range(-1, len(skills.skills)), "elapsed": range(2**31)}
+def ranges_of(player: Player) -> dict[str, range]:
+    """Return the valid ranges of numbers in a player's memory, by name; for checkpoints."""
+    skills = player.skills
+    found = {
+        "skill": range(-1, len(skills.skills)),
+        "elapsed": range(2**31),
+        "end": range(len(CallEnd)),
+    }
     if skills.lengths:
         found["limit"] = range(max(skills.lengths) + 1)
-    for i, policy in enumerate(skills.policies):
-        below, guide = skills_below(policy), getattr(policy, "guide", None)
-        if below is not None:
-            found |= prefixed(str(i), ranges_of(below) | ranges_of_guide(guide))
+    if player.guide is not None:
+        found |= prefixed("guide", player.guide.selector.ranges)
+    for i, below in player.below.items():
+        found |= prefixed(str(i), ranges_of(below))
     return found
-
-
-def ranges_of_guide(guide: Any | None) -> dict[str, range]:
-    """The same of what a ready selector remembers."""
-    return {} if guide is None else prefixed("guide", guide.selector.ranges)

@@ -11,9 +11,9 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.columns import Columns
-from skillweave.collecting.starters import Starters
+from skillweave.collecting.judge import judge, seen_by
+from skillweave.collecting.starters import StartPolicy
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import info_rows, told_success
 from skillweave.errors import TrainingError
 from skillweave.experience import Batch
 from skillweave.messages import observed
@@ -68,12 +68,16 @@ class SkillCollector(Collector):
         search_steps: int | None = None,
         episode_calls: int = 1,
     ) -> None:
-        super().__init__(engine, acting)
+        super().__init__(engine)
+        if acting is not None:
+            self.acting = acting
         self.skill, self.reflexes = skill, reflexes
         self._start_calls = 0 if starters is None else start_calls
         self._search_steps, self._episode_calls = search_steps, episode_calls
         n = self.num_envs
         self._never = np.zeros(n, bool)
+        size = 0 if acting is None else acting.memory_size
+        self.kept["memory"] = np.zeros((n, size), np.float32)  # the learner's
         self.kept["elapsed"] = np.zeros(n, np.int64)  # the skill's steps in the open episode
         if episode_calls > 1:
             self.kept["calls_made"] = np.zeros(n, np.int64)  # of the skill, in the open episode
@@ -84,9 +88,14 @@ class SkillCollector(Collector):
             self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
             self.kept["found"] = np.zeros(n, bool)  # it ever might
             self.kept["calls_left"] = np.zeros(n, np.int64)  # that come first; −1: to be drawn
-            self._starters = Starters(starters, n, engine.action_space)
+            self._starters = StartPolicy(starters, n, engine.action_space)
             self.kept |= self._starters.kept
             self.ranges |= self._starters.ranges
+
+    @property
+    def memory(self) -> Array | None:
+        """(N, M), the recurrent state of the learners; None: they have none."""
+        return self.kept["memory"] if self.kept["memory"].shape[1] else None
 
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
         """The same over other environments."""
@@ -125,7 +134,14 @@ class SkillCollector(Collector):
             action[searching] = self._starters.act(searching, obs, mask, self._rng)
         raw = self.engine.step(action)
         self.kept["age"] += 1
-        judged = self._judge(obs, action, raw, playing)
+        self.kept["elapsed"] += 1
+        if playing is not None:
+            self.kept["elapsed"][searching] = 0
+        step = Step(
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            self._never, self.kept["age"].copy(), raw.info,
+        )  # fmt: skip
+        judged = self._judge(step, playing)
         ended = judged.terminated | judged.truncated
         if out is not None:
             next_mask = self.engine.mask()
@@ -148,7 +164,8 @@ class SkillCollector(Collector):
             self._begin_anew(np.setdiff1d(ids, more) if len(more) else ids)
         if playing is not None:
             going_on = searching[~over[searching]]
-            free = self._starters.observe(going_on, obs, action, raw)
+            part = seen_by(None, step, step.elapsed[going_on], going_on)
+            free = self._starters.observe(going_on, part)
             left = self.kept["calls_left"]
             left[free] = np.maximum(left[free] - 1, 0)
             self._give_up(self._look(going_on))
@@ -242,55 +259,23 @@ class SkillCollector(Collector):
             return f"of {by}"
         return f"of {by}, begun anew after {self._search_steps:,} of them (search_steps)"
 
-    def _judge(self, obs: Array, action: Array, raw: RawStep, playing: Array | None) -> Judged:
-        """What a step was to the skill; anything where it did not play."""
-        skill = self.skill
-        self.kept["elapsed"] += 1
-        if skill is None:
-            success = told_success(raw.info, self.num_envs)
-            return Judged(raw.reward, raw.terminated, raw.truncated, success)
-        elapsed = self.kept["elapsed"]
+    def _judge(self, step: Step, playing: Array | None) -> Judged:
+        """Judge a step for the skill; anything where it did not play."""
+        rows = self._all if playing is None else np.flatnonzero(playing)
+        elapsed = self.kept["elapsed"][rows]
+        outcome = judge(self.skill, seen_by(self.skill, step, elapsed, rows), rows)
         if playing is None:
-            return self._of_skill(skill, obs, action, raw, self._all)
-        rows = np.flatnonzero(playing)
-        elapsed[~playing] = 0
-        found = Judged(
-            np.zeros(self.num_envs, np.float32), self._never.copy(), self._never.copy(),
-            self._never.copy() if skill.defines("success") else None,
-        )  # fmt: skip
+            ends = outcome.terminated, outcome.truncated
+            return Judged(outcome.reward, *ends, outcome.success)
+        knows = self.skill is not None and self.skill.defines("success")
+        rewards, never = np.zeros(self.num_envs, np.float32), self._never
+        found = Judged(rewards, never.copy(), never.copy(), never.copy() if knows else None)
         if len(rows):
-            part = RawStep(
-                raw.next_obs[rows], raw.reward[rows], raw.terminated[rows], raw.truncated[rows],
-                info_rows(raw.info, rows, self.num_envs),
-            )  # fmt: skip
-            judged = self._of_skill(skill, obs[rows], action[rows], part, rows)
-            found.reward[rows], found.terminated[rows] = judged.reward, judged.terminated
-            found.truncated[rows] = judged.truncated
+            found.reward[rows], found.terminated[rows] = outcome.reward, outcome.terminated
+            found.truncated[rows] = outcome.truncated
             if found.success is not None:
-                found.success[rows] = judged.success
+                found.success[rows] = outcome.success
         return found
-
-    def _of_skill(
-        self, skill: Skill, obs: Array, action: Array, raw: RawStep, ids: Array
-    ) -> Judged:
-        """What a step of environments ``ids`` (n,) was to the skill."""
-        n, elapsed = len(ids), self.kept["elapsed"][ids]
-        timed_out = self._never[:n]
-        if skill.max_steps is not None:
-            timed_out = (elapsed >= skill.max_steps) & ~raw.terminated
-        step = Step(
-            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            timed_out, elapsed, raw.info,
-        )  # fmt: skip
-        reward = asked(skill, "reward", step, n, elapsed, ids)
-        terminated = raw.terminated
-        if skill.defines("termination"):
-            terminated = terminated | asked(skill, "termination", step, n, elapsed, ids)
-        truncated = (raw.truncated | timed_out) & ~terminated
-        success = None
-        if skill.defines("success"):
-            success = asked(skill, "success", step, n, elapsed, ids)
-        return Judged(reward, terminated, truncated, success)
 
     def _count(self, raw: RawStep, judged: Judged, playing: Array | None) -> None:
         """Keep the sums of the open episodes."""

@@ -10,9 +10,10 @@ import numpy as np
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.ends import ENDED, Why, judged, skill_step
+from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import ActiveGuide
-from skillweave.collecting.levels import CRITIC, SELECTOR, Inside, Level, woven
+from skillweave.collecting.judge import judge, seen_by, terminated_in_call
+from skillweave.collecting.levels import CRITIC, SELECTOR, Level, NestedLevel, with_learners
 from skillweave.collecting.woven_rows import Rows
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import DeclarationError
@@ -32,7 +33,7 @@ class WovenCollector(DecisionCollector):
     Args:
         engine: the environments.
         acting: the selector.
-        skills: those that learn have any policy; ``Inner`` where one is a hierarchy.
+        skills: those that learn have any policy; ``UntrainedHierarchy`` where one is a hierarchy.
         learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
             ``skill_critic`` and ``inner/skill_critic`` say what skills are worth.
         margins: by the paths of critics: calls are cut where deciding anew is worth so much more.
@@ -50,16 +51,15 @@ class WovenCollector(DecisionCollector):
         as_skill: Skill | None = None,
     ) -> None:
         self.learners = dict(learners)
-        acts = woven(skills, learners, margins or {})
+        acts = with_learners(skills, learners, margins or {})
         super().__init__(engine, acting, acts, guide=guide, as_skill=as_skill)
-        self._watches = True
-        self.root = Level(self, self._calls, self.skills, learners)
-        apart = any(x.skills.reflexes and x.skills.reflexes_apart for x in self.root.all())
-        self.overridden = np.zeros(self.num_envs, bool) if apart else None
+        self.root = Level(self, self.memory, self.player, learners)
+        reflexes = any(level.skills.reflexes for level in self.root.all())
+        self.overridden = np.zeros(self.num_envs, bool) if reflexes else None
         """(N,), where reflexes acted in the latest step; None: there are none."""
-        self.kept["leaf"] = np.zeros(self.num_envs, np.int64)  # who acted last; 0: nobody yet
+        self.kept["leaf"] = np.zeros(self.num_envs, np.int64)  # the latest that acted; 0: none yet
         self.ranges["leaf"] = range(self.root.end)
-        self._fresh = self._never  # the leaf that acts begins to
+        self._fresh = np.zeros(self.num_envs, bool)  # the leaf that acts starts to
         self._rows: Rows | None = None
 
     def like(self, engine: Engine, acting: Acting) -> Any:
@@ -68,8 +68,9 @@ class WovenCollector(DecisionCollector):
 
     def _collect(self, request: Request) -> dict[str, Batch]:
         self._rows = Rows(self, request.rows, self.root.all())
-        (selector,) = super()._collect(request).values()
-        found = {SELECTOR: selector} | {path: self._part(path) for path in self.learners}
+        selectors = super()._collect(request)
+        found = {SELECTOR: selectors[""]} if selectors else {}
+        found |= {path: self._part(path) for path in self.learners}
         self._rows = None
         return found
 
@@ -81,7 +82,7 @@ class WovenCollector(DecisionCollector):
         if name == CRITIC:
             return self._rows.of_critic(level.path)
         if name == SELECTOR:
-            assert isinstance(level, Inside)
+            assert isinstance(level, NestedLevel)
             return level.taken(self.obs)
         number = [s.name for s in level.skills.skills].index(name)
         return self._rows.of_leaf(level.leaves[number])
@@ -94,12 +95,15 @@ class WovenCollector(DecisionCollector):
             self._gammas[path] = request.below[path].gamma.astype(np.float64).repeat(acting.each)
 
     def _act(self, obs: Array, mask: Array | None) -> Array:
-        """The actions; who acts, and what selectors below have decided, is kept."""
-        action = super()._act(obs, mask)
+        """Return the actions; which leaf acts, and what selectors below have chosen, is kept."""
+        for level in self.root.all():
+            if isinstance(level, NestedLevel) and level.selector is not None:
+                level.selector.latest = None
         if self.overridden is not None:
-            action, self.overridden[:] = action.copy(), False
-            self._override(self.root, self._all, action, self.overridden)
-        leaf = self.root.leaf(self._calls, self._all)
+            self.overridden[:] = False
+            self._turn.overridden = self.overridden
+        action = super()._act(obs, mask)
+        leaf = self.root.leaf(self.memory, self._all)
         same = leaf == self.kept["leaf"]
         self._fresh, self.kept["leaf"][:] = ~same, leaf
         self._decided(self.root, self._all)
@@ -107,77 +111,65 @@ class WovenCollector(DecisionCollector):
             self._rows.go_on(np.flatnonzero(same))
         return action
 
-    def _override(self, level: Level, ids: Array, action: Array, overridden: Array) -> None:
-        """Put reflexes in force where a level acts, those below it first; in place.
-
-        Args:
-            ids: (k,) environments in which it acts.
-            action, overridden: of all environments.
-        """
-        running = self._calls[f"{level.prefix}skill"][ids]
-        for i, inside in level.below.items():
-            self._override(inside, ids[running == i], action, overridden)
-        if level.skills.reflexes and len(ids):
-            action[ids], holds = level.skills.override(self.obs[ids], action[ids])
-            overridden[ids] |= holds
-
     def _decided(self, level: Level, ids: Array) -> None:
-        """Keep what selectors below ``level`` have decided in environments ``ids`` (k,)."""
-        running = self._calls[f"{level.prefix}skill"][ids]
-        for i, inside in level.below.items():
+        """Keep what selectors below ``level`` have chosen in environments ``ids`` (k,)."""
+        running = self.memory[f"{level.prefix}skill"][ids]
+        for i, below in level.below.items():
             mine = ids[running == i]
-            inside.decided(self._calls, self.obs, mine)
-            self._decided(inside, mine)
+            below.decided(self.obs, mine)
+            self._decided(below, mine)
 
-    def _record(self, step: Step, raw: RawStep, mask: Array | None, why: Array) -> None:
+    def _record(self, step: Step, raw: RawStep, mask: Array | None, end: Array) -> None:
         """Keep the step for all who learn below the selector."""
         assert self._rows is not None
         self._rows.put(step, self.kept["leaf"], self._fresh, mask, self.engine.mask())
         truncated = raw.truncated & ~raw.terminated
         self._rows.put_critic(self.root, self._all, raw.reward, raw.terminated, truncated)
-        self._walk(self.root, self._all, step, why)
+        self._walk(self.root, self._all, step, end)
         self._rows.next()
 
-    def _walk(self, level: Level, ids: Array, step: Step, why: Array) -> None:
+    def _walk(self, level: Level, ids: Array, step: Step, end: Array) -> None:
         """What a step was to the skills of a level, in environments ``ids`` (k,).
 
         Args:
             step: of all environments.
-            why: (k,), why calls of these skills ended.
+            end: (k,), why calls of these skills ended.
         """
-        for i, rows in level.called(self._calls, ids):
+        for i, rows in level.called(self.memory, ids):
             if i in level.learning:
-                self._judge(level, i, ids[rows], step, why[rows])
+                self._judge(level, i, ids[rows], step, end[rows])
             elif i in level.below:
-                self._inside(level, i, ids[rows], step, why[rows])
+                self._inside(level, i, ids[rows], step, end[rows])
 
-    def _judge(self, level: Level, i: int, mine: Array, step: Step, why: Array) -> None:
-        """What a step was to skill ``i``, in environments ``mine`` (k,)."""
+    def _judge(self, level: Level, i: int, mine: Array, step: Step, end: Array) -> None:
+        """Judge a step of skill ``i``, in environments ``mine`` (k,)."""
         assert self._rows is not None
-        part = self._part_of(level, i, mine, step)
-        reward, terminated = judged(level.skills.skills[i], part, mine, why)
-        over = (why != Why.RUNNING) & ~terminated
-        goes_on = over & (why != Why.EPISODE) & ~part.timed_out
-        acted = level.learning[i].acted
-        assert acted is not None
-        self._rows.judge(mine, reward, terminated, over, goes_on)
-        self._rows.put_skill(level.leaves[i], mine, acted)
+        skill, part = level.skills.skills[i], self._part_of(level, i, mine, step)
+        terminated = terminated_in_call(skill, part, end, mine)
+        over = (end != CallEnd.RUNNING) & ~terminated
+        goes_on = over & (end != CallEnd.EPISODE) & ~part.timed_out
+        latest = level.learning[i].latest
+        assert latest is not None
+        self._rows.judge(mine, judge(skill, part, mine).reward, terminated, over, goes_on)
+        self._rows.put_skill(level.leaves[i], mine, latest.acted)
 
-    def _inside(self, level: Level, i: int, mine: Array, step: Step, why: Array) -> None:
-        """What a step was to skill ``i``, which is a hierarchy, and to all in it."""
+    def _inside(self, level: Level, i: int, mine: Array, step: Step, end: Array) -> None:
+        """Judge a step of skill ``i``, which is a hierarchy, and for all in it."""
         assert self._rows is not None
-        inside, part = level.below[i], self._part_of(level, i, mine, step)
-        reward, terminated = judged(level.skills.skills[i], part, mine, why)
-        over = (why != Why.RUNNING) & ~terminated
-        self._rows.put_critic(inside, mine, reward, terminated, over)
-        if inside.selector is not None:
-            gamma = self._gammas[inside.path + SELECTOR]
-            own = self._calls[inside.prefix + ENDED][mine] != Why.RUNNING
-            closes = own | terminated | (why == Why.EPISODE) | (over & part.timed_out)
-            inside.learn_from(mine, reward, terminated, over, part.next_obs, closes, gamma)
-        self._walk(inside, mine, step, inside.ends(self._calls, mine, why))
+        below, part = level.below[i], self._part_of(level, i, mine, step)
+        skill = level.skills.skills[i]
+        reward = judge(skill, part, mine).reward
+        terminated = terminated_in_call(skill, part, end, mine)
+        over = (end != CallEnd.RUNNING) & ~terminated
+        self._rows.put_critic(below, mine, reward, terminated, over)
+        if below.selector is not None:
+            gamma = self._gammas[below.path + SELECTOR]
+            own = self.memory[f"{below.prefix}end"][mine] != CallEnd.RUNNING
+            closes = own | terminated | (end == CallEnd.EPISODE) | (over & part.timed_out)
+            below.learn_from(mine, reward, terminated, over, part.next_obs, closes, gamma)
+        self._walk(below, mine, step, below.ends(self.memory, mine, end))
 
     def _part_of(self, level: Level, i: int, mine: Array, step: Step) -> Step:
         """A step of environments ``mine`` (k,) as skill ``i`` of a level sees it."""
-        elapsed = self._calls[f"{level.prefix}elapsed"][mine]
-        return skill_step(step, mine, elapsed, level.skills.skills[i].max_steps)
+        elapsed = self.memory[f"{level.prefix}elapsed"][mine]
+        return seen_by(level.skills.skills[i], step, elapsed, mine)

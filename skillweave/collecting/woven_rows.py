@@ -46,8 +46,8 @@ class Rows:
             if level.has_critic:
                 self._critics[level.path] = CriticRows(lead)
             for i, skill in level.learning.items():
-                if skill.acts.memory_size:
-                    memory = collector._calls[f"{level.prefix}{i}.rnn"]
+                if skill.acting.memory_size:
+                    memory = collector.memory[f"{level.prefix}{i}.rnn"]
                     self._memory[level.leaves[i]] = memory.copy()
         codec = action_codec(collector.engine.action_space)  # all skills act in this space
         units = codec.from_env(np.asarray(codec.space.sample())[None])
@@ -101,7 +101,7 @@ class Rows:
     ) -> None:
         """Write what the step was to a level, in environments ``mine`` (k,) where it acts."""
         if (rows := self._critics.get(level.path)) is not None:
-            calls = self._collector._calls
+            calls = self._collector.memory
             skill, elapsed = (calls[f"{level.prefix}{k}"][mine] for k in ("skill", "elapsed"))
             rows.put(self._at, mine, skill, elapsed == 1, reward, terminated, truncated)
 

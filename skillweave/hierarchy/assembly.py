@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.levels import Inner
+from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import own_guide, restricting_guide
 from skillweave.hierarchy.nesting import below, inner_of
@@ -51,7 +50,6 @@ def learning_set(declared: Declaration, found: Mapping[str, Policy]) -> SkillSet
             return found[skill.name]
         own = below(found, skill.name)
         selector = own[SELECTOR] if inner.ready_selector is not None else None
-        make = partial(HierarchyPolicy, guide=own_guide(inner))
-        return Inner(learning_set(inner, own), selector, make)
+        return UntrainedHierarchy(learning_set(inner, own), selector, own_guide(inner))
 
     return declared.skill_set([acts(s) for s in declared.skills])

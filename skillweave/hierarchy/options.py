@@ -9,7 +9,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.collecting.calls import SkillSet, Why
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.player import Player, Turn
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import allowed_rows
@@ -51,7 +53,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = float(gamma)
-        self._watches = skills.watches
+        self._player = Player(skills)
         self._seed = seed
         self._obs: Array = np.empty(0)
         self._mask: Array | None = None
@@ -75,7 +77,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             raise DeclarationError("OptionsEnv.reset takes one seed for all environments")
         self._seed = self._seed + 1 if seed is None else seed
         self._calls = 0
-        self._memory = self.skills.start(self.num_envs)
+        self._memory = self._player.start(self.num_envs)
         self._obs = self.engine.reset(self._seed)
         self._mask = self.skills.mask(self._obs)
         info = {} if self._mask is None else {"action_mask": self._mask}
@@ -96,8 +98,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         n = self.num_envs
         skill = np.asarray(actions).reshape(n)
         self._check(skill)
-        self.skills.begin(self._memory, np.arange(n), skill)
-        rng = (Seeds(self._seed) / "call" / self._calls).numpy()
+        self._player.begin(self._memory, np.arange(n), skill)
+        turn = Turn(rng=(Seeds(self._seed) / "call" / self._calls).numpy())
         self._calls += 1
         obs = self._obs
         next_obs = np.empty_like(obs)
@@ -109,7 +111,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             turns = self._turn(turns, rows, skill)
             here = obs if len(rows) == n else obs[rows]
             allowed = allowed_rows(self.engine.mask(), rows)
-            action = self.skills.act(self._memory, rows, here, rng, allowed)
+            action = self._player.act_in_calls(self._memory, rows, here, allowed, turn)
             raw = self.engine.step(action, None if len(rows) == n else rows)
             reward[rows] += discount[rows] * raw.reward
             plain[rows] += raw.reward
@@ -125,7 +127,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             if ended.any():
                 terminated[rows], truncated[rows] = raw.terminated, raw.truncated
                 obs[rows[ended]] = self.engine.reset_some(rows[ended])
-                self.skills.forget(self._memory, rows[ended])
+                self._player.restart(self._memory, rows[ended])
                 over = over | ended
             if over.any():
                 rows = rows[~over]
@@ -146,14 +148,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self, rows: Array, obs: Array, action: Array, raw: RawStep, elapsed: Array
     ) -> Array:
         """Show a step of environments ``rows`` (k,) to their skills; (k,): the call is over."""
-        seen = None
-        if self._watches:
-            never = np.zeros(len(rows), bool)
-            seen = Step(
-                obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-                never, elapsed, raw.info,
-            )  # fmt: skip
-        over: Array = self.skills.observe(self._memory, rows, seen) != Why.RUNNING
+        step = Step(
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            np.zeros(len(rows), bool), elapsed, raw.info,
+        )  # fmt: skip
+        over: Array = self._player.observe(self._memory, rows, step) != CallEnd.RUNNING
         return over
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -168,8 +167,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         mask[terminated] = True
         cut = np.flatnonzero(truncated & ~terminated)
         if len(cut):
-            found = self.skills.startable(next_obs[cut])
-            mask[cut] = found | ~found.any(axis=1, keepdims=True)
+            mask[cut] = self._player.allowed(self._memory, cut, next_obs[cut])
         return {"action_mask": self._mask, "next_action_mask": mask}
 
     def _final(self, next_obs: Array, ended: Array) -> dict[str, Any]:

@@ -9,23 +9,18 @@ from typing import Any, cast
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.calls import Interruption, SkillSet, Why
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.ends import Interruption
 from skillweave.collecting.guide import ActiveGuide
-from skillweave.selectors import LastCall, ReadySelector
+from skillweave.collecting.player import Player, Turn
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.types import Array, Memory, Policy, Step, unprefixed
 
-_SELECTOR = "selector."
-
 
 @checked_names
 class HierarchyPolicy:
-    """Decides where a call is over, lets the skill act elsewhere.
-
-    Memory rows: those of ``SkillSet``, ``why`` (int8, why the last call ended; one that is
-    running has not), the selector's own and its guide's; where that tells, ``chances``: how likely
-    its latest choices were.
+    """A selector and its skills as one policy; its memory is that of a ``Player``.
 
     Args:
         selector: chooses a row of the skills.
@@ -37,6 +32,7 @@ class HierarchyPolicy:
         self, selector: Policy, skills: SkillSet, guide: ActiveGuide | None = None
     ) -> None:
         self.selector, self.skills, self.guide = selector, skills, guide
+        self.player = Player(skills, selector, guide)
         self.observation_space = selector.observation_space
         self.action_space = skills.policies[0].action_space
         self.labels = tuple(s.name for s in skills.skills)
@@ -63,12 +59,7 @@ class HierarchyPolicy:
 
     def start(self, n: int) -> Memory:
         """Memory of ``n`` environments that wait for their first decision."""
-        memory = self.skills.start(n) | {"why": np.full(n, Why.EPISODE, np.int8)}
-        if self.guide is not None:
-            memory |= self.guide.start(n)
-            if self.guide.tells:
-                memory["chances"] = np.zeros((n, self.skills.choices), np.float32)
-        return memory | {_SELECTOR + k: v for k, v in self.selector.start(n).items()}
+        return self.player.start(n)
 
     def act(
         self,
@@ -86,43 +77,14 @@ class HierarchyPolicy:
         ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills. A selector
         that was kept because it samples (``SkillSet.greedy_selector``) samples in any case.
         """
-        deterministic = deterministic and self.skills.greedy_selector
         memory = {k: v.copy() for k, v in memory.items()}
-        rows = np.flatnonzero(memory["why"] != Why.RUNNING)
-        if len(rows):
-            here = obs[rows]
-            own = {k: v[rows] for k, v in self._selectors(memory).items()}
-            may = self.skills.mask(here)
-            if self.guide is not None:
-                may = np.ones((len(rows), self.skills.choices), bool) if may is None else may
-                chances = self.guide.ask(memory, rows, here, may)
-                may = chances > 0.0 if self.guide.restricts else may
-                if self.guide.tells:
-                    memory["chances"][rows] = chances
-            skill, after = self.selector.act(own, here, may, deterministic=deterministic, rng=rng)
-            for k, v in after.items():
-                memory[_SELECTOR + k][rows] = v
-            self.skills.begin(memory, rows, skill)
-            memory["why"][rows] = Why.RUNNING
-        return self.skills.act(memory, np.arange(len(obs)), obs, rng, mask), memory
+        turn = Turn(deterministic, rng)
+        return self.player.act(memory, np.arange(len(obs)), obs, mask, turn), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """The ``memory`` after a ``step``: notice where calls are over."""
         memory = {k: v.copy() for k, v in memory.items()}
-        watches = self.guide is not None or isinstance(self.selector, ReadySelector)
-        seen = step if self.skills.watches else None
-        rows = np.arange(len(step.reward))
-        why = self.skills.observe(memory, rows, seen)
-        memory["why"] = np.where(step.terminated | step.truncated, np.int8(Why.EPISODE), why)
-        if not watches:
-            return memory
-        succeeded = self.skills.succeeded(memory, rows, step, memory["why"])
-        last = LastCall(memory["skill"], memory["why"], succeeded)
-        if self.guide is not None:
-            self.guide.watch(memory, step, last)
-        if isinstance(self.selector, ReadySelector):
-            after = self.selector.watch(self._selectors(memory), step, last)
-            memory |= {_SELECTOR + k: v for k, v in after.items()}
+        self.player.observe(memory, np.arange(len(step.reward)), step)
         return memory
 
     def acting(self, memory: Memory) -> Array | None:
@@ -136,10 +98,6 @@ class HierarchyPolicy:
         if not isinstance(policy, HierarchyPolicy):
             return name
         return f"{name}/{policy.acts(unprefixed(str(i), memory), row)}"
-
-    def _selectors(self, memory: Memory) -> Memory:
-        """What the selector remembers."""
-        return {k[len(_SELECTOR) :]: v for k, v in memory.items() if k.startswith(_SELECTOR)}
 
 
 def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:

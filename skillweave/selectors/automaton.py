@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.calls import Why
+from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillweaveError
 from skillweave.messages import short
@@ -186,7 +186,7 @@ class Automaton(ReadySelector):
         """Whether an event has happened in this step, (n,) bool."""
         if isinstance(event, str):
             wanted = last.succeeded if event == "success" else ~last.succeeded
-            happened: Array = (last.why != Why.RUNNING) & wanted
+            happened: Array = (last.why != CallEnd.RUNNING) & wanted
             return happened
         name, n = function_name(event), len(step.reward)
         return answer(event, step, n, bool, self._who, name, step.elapsed)

@@ -58,7 +58,7 @@ class ReadySelector(Foreign):
 
         Args:
             step: as the environments answered; its ``elapsed`` counts as for any policy.
-            last: ``why`` is 0 (``Why.RUNNING``) where the call goes on.
+            last: ``why`` is 0 (``CallEnd.RUNNING``) where the call goes on.
         """
         return memory
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Discrete
 
-from skillweave.collecting.calls import Why
+from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillweaveError
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
@@ -42,7 +42,7 @@ class FunctionSelector(ReadySelector):
             return {}
         return {
             "skill": np.full(n, -1),
-            "why": np.full(n, Why.EPISODE, np.int8),
+            "why": np.full(n, CallEnd.EPISODE, np.int8),
             "succeeded": np.zeros(n, bool),
         }
 

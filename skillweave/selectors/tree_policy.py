@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from skillweave.collecting.calls import Why
+from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillweaveError
 from skillweave.selectors.base import ReadySelector, shown_obs
@@ -95,7 +95,7 @@ class TreeSelector(ReadySelector):
         Where another skill was called than the leaf's, as one may who is only guided, the leaf was
         not under way: it is asked for again.
         """
-        over = last.why != Why.RUNNING
+        over = last.why != CallEnd.RUNNING
         called = np.array(self._plan.skills)[memory["leaf"]] == last.skill
         leaf = np.where(over & ~called, -1, memory["leaf"])
         succeeded = np.where(over, last.succeeded, memory["succeeded"])

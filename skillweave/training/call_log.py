@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from skillweave.collecting.calls import Why, skills_below
+from skillweave.collecting.calls import skills_below
+from skillweave.collecting.ends import CallEnd
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.plain_agent import AGENT
 from skillweave.training.play import Played
-from skillweave.training.skill_report import ENDS, Judged, judge, played_below
+from skillweave.training.skill_report import ENDS, Judged, judged_step, played_below
 from skillweave.types import Array, Policy
 
 
@@ -82,7 +83,7 @@ class CallLog:
     def _add(self, played: Played, level: _Level) -> None:
         """Write down a step of environments in which the skills of a level act."""
         assert played.acting is not None
-        judged = None if level.skills is None else judge(level.skills, played)
+        judged = None if level.skills is None else judged_step(level.skills, played)
         leaf = np.array([level.numbers.get(i, 0) for i in range(len(level.labels))])[played.acting]
         here = ~np.isin(played.acting, list(level.below))
         self._write(played, leaf, judged, np.flatnonzero(here))
@@ -101,7 +102,7 @@ class CallLog:
             begun = played.begun is not None and bool(played.begun[j])
             if last is None or begun or last.skill != leaf[j]:
                 if last is not None and judged is not None and last.why is None:
-                    last.why = ENDS[Why.LIMIT]  # the hierarchy that it was in was called no more
+                    last.why = ENDS[CallEnd.LIMIT]  # its hierarchy was called no more
                 start = len(episode.rewards)
                 episode.calls.append(Call(int(leaf[j]), start, np.array(played.step.obs[j])))
             call, reward = episode.calls[-1], float(played.reward[j])
@@ -113,15 +114,15 @@ class CallLog:
             if judged is not None:
                 self._add_judged(call, judged, int(j))
             elif played.over[j]:
-                call.why = ENDS[Why.EPISODE]
+                call.why = ENDS[CallEnd.EPISODE]
 
     def _add_judged(self, call: Call, judged: Judged, j: int) -> None:
         """Write down what the running skill says of a step."""
         skill = self.skills[call.skill]
         if not isinstance(skill, RecordedSkill):
             call.own = (call.own or 0.0) + float(judged.reward[j])
-        if judged.why[j] != Why.RUNNING:
-            call.why = ENDS[Why(int(judged.why[j]))]
+        if judged.why[j] != CallEnd.RUNNING:
+            call.why = ENDS[CallEnd(int(judged.why[j]))]
             if skill.defines("success"):
                 call.succeeded = bool(judged.succeeded[j])
 

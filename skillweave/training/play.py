@@ -27,7 +27,7 @@ class Played:
     acting: Array | None = None  # (k,) int64, the skill that acted; None: no skills below
     begun: Array | None = None  # (k,) bool: a call of that skill began
     elapsed: Array | None = None  # (k,) int64, steps of its call so far; None: not told
-    why: Array | None = None  # (k,) int8, the policy's ``Why`` its call has ended; None: not told
+    why: Array | None = None  # (k,) int8, why its call ended, ``CallEnd``; None: not known
     chosen: Memory | None = None  # what the policy remembered when it had acted
     after: Memory | None = None  # the same after the step
 
@@ -91,7 +91,7 @@ def play(
         played = episodes.step(action)
         played.acting, played.begun, played.chosen = acting, begun, own
         after = policy.observe(own, played.step)
-        played.elapsed, played.why = after.get("elapsed"), after.get("why")
+        played.elapsed, played.why = after.get("elapsed"), after.get("end")
         played.after = after
         for k, v in after.items():
             memory[k][rows] = v

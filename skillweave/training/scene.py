@@ -12,7 +12,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.guide import ActiveGuide, AskedElsewhere
+from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.levels import CRITIC, SELECTOR
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
@@ -118,7 +118,7 @@ class WovenScene(Scene):
     """Environments in which a selector calls skills, and some of these learn too."""
 
     skills: SkillSet = field(kw_only=True)
-    """Those that learn have any policy, or are ``Inner``."""
+    """Those that learn have any policy, or are ``UntrainedHierarchy``."""
     skill_space: gym.Space[Any] = field(kw_only=True)
     """What skills choose from."""
     spec: EnvSpec = field(kw_only=True)
@@ -172,9 +172,8 @@ class WovenScene(Scene):
             acting: the selector; None: the guide decides.
             learners, margins: as of ``WovenCollector``.
         """
-        decides: Any = acting or AskedElsewhere(engine.num_envs)
         return WovenCollector(
-            engine, decides, self.skills, learners, margins, self.guide, self.as_skill
+            engine, acting, self.skills, learners, margins, self.guide, self.as_skill
         )
 
 

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet, Why, skill_step, skills_below
+from skillweave.collecting.calls import SkillSet, skills_below
+from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.judge import Outcome, judge, seen_by
 from skillweave.reading import Count
 from skillweave.skills import Skill, asked
 from skillweave.skills.base import RecordedSkill
@@ -17,7 +19,12 @@ from skillweave.types import Array, Policy, unprefixed
 
 _MEMORIES = ("chosen", "after")
 """Fields of a step that hold what a policy remembers."""
-ENDS = {Why.OWN: "own", Why.LIMIT: "limit", Why.INTERRUPTED: "interrupted", Why.EPISODE: "episode"}
+ENDS = {
+    CallEnd.OWN: "own",
+    CallEnd.LIMIT: "limit",
+    CallEnd.INTERRUPTED: "interrupted",
+    CallEnd.EPISODE: "episode",
+}
 """Why a call ended, as reports name it."""
 
 
@@ -90,28 +97,28 @@ class SkillReport:
 class Judged:
     """What the skills say of one step in each environment that acts."""
 
-    why: Array  # (k,) int8, ``Why`` its call has ended; RUNNING: it goes on
+    why: Array  # (k,) int8, ``CallEnd`` its call has ended; RUNNING: it goes on
     reward: Array  # (k,) the running skill's own; the environment's where it defines none
     succeeded: Array  # (k,) bool, the call is over, and its skill's ``success`` says yes
     has_succeeded: Array  # (k,) bool, ``success`` says yes; endless skills are asked at every step
 
 
-def judge(skills: SkillSet, played: Played) -> Judged:
-    """Ask the running skills about a step of a hierarchy."""
+def judged_step(skills: SkillSet, played: Played) -> Judged:
+    """Judge a step of a hierarchy by the running skills."""
     assert played.acting is not None
     assert played.elapsed is not None
     assert played.why is not None
     acting, why = played.acting, played.why.copy()
-    why[(why == Why.RUNNING) & played.over] = Why.EPISODE
-    over = why != Why.RUNNING
-    own, success = played.reward.copy(), np.zeros(len(acting), bool)
+    why[(why == CallEnd.RUNNING) & played.over] = CallEnd.EPISODE
+    over = why != CallEnd.RUNNING
+    reward, success = played.reward.copy(), np.zeros(len(acting), bool)
     for i, skill in enumerate(skills.skills):
         if skill.defines("reward") and len(rows := np.flatnonzero(acting == i)):
-            own[rows] = _ask(skills, i, "reward", played, played.elapsed, rows)
+            reward[rows] = _outcome(skill, played, played.elapsed, rows).reward
         due = (acting == i) & (over | is_endless(skills, i))
         if skill.defines("success") and len(rows := np.flatnonzero(due)):
-            success[rows] = _ask(skills, i, "success", played, played.elapsed, rows)
-    return Judged(why, own, success & over, success)
+            success[rows] = _outcome(skill, played, played.elapsed, rows).success
+    return Judged(why, reward, success & over, success)
 
 
 def is_endless(skills: SkillSet, i: int) -> bool:
@@ -137,7 +144,7 @@ class SkillTally:
         self.skills = found if isinstance(found, SkillSet) else None
         count = len(self.labels)
         self._steps, self._calls = np.zeros(count, np.int64), np.zeros(count, np.int64)
-        self._ended = np.zeros((count, len(Why)), np.int64)
+        self._ended = np.zeros((count, len(CallEnd)), np.int64)
         self._succeeded = np.zeros(count, np.int64)
         self._late, self._hasty = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._endless = np.array(
@@ -173,19 +180,19 @@ class SkillTally:
         self._before[whose] = 1 + called
         own = played.reward
         if self.skills is not None:
-            judged = judge(self.skills, played)
+            judged = judged_step(self.skills, played)
             assert played.elapsed is not None
-            self._open[played.episode] = np.where(judged.why == Why.RUNNING, acting, -1)
+            self._open[played.episode] = np.where(judged.why == CallEnd.RUNNING, acting, -1)
             own = judged.reward
-            ended = np.flatnonzero(judged.why != Why.RUNNING)
+            ended = np.flatnonzero(judged.why != CallEnd.RUNNING)
             np.add.at(self._ended, (acting[ended], judged.why[ended]), 1)
-            done, again = judged.why == Why.OWN, self._done[played.episode] == acting
+            done, again = judged.why == CallEnd.OWN, self._done[played.episode] == acting
             self._idle += np.bincount(acting[done & again], minlength=count)
             self._done[played.episode] = np.where(done, acting, -1)
             np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
             assert played.begun is not None
             before = self._has_succeeded[played.episode] & ~played.begun & self._endless[acting]
-            late = before & judged.succeeded & (judged.why == Why.LIMIT)
+            late = before & judged.succeeded & (judged.why == CallEnd.LIMIT)
             self._late += np.bincount(acting[late], minlength=count)
             hasty = done & (played.elapsed <= 2) & self._pays[acting] & (own < 0)
             self._hasty += np.bincount(acting[hasty & ~judged.succeeded], minlength=count)
@@ -201,7 +208,7 @@ class SkillTally:
         """Another skill acts in ``episodes`` (k,): calls that might have gone on are over."""
         over = episodes[self._open[episodes] >= 0]
         if len(over):
-            np.add.at(self._ended[:, Why.LIMIT], self._open[over], 1)
+            np.add.at(self._ended[:, CallEnd.LIMIT], self._open[over], 1)
             self._open[over] = -1
         self._done[episodes] = -1
         for tally in self._below.values():
@@ -273,18 +280,16 @@ class CallTally:
         episode = played.episode[rows]
         self._elapsed[episode] += 1
         elapsed, limit = self._elapsed[episode], self._skill.max_steps
-        own = played.reward[rows]
-        if self._skill.defines("reward"):
-            own = self._asked("reward", played, rows)
-        self._returns[episode] += own
-        why = np.full(len(rows), Why.RUNNING)
+        outcome = _outcome(self._skill, played, self._elapsed[played.episode], rows)
+        defined = self._skill.defines("reward")
+        self._returns[episode] += outcome.reward if defined else played.reward[rows]
+        why = np.full(len(rows), CallEnd.RUNNING)
         if limit is not None:
-            why[elapsed >= limit] = Why.LIMIT
-        if self._skill.defines("termination"):
-            why[self._asked("termination", played, rows)] = Why.OWN
+            why[elapsed >= limit] = CallEnd.LIMIT
+        why[outcome.stops] = CallEnd.OWN
         ended = played.step.terminated[rows] | played.step.truncated[rows]
-        why[ended | (played.over[rows] & (why == Why.RUNNING))] = Why.EPISODE
-        over = np.flatnonzero(why != Why.RUNNING)
+        why[ended | (played.over[rows] & (why == CallEnd.RUNNING))] = CallEnd.EPISODE
+        over = np.flatnonzero(why != CallEnd.RUNNING)
         if self._below is not None:
             self._below.add(rows_of(played, rows))
             self._below.cut(episode[over])
@@ -293,7 +298,10 @@ class CallTally:
         for reason, name in ENDS.items():
             self._ended[name] += int((why == reason).sum())
         if self._skill.defines("success"):
-            self._succeeded += int(self._asked("success", played, rows[over]).sum())
+            ended_rows = rows[over]
+            last = _outcome(self._skill, played, self._elapsed[played.episode], ended_rows)
+            assert last.success is not None
+            self._succeeded += int(last.success.sum())
         self._open[episode[over]], self._done[episode[over]] = False, True
 
     def reports(self) -> dict[str, SkillReport]:
@@ -307,12 +315,6 @@ class CallTally:
         )  # fmt: skip
         below = {} if self._below is None else self._below.reports()
         return {self._path: report} | below
-
-    def _asked(self, method: str, played: Played, rows: Array) -> Array:
-        """Return the answer of a skill's method about the step of ``rows`` (m,)."""
-        elapsed = self._elapsed[played.episode[rows]]
-        step = skill_step(played.step, rows, elapsed, self._skill.max_steps)
-        return asked(self._skill, method, step, len(rows), elapsed, played.rows[rows])
 
 
 def tally_of(policy: Policy, episodes: int) -> tuple[str | None, SkillTally | CallTally]:
@@ -329,7 +331,7 @@ def rows_of(played: Played, rows: Array) -> Played:
     if len(rows) == len(played.rows):
         return played
     values = {f.name: getattr(played, f.name) for f in fields(played)}
-    step = skill_step(played.step, rows, played.step.elapsed[rows], None)
+    step = seen_by(None, played.step, played.step.elapsed[rows], rows)
     some = {k: v[rows] for k, v in values.items() if isinstance(v, np.ndarray)}
     memories = {k: values[k] and {n: v[rows] for n, v in values[k].items()} for k in _MEMORIES}
     return Played(**values | some | memories | {"step": step})
@@ -342,10 +344,10 @@ def played_below(played: Played, i: int, rows: Array) -> Played:
     assert played.after is not None
     chosen = {k: v[rows] for k, v in unprefixed(str(i), played.chosen).items()}
     after = {k: v[rows] for k, v in unprefixed(str(i), played.after).items()}
-    step = skill_step(played.step, rows, played.elapsed[rows], None)
+    step = seen_by(None, played.step, played.elapsed[rows], rows)
     return Played(
         played.rows[rows], played.episode[rows], step, played.reward[rows], played.lasted[rows],
-        played.cut[rows], chosen["skill"], chosen["elapsed"] == 0, after["elapsed"], after["why"],
+        played.cut[rows], chosen["skill"], chosen["elapsed"] == 0, after["elapsed"], after["end"],
         chosen, after,
     )  # fmt: skip
 
@@ -364,10 +366,6 @@ def all_steps(skills: Mapping[str, SkillReport]) -> int:
     return sum(skills[name].steps for name in top)
 
 
-def _ask(
-    skills: SkillSet, i: int, method: str, played: Played, elapsed: Array, rows: Array
-) -> Array:
-    """What a method of skill ``i`` says about a step of ``rows`` (m,) of those that act."""
-    skill = skills.skills[i]
-    step = skill_step(played.step, rows, elapsed[rows], skill.max_steps)
-    return asked(skill, method, step, len(rows), elapsed[rows], played.rows[rows])
+def _outcome(skill: Skill, played: Played, elapsed: Array, rows: Array) -> Outcome:
+    """Judge a step of ``rows`` (m,) of those that act; ``elapsed`` is of all of them."""
+    return judge(skill, seen_by(skill, played.step, elapsed[rows], rows), played.rows[rows])

@@ -27,6 +27,7 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -109,7 +110,7 @@ def test_every_decision_is_that_of_a_scalar_loop(call_steps, rows):
         ticks, ended = ticks + rows, ended + len(collected.episodes)
         assert collected.steps == rows * N
     # What is not in a decision yet is in an open call: no step is lost, none invented.
-    open_calls = np.where(collector.kept["over"], 0, collector.kept["tau"])
+    open_calls = np.where(collector.memory["end"] == CallEnd.RUNNING, collector.kept["tau"], 0)
     np.testing.assert_array_equal(taken + open_calls, ticks)
     assert ended > 20
 

@@ -13,7 +13,7 @@ from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import joined_collected
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.guide import SMOOTHED, ActiveGuide, AskedElsewhere, as_logits
+from skillweave.collecting.guide import SMOOTHED, ActiveGuide, as_logits
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import make_engine
 from skillweave.seeding import Seeds
@@ -35,7 +35,7 @@ class Drawn(Choices):
         self.rng = np.random.default_rng(0)
 
     def some(self, rows, obs, mask, memory):
-        action = (mask[rows] * self.rng.random(mask[rows].shape)).argmax(1)
+        action = (mask * self.rng.random(mask.shape)).argmax(1)
         return Acted(action, None, None)
 
 
@@ -89,7 +89,7 @@ def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=2)
     for greedy in (False, True):
         collector = DecisionCollector(
-            make_engine(SPEC, N), AskedElsewhere(N), skills,
+            make_engine(SPEC, N), Choices(N, len(SKILLS)), skills,
             guide=ActiveGuide(bound(AUTOMATON), decides=True),
         )  # fmt: skip
         collector.start(Seeds(2))
@@ -120,7 +120,9 @@ def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts()
     skill_set = SkillSet(skills, tuple(s.policy for s in skills), call_steps=1)
     names = tuple(s.name for s in skills)
     guide = ActiveGuide(bound(clock, names), decides=True)
-    collector = DecisionCollector(make_engine(SPEC, N), AskedElsewhere(N), skill_set, guide=guide)
+    collector = DecisionCollector(
+        make_engine(SPEC, N), Choices(N, len(SKILLS)), skill_set, guide=guide
+    )
     collector.start(Seeds(2))
     found = collector.collect(next(requests(60))).batches[""]
     for n in range(N):
@@ -136,7 +138,9 @@ def test_collectors_agree_on_what_they_tell_also_where_no_call_has_ended(tells):
     for call_steps, rows in ((30, 1), (1, 2)):
         collector = collector_of(ActiveGuide(bound(AUTOMATON), tells=tells), call_steps)
         if rows == 1:  # it waits for two steps
-            collector.acting.some = lambda ids, *seen: Acted(np.full(len(ids), 3), None, None)
+            collector.selector.acting.some = lambda ids, *seen: Acted(
+                np.full(len(ids), 3), None, None
+            )
         found.append(collector.collect(next(requests(rows))))
     assert not found[0].batches[""]["valid"].any(), "no call has ended"
     joined = joined_collected(found, 1).batches[""]

@@ -14,10 +14,9 @@ from toy_acting import Again, Choices, Counts, requests, valid_rows
 
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.levels import Inner
+from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 
@@ -82,13 +81,13 @@ class Remembering(Selector, Counts):
 
     memory_size = 1
 
-    def these(self, obs, mask, memory):
-        return Counts.some(self, np.arange(len(obs)), obs, mask, memory)
+    def some(self, rows, obs, mask, memory):
+        return Counts.some(self, rows, obs, mask, memory)
 
 
 def collector_of(node, outer_steps, inner_steps, chooser=Selector, env=Walk):
     skills = SkillSet((Down(), Rest()), (None, Rest.policy), call_steps=inner_steps)
-    inner = Inner(skills, None, HierarchyPolicy)
+    inner = UntrainedHierarchy(skills, None)
     whole = SkillSet((Up(), node()), (None, inner), call_steps=outer_steps)
     engine = make_engine(EnvSpec(env, engine="sync"), N)
     name = node().name

@@ -11,11 +11,10 @@ from test_woven import Choices, Down, Learner, N, Stay, Up, Values, asked
 from toy_acting import requests
 
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.levels import Inner
+from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex, Skill
@@ -98,7 +97,7 @@ def low(obs):
 def test_reflexes_of_a_hierarchy_below_hold_where_it_acts_and_those_above_come_last():
     inner = SkillSet((Down(), Stay()), (None, Stay.policy), (Reflex(low, 2), Reflex(far, 2)), 2)
     skills = SkillSet(
-        (Up(), Inside()), (None, Inner(inner, None, HierarchyPolicy)), (BACK,), call_steps=3
+        (Up(), Inside()), (None, UntrainedHierarchy(inner, None)), (BACK,), call_steps=3
     )
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
     learners = {"up": Learner(N), "inside/down": Learner(N), "inside/selector": Chooser(N)}

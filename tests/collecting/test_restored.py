@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.restored import check_numbers, opened
 
 SPACE = gym.spaces.Discrete(5, start=1)
@@ -43,8 +44,8 @@ def test_what_a_diverged_member_decided_by_is_nought_and_infinity_is_refused():
         ("calls_left", -1, False),  # it is to be drawn
         ("reward", 1e9, False),
         ("reward", np.nan, True),
-        ("skills.0.own", np.nan, False),  # a user's
-        ("guide.own", np.inf, False),
+        ("player.0.own", np.nan, False),  # a user's
+        ("player.guide.own", np.inf, False),
         ("starters.0.own", -(2**40), False),
     ],
 )
@@ -57,13 +58,11 @@ def test_own_numbers_have_ranges_and_a_users_may_be_anything(name, value, refuse
         check_numbers(own, {"choice": range(3)})
 
 
-@pytest.mark.parametrize(
-    ("about", "runs", "skill"),
-    [("over", False, "skills.skill"), ("starters.called", True, "starters.skill")],
-)
-def test_where_a_call_is_open_a_skill_runs(about, runs, skill):
-    both = {about: np.array([runs, not runs]), skill: np.array([1, -1])}
+@pytest.mark.parametrize("player", ["player", "starters"])
+def test_where_a_call_is_open_a_skill_runs(player):
+    end = np.int8([CallEnd.RUNNING, CallEnd.OWN])
+    both = {f"{player}.end": end, f"{player}.skill": np.array([1, -1])}
     check_numbers(both, {})
-    both[about] = ~both[about]
+    both[f"{player}.end"] = end[::-1]
     with pytest.raises(ValueError, match="no skill runs"):
         check_numbers(both, {})

@@ -9,7 +9,7 @@ from toy_acting import Choices, requests
 
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.skill_rows import SkillCollector
-from skillweave.collecting.starters import Starters
+from skillweave.collecting.starters import StartPolicy
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
@@ -223,7 +223,7 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
     space = Corridor.action_space
 
     def acted(kinds, xs, ids):
-        starters = Starters(SkillSet(skills[kinds], policies[kinds]), len(xs), space)
+        starters = StartPolicy(SkillSet(skills[kinds], policies[kinds]), len(xs), space)
         obs = np.array([[x, 0] for x in xs], np.float32)
         mask = np.eye(5, dtype=bool)[[1, 2, 1, 3]] | np.eye(5, dtype=bool)[1]
         return starters.act(np.array(ids), obs, mask, np.random.default_rng(0)).tolist()

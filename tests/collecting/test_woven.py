@@ -11,8 +11,10 @@ from reference_calls import EPISODE, POSITION, T, Walk
 from toy_acting import Choices, requests, valid_rows
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.calls import Interruption, SkillSet, Why
+from skillweave.collecting.calls import Interruption, SkillSet
+from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.lengths import Lengths
+from skillweave.collecting.player import Player
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.seeding import Seeds
@@ -60,9 +62,6 @@ class Learner(Choices):
 
         self.stacks = ((Algorithm(), 1),)
 
-    def these(self, obs, mask, memory):
-        return self.some(np.arange(len(obs)), obs, mask, memory)
-
 
 class Values(Learner):
     """A critic to whom skill k is worth k where the position is odd, else nothing.
@@ -70,8 +69,8 @@ class Values(Learner):
     A new decision is worth as much as the best skill.
     """
 
-    def these(self, obs, mask, memory):
-        found = super().these(obs, mask, memory)
+    def some(self, rows, obs, mask, memory):
+        found = super().some(rows, obs, mask, memory)
         odd = obs[:, POSITION] % 2 == 1
         return replace(found, dist_params=odd[:, None] * np.array([0, 1, 2, 2], np.float32))
 
@@ -109,7 +108,8 @@ def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
     skills, seen = collector.skills, {0: 0, 1: 0}
     ended, continued = 0, 0
     for request in itertools.islice(asked(40), 5):
-        open_steps = collector.kept["tau"] * ~collector.kept["over"]
+        runs = collector.memory["end"] == CallEnd.RUNNING
+        open_steps = collector.kept["tau"] * runs
         batches = collector.collect(request).batches
         experience, stream = batches["selector"], batches["skill_critic"]
         own = batches["up"], batches["down"]
@@ -166,7 +166,7 @@ def test_a_call_is_cut_where_it_is_worth_clearly_more_to_decide_anew():
     skills = tuple(kind() for kind in (Down, Stay, Down))
     policy = Stay.policy
     cuts = Interruption(lambda obs: worth[obs[:, T].astype(int)], 0.5)
-    found = SkillSet(skills, (policy,) * 3, call_steps=9, interruption=cuts)
+    found = Player(SkillSet(skills, (policy,) * 3, call_steps=9, interruption=cuts))
     memory, rows = found.start(4), np.arange(4)
     found.begin(memory, rows, np.array([1, 1, 2, 0]))
     obs = np.zeros((4, 3), np.float32)
@@ -174,7 +174,7 @@ def test_a_call_is_cut_where_it_is_worth_clearly_more_to_decide_anew():
     no = np.zeros(4, bool)
     step = Step(obs, np.ones(4, int), obs, np.zeros(4), no, no, no, np.ones(4, int), {})
     why = found.observe(memory, rows, step)
-    assert why.tolist() == [Why.INTERRUPTED, Why.RUNNING, Why.RUNNING, Why.RUNNING]
+    assert why.tolist() == [CallEnd.INTERRUPTED, CallEnd.RUNNING, CallEnd.RUNNING, CallEnd.RUNNING]
 
 
 class AtFirst(Down):
@@ -188,21 +188,22 @@ def test_a_call_goes_on_where_no_skill_may_start():
     worth = np.array([0.0, 9.0, 9.0])
     cuts = Interruption(lambda obs: np.tile(worth, (len(obs), 1)), 0.5)
     skills = (AtFirst(), AtFirst())
-    found = SkillSet(skills, (Stay.policy,) * 2, call_steps=9, interruption=cuts)
+    found = Player(SkillSet(skills, (Stay.policy,) * 2, call_steps=9, interruption=cuts))
     memory, rows = found.start(2), np.arange(2)
     found.begin(memory, rows, np.array([0, 0]))
     obs = np.zeros((2, 3), np.float32)
     obs[1, T] = 1
     no = np.zeros(2, bool)
     step = Step(obs, np.ones(2, int), obs, np.zeros(2), no, no, no, np.ones(2, int), {})
-    assert found.observe(memory, rows, step).tolist() == [Why.INTERRUPTED, Why.RUNNING]
+    assert found.observe(memory, rows, step).tolist() == [CallEnd.INTERRUPTED, CallEnd.RUNNING]
 
 
 @pytest.mark.parametrize("margin", [None, 0.5])
 def test_a_critic_is_told_where_calls_begin(margin):
     collector = collector_of(5, margin)
     for request in itertools.islice(asked(40), 3):
-        open_steps = collector.kept["tau"] * ~collector.kept["over"]
+        runs = collector.memory["end"] == CallEnd.RUNNING
+        open_steps = collector.kept["tau"] * runs
         batches = collector.collect(request).batches
         experience, stream = batches["selector"], batches["skill_critic"]
         for n in range(N):
@@ -219,13 +220,16 @@ def test_a_critic_is_told_where_calls_begin(margin):
 def test_a_choice_is_a_skill_and_a_length():
     skills = SkillSet((Down(), Stay()), (Stay.policy,) * 2, call_steps=Lengths(1, 4, 16))
     assert skills.choices == 6
-    memory = skills.start(3)
-    skills.begin(memory, np.arange(3), np.array([0, 4, 5]))
+    player, rows, no = Player(skills), np.arange(3), np.zeros(3, bool)
+    memory = player.start(3)
+    player.begin(memory, rows, np.array([0, 4, 5]))
     assert memory["skill"].tolist() == [0, 1, 1]
     assert memory["limit"].tolist() == [1, 4, 16]
-    found = [skills.observe(memory, np.arange(3), None).tolist() for _ in range(4)]
-    assert found[0] == [Why.LIMIT, Why.RUNNING, Why.RUNNING]
-    assert found[3] == [Why.LIMIT, Why.LIMIT, Why.RUNNING]
+    obs = np.zeros((3, 4), np.float32)
+    step = Step(obs, np.ones(3, int), obs, np.zeros(3), no, no, no, np.ones(3, int), {})
+    found = [player.observe(memory, rows, step).tolist() for _ in range(4)]
+    assert found[0] == [CallEnd.LIMIT, CallEnd.RUNNING, CallEnd.RUNNING]
+    assert found[3] == [CallEnd.LIMIT, CallEnd.LIMIT, CallEnd.RUNNING]
 
 
 def test_a_learner_of_the_library_acts_and_its_head_is_kept():

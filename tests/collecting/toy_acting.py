@@ -42,7 +42,7 @@ class Choices:
 
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Any) -> Acted:
         chosen = []
-        for row in rows:
+        for row in range(len(rows)):
             rng = np.random.default_rng(zlib.crc32(obs[row].tobytes()))
             allowed = np.ones(self.actions, bool) if mask is None else mask[row]
             chosen.append(rng.choice(np.flatnonzero(allowed)))
@@ -69,7 +69,7 @@ class Counts(Choices):
     memory_size = 1
 
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Any) -> Acted:
-        before = memory[rows].copy()
+        before = memory.copy()
         return Acted(super().some(rows, obs, mask, None).action, before, before + 1)
 
 

@@ -416,7 +416,7 @@ def acts(policy, steps: int = 30) -> list:
         obs = rng.normal(size=(16, 4)).astype(np.float32)
         action, memory = policy.act(memory, obs)
         found.append((action.tolist(), policy.acting(memory).tolist()))
-        memory["why"][:] = rng.random(16) < 0.5
+        memory["end"][:] = rng.random(16) < 0.5
     return found
 
 

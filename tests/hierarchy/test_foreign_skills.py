@@ -69,7 +69,7 @@ def acts(policy, size=4, steps=40):
         obs = rng.normal(size=(16, size)).astype(np.float32)
         action, memory = policy.act(memory, obs)
         found.append((action.tolist(), policy.acting(memory).tolist()))
-        memory["why"][:] = rng.random(16) < 0.5
+        memory["end"][:] = rng.random(16) < 0.5
     return found
 
 

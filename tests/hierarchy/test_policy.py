@@ -29,7 +29,8 @@ from reference_calls import (
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Hierarchy, Run
-from skillweave.collecting.calls import SkillSet, Why
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.ends import CallEnd
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
@@ -85,7 +86,7 @@ def play(policy, engine, seed: int, steps: int, **how) -> list:
     obs, memory, happened = engine.reset(seed), policy.start(n), []
     elapsed = np.zeros(n, np.int64)
     for _ in range(steps):
-        decides = memory.get("why", np.zeros(n, bool)).astype(bool)
+        decides = memory.get("end", np.zeros(n, bool)).astype(bool)
         action, memory = policy.act(memory, obs, **how)
         acting = policy.acting(memory)
         happened.append((obs.copy(), decides, None if acting is None else acting.copy(), action))
@@ -446,8 +447,8 @@ def test_alone_an_environment_is_acted_in_as_among_others(make):
             alone[i] = policy.observe(alone[i], part)
             acting = policy.acting(alone[i])
             assert acting.tolist() == [policy.acting(together)[i]]
-            where = together["why"][i]
-            assert alone[i]["why"].tolist() == [where]
+            where = together["end"][i]
+            assert alone[i]["end"].tolist() == [where]
     assert together.keys() == alone[0].keys()
 
 
@@ -511,7 +512,7 @@ def test_a_skill_that_terminates_is_followed_by_a_decision_and_only_there():
     assert action.tolist() == [2, 2]
     assert policy.acting(memory).tolist() == [0, 0]
     memory = policy.observe(memory, transition(obs, action, walk_obs(2, -4)))
-    assert memory["why"].tolist() == [Why.OWN, Why.RUNNING]
+    assert memory["end"].tolist() == [CallEnd.OWN, CallEnd.RUNNING]
     _, memory = policy.act(memory, walk_obs(2, -4))
     assert policy.acting(memory).tolist() == [1, 0]
     assert memory["elapsed"].tolist() == [0, 1]
@@ -523,7 +524,7 @@ def test_a_call_lasts_as_many_steps_as_the_least_limit_says():
         policy = HierarchyPolicy(Chooser(1), skill_set(Left, call_steps=call_steps))
         memory, obs, decided = policy.start(1), walk_obs(0), []
         for _ in range(12):
-            decided.append(bool(memory["why"][0]))
+            decided.append(bool(memory["end"][0]))
             action, memory = policy.act(memory, obs)
             memory = policy.observe(memory, transition(obs, action, obs))
         assert decided == [k % lasts == 0 for k in range(12)]
@@ -536,7 +537,7 @@ def test_call_steps_of_a_skill_count_instead_of_those_of_the_hierarchy():
         policy = HierarchyPolicy(Chooser(1), skills)
         memory, obs, decided = policy.start(1), walk_obs(0), []
         for _ in range(12):
-            decided.append(bool(memory["why"][0]))
+            decided.append(bool(memory["end"][0]))
             action, memory = policy.act(memory, obs)
             memory = policy.observe(memory, transition(obs, action, obs))
         assert decided == [k % lasts == 0 for k in range(12)], "Left itself stops after 3"

@@ -9,7 +9,7 @@ import pytest
 from ready_selectors.chain import NAMES, Corridor, bound, got_key, hierarchy, story
 
 from skillweave import Automaton, SkillweaveError
-from skillweave.collecting.calls import Why
+from skillweave.collecting.ends import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.types import Step
 
@@ -54,14 +54,16 @@ def test_transitions_by_hand():
         )
     )
     memory = policy.start(5)
-    running = call([Why.RUNNING] * 5, [False] * 5)
+    running = call([CallEnd.RUNNING] * 5, [False] * 5)
     assert states(policy, memory) == ["low"] * 5
     memory = policy.watch(memory, step([0, 1, 2, 9, 0.5]), running)
     # At most one transition in a step: 9 does not go on from high.
     assert states(policy, memory) == ["low", "over", "high", "high", "over"]
     memory = policy.watch(memory, step([0, 0, 7.5, 9, 0]), running)
     assert states(policy, memory) == ["low", "over", "low", "high", "over"]
-    ended = call([Why.OWN, Why.LIMIT, Why.OWN, Why.OWN, Why.LIMIT], [1, 0, 1, 1, 1])
+    ended = call(
+        [CallEnd.OWN, CallEnd.LIMIT, CallEnd.OWN, CallEnd.OWN, CallEnd.LIMIT], [1, 0, 1, 1, 1]
+    )
     memory = policy.watch(memory, step([0] * 5), ended)
     assert states(policy, memory) == ["low", "low", "low", "over", "over"]
     # A call that goes on has neither succeeded nor failed.

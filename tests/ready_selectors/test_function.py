@@ -20,7 +20,7 @@ from ready_selectors.chain import (
 )
 
 from skillweave import LastCall, SkillweaveError
-from skillweave.collecting.calls import Why
+from skillweave.collecting.ends import CallEnd
 
 
 def by_number(obs: Any) -> Any:
@@ -57,10 +57,10 @@ def test_a_function_of_two_arguments_is_told_how_the_last_call_ended():
     calls = story(hierarchy(choose, call_steps=place - 1), 0, most=2 + place + 1)
     assert calls == [("wait", 2), ("get_key", place - 1), ("get_key", 1), ("open_door", 1)]
     assert told == [
-        (-1, Why.EPISODE, False),
-        (3, Why.LIMIT, False),
-        (0, Why.LIMIT, False),
-        (0, Why.OWN, True),
+        (-1, CallEnd.EPISODE, False),
+        (3, CallEnd.LIMIT, False),
+        (0, CallEnd.LIMIT, False),
+        (0, CallEnd.OWN, True),
     ]
 
 

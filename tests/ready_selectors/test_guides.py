@@ -183,7 +183,7 @@ def calls_of(policy, guide, seeds=6):
         obs, _ = env.reset(seed=seed)
         memory = policy.start(1)
         for t in range(40):
-            decides = memory["why"][0] != 0
+            decides = memory["end"][0] != 0
             state = guide.state_names[int(memory["guide.state"][0])]
             action, memory = policy.act(memory, obs[None], deterministic=False)
             if decides:

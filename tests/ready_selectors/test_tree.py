@@ -10,7 +10,7 @@ import pytest
 from ready_selectors.chain import Corridor, has_key, hierarchy, story
 
 from skillweave import SkillweaveError, tree
-from skillweave.collecting.calls import Why
+from skillweave.collecting.ends import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.selectors.ready import ready_selector
 from skillweave.selectors.tree_policy import TreeSelector
@@ -33,7 +33,7 @@ def made(root: Any, names: tuple[str, ...] = ABC) -> TreeSelector:
 
 def told(policy: Any, memory: Any, succeeded: Any) -> Any:
     """The memory after calls that ended so."""
-    why = np.full(len(succeeded), Why.OWN, np.int8)
+    why = np.full(len(succeeded), CallEnd.OWN, np.int8)
     called = np.array(policy._plan.skills)[memory["leaf"]]
     return policy.watch(memory, None, LastCall(called, why, np.array(succeeded)))
 
@@ -46,7 +46,9 @@ def test_a_leaf_whose_skill_was_not_called_is_asked_for_again():
         skill, memory = policy.act(memory, obs)
         names += ABC[skill[0]]
         skill = skill if instead is None else np.array([instead])
-        memory = policy.watch(memory, None, LastCall(skill, np.int8([Why.OWN]), np.array([True])))
+        memory = policy.watch(
+            memory, None, LastCall(skill, np.int8([CallEnd.OWN]), np.array([True]))
+        )
     assert names == "abbbc"
 
 

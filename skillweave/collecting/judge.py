@@ -1,0 +1,107 @@
+"""Judging: the only place that calls a skill's reward, termination and success on transitions."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from skillweave.collecting.ends import CallEnd
+from skillweave.envs.infos import info_rows, told_success
+from skillweave.skills import Skill, asked
+from skillweave.types import Array, Step
+
+
+class Outcome:
+    """The outcome of n steps for a skill; each of its methods is called when first needed.
+
+    Args:
+        skill: None for the task itself: the environment's own reward and ends.
+        step: as the skill sees it; see ``seen_by``.
+        ids: (n,) the environments, for messages; None: all n.
+    """
+
+    def __init__(self, skill: Skill | None, step: Step, ids: Array | None = None) -> None:
+        self._skill, self._step, self._ids = skill, step, ids
+
+    @cached_property
+    def reward(self) -> Array:
+        """(n,) float32."""
+        return self._step.reward if self._skill is None else self._asked(self._skill, "reward")
+
+    @cached_property
+    def stops(self) -> Array:
+        """(n,) bool, the skill's own termination() is true."""
+        if self._skill is None or not self._skill.defines("termination"):
+            return np.zeros(len(self._step.reward), bool)
+        return self._asked(self._skill, "termination")
+
+    @cached_property
+    def terminated(self) -> Array:
+        """(n,) bool, the value of what follows is 0."""
+        terminated: Array = self._step.terminated | self.stops
+        return terminated
+
+    @cached_property
+    def truncated(self) -> Array:
+        """(n,) bool, cut by a time limit, the environment's or the skill's; never if terminated."""
+        truncated: Array = (self._step.truncated | self._step.timed_out) & ~self.terminated
+        return truncated
+
+    @cached_property
+    def success(self) -> Array | None:
+        """(n,) bool; of the task float64, NaN where unknown; None: the skill defines none."""
+        if self._skill is None:
+            return told_success(self._step.info, len(self._step.reward))
+        return self._asked(self._skill, "success") if self._skill.defines("success") else None
+
+    def _asked(self, skill: Skill, method: str) -> Array:
+        step = self._step
+        return asked(skill, method, step, len(step.reward), step.elapsed, self._ids)
+
+
+def judge(skill: Skill | None, step: Step, ids: Array | None = None) -> Outcome:
+    """Judge n steps by a skill; the arguments are those of ``Outcome``."""
+    return Outcome(skill, step, ids)
+
+
+def terminated_in_call(skill: Skill, step: Step, end: Array, ids: Array) -> Array:
+    """Return where the value of what follows a step in a call is 0, (n,) bool.
+
+    ``end`` (n,) already says whether the skill's own termination ended the call; only at the end of
+    an episode, which hides it, is the skill asked again.
+    """
+    terminated: Array = step.terminated | (end == CallEnd.OWN)
+    rows = np.flatnonzero((end == CallEnd.EPISODE) & ~terminated)
+    if len(rows) and skill.defines("termination"):
+        last = seen_by(skill, step, step.elapsed[rows], rows)
+        terminated[rows] = judge(skill, last, ids[rows]).stops
+    return terminated
+
+
+def seen_by(skill: Skill | None, step: Step, elapsed: Array, rows: Array | None = None) -> Step:
+    """Return a step as a skill sees it, whose calls have their own time and limit.
+
+    Args:
+        skill: None: there is no limit.
+        elapsed: (m,) steps of its calls so far, this one included.
+        rows: (m,) ascending, some rows of the step; None: all.
+    """
+    every = rows is None or len(rows) == len(step.reward)  # then there is nothing to copy
+    at = slice(None) if every else rows
+    terminated = step.terminated[at]
+    timed_out = np.zeros(len(terminated), bool)
+    if skill is not None and skill.max_steps is not None:
+        timed_out = (elapsed >= skill.max_steps) & ~terminated
+    info = step.info if rows is None or every else info_rows(step.info, rows, len(step.reward))
+    return Step(
+        obs=step.obs[at],
+        action=step.action[at],
+        next_obs=step.next_obs[at],
+        reward=step.reward[at],
+        terminated=terminated,
+        truncated=step.truncated[at],
+        timed_out=timed_out,
+        elapsed=elapsed,
+        info=info,
+    )

@@ -1,0 +1,436 @@
+"""The life of a call, in one place: who acts in N environments, and until when.
+
+Training, evaluation, deployment, ``OptionsEnv`` and the search for start states all let skills act
+through a ``Player``. Its memory is arrays with a row for each environment, changed in place. They
+are named as follows; a hierarchy that is skill ``i`` has the same names under ``i.``:
+
+- ``skill``: the running one, −1 where no call has started in the episode;
+- ``elapsed``: steps of its call; ``limit``: the length that was chosen, where one is;
+- ``end``: why the latest call ended (``CallEnd``), RUNNING where it has not;
+- ``i.<key>``: what the policy of skill ``i`` remembers;
+- ``selector.<key>``, ``guide.<key>``: the same of the selector and its guide; ``chances``: how
+  likely the guide's latest choices were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.collecting.acting import Acted, Acting
+from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.ends import CallEnd, Interruption
+from skillweave.collecting.guide import ActiveGuide, LastCall
+from skillweave.collecting.judge import judge, seen_by
+from skillweave.envs.infos import allowed_rows
+from skillweave.errors import PolicyError
+from skillweave.skills import apply_reflexes, path_of
+from skillweave.skills.outputs import blame
+from skillweave.types import Array, Memory, Memoryless, Policy, Step
+
+
+@dataclass(slots=True)
+class Turn:
+    """How a player acts in one step."""
+
+    deterministic: bool = True
+    """The selector acts greedily, else it samples."""
+    rng: np.random.Generator | None = None
+    """The source of chance for policies that sample."""
+    age: Array | None = None
+    """(N,), steps of the episodes so far, for messages."""
+    overridden: Array | None = None
+    """(N,) bool, set where a reflex acts."""
+
+
+class Actor(Protocol):
+    """Acts in some of N environments, with memory that is changed in place."""
+
+    watches: bool
+    """``observe`` has something to notice."""
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of n environments in which it has not acted yet."""
+        ...
+
+    def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
+        """Return actions (k, …) in environments ``rows`` (k,); ``obs`` and ``mask`` are of these.
+
+        Args:
+            memory: of all N environments.
+        """
+        ...
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> Any:
+        """Notice a step of environments ``rows`` (k,)."""
+        ...
+
+
+class PolicyActor:
+    """A ``Policy`` among the actors.
+
+    Args:
+        blamed: what messages say of its errors: "skill 'x': its policy's act()".
+    """
+
+    def __init__(self, policy: Policy, blamed: str) -> None:
+        self._policy, self._blamed = policy, blamed
+        self.watches = getattr(type(policy), "observe", None) is not Memoryless.observe
+
+    def start(self, n: int) -> Memory:
+        """Return the policy's fresh memory."""
+        return self._policy.start(n)
+
+    def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
+        """Return the policy's actions."""
+        before = {k: v[rows] for k, v in memory.items()}
+        how: Any = {"deterministic": turn.deterministic, "rng": turn.rng}
+        try:
+            actions, after = self._policy.act(before, obs, mask, **how)
+        except Exception as error:
+            blame(error, self._blamed)
+        _put(memory, rows, after)
+        return actions
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
+        """Let the policy notice a step."""
+        _put(memory, rows, self._policy.observe({k: v[rows] for k, v in memory.items()}, step))
+
+
+@dataclass
+class Choice:
+    """What a learner did in its latest step, and by what."""
+
+    rows: Array  # (k,) environments
+    obs: Array  # (k, …)
+    acted: Acted
+    mask: Array | None  # (k, A) bool
+    recurrent_state: Array | None  # (k, M), before
+
+
+class LearnerActor:
+    """A network that learns, among the actors; its latest choice is recorded.
+
+    Args:
+        acting: the network.
+    """
+
+    watches = False
+
+    def __init__(self, acting: Acting) -> None:
+        self.acting = acting
+        self.latest: Choice | None = None
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The space of its actions in the environment's units."""
+        space: gym.Space[Any] = self.acting.stacks[0][0].action_space
+        return space
+
+    def start(self, n: int) -> Memory:
+        """Return zeros (n, M), where the network is recurrent."""
+        size = self.acting.memory_size
+        return {"rnn": np.zeros((n, size), np.float32)} if size else {}
+
+    def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
+        """Return actions (k, …) in the environment's units, as the latest request says."""
+        before = memory["rnn"][rows] if "rnn" in memory else None
+        acted = self.acting.some(rows, obs, mask, before)
+        if acted.recurrent_state is not None:
+            memory["rnn"][rows] = acted.recurrent_state
+        self.latest = Choice(rows, obs, acted, mask, before)
+        actions: Array = self.acting.to_env(acted.action)
+        return actions
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
+        """Notice nothing."""
+
+
+class Player:
+    """Skills in calls, and the selector that starts them.
+
+    Args:
+        skills: with their policies; one that is a ``Player`` or has one is a hierarchy.
+        selector: chooses where a call has ended; None: the caller does, by ``begin``, or the guide.
+        guide: a ready selector that restricts the choices, or makes them.
+    """
+
+    watches = True
+
+    def __init__(
+        self, skills: SkillSet, selector: Any = None, guide: ActiveGuide | None = None
+    ) -> None:
+        self.skills, self.guide = skills, guide
+        self.actors = tuple(
+            _actor_of(policy, f"skill {path_of(skill)!r}: its policy's act()")
+            for skill, policy in zip(skills.skills, skills.policies, strict=True)
+        )
+        self.selector: Any = None
+        if selector is not None:
+            self.selector = _actor_of(selector, "the selector's act()")
+        self._ready = selector if hasattr(selector, "watch") else None
+        self._keys = tuple(self._named(i) for i in range(len(self.actors)))
+        self._selector_keys = () if self.selector is None else tuple(self.selector.start(1))
+        self._limits = tuple(skills.limit(i) for i in range(len(self.actors)))
+        self._stops = tuple(skill.defines("termination") for skill in skills.skills)
+        self.restricts = skills.restricts
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The environment's; all skills act in it."""
+        space: gym.Space[Any] = self.skills.policies[0].action_space
+        return space
+
+    @property
+    def below(self) -> dict[int, Player]:
+        """The skills that are hierarchies, by their place in the list."""
+        return {i: a for i, a in enumerate(self.actors) if isinstance(a, Player)}
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of n environments whose episodes start."""
+        memory: Memory = {
+            "skill": np.full(n, -1),
+            "elapsed": np.zeros(n, np.int64),
+            "end": np.full(n, CallEnd.EPISODE, np.int8),
+        }
+        if self.skills.lengths:
+            memory["limit"] = np.zeros(n, np.int64)
+        for i, actor in enumerate(self.actors):
+            memory |= {f"{i}.{k}": v for k, v in actor.start(n).items()}
+        if self.selector is not None:
+            memory |= {f"selector.{k}": v for k, v in self.selector.start(n).items()}
+        if self.guide is not None:
+            memory |= self.guide.start(n)
+            memory["chances"] = np.zeros((n, self.skills.choices), np.float32)
+        return memory
+
+    def restart(self, memory: Memory, rows: Array) -> None:
+        """Start new episodes in environments ``rows`` (k,): no call has started."""
+        memory["skill"][rows] = -1
+        memory["end"][rows] = CallEnd.EPISODE
+        chooses = {} if self.selector is None else self.selector.start(len(rows))
+        fresh = {f"selector.{k}": v for k, v in chooses.items()}
+        if self.guide is not None:
+            fresh |= self.guide.start(len(rows))
+        _put(memory, rows, fresh)
+
+    def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
+        """Return actions (k, …) in environments ``rows`` (k,), after decisions where calls ended.
+
+        Args:
+            memory: of all environments.
+            obs: (k, …).
+            mask: (k, A) bool, actions that the environments allow; None: all. Networks keep to it;
+                policies made elsewhere and reflexes may take another action.
+        """
+        ended = np.flatnonzero(memory["end"][rows] != CallEnd.RUNNING)
+        if len(ended):
+            every = len(ended) == len(rows)
+            self._decide(memory, rows[ended], obs if every else obs[ended], turn)
+        return self.act_in_calls(memory, rows, obs, mask, turn)
+
+    def act_in_calls(
+        self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn
+    ) -> Array:
+        """Return actions (k, …) as of ``act``, where calls run in all environments ``rows``."""
+        running, actions = memory["skill"][rows], None
+        own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden)
+        for i, actor in enumerate(self.actors):
+            mine = np.flatnonzero(running == i)
+            if not len(mine):
+                continue
+            if len(mine) == len(rows):
+                actions = actor.act(self.of_skill(memory, i), rows, obs, mask, own)
+                break
+            allowed = allowed_rows(mask, mine)
+            some = actor.act(self.of_skill(memory, i), rows[mine], obs[mine], allowed, own)
+            if actions is None:
+                actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
+            actions[mine] = some
+        assert actions is not None, "no call runs"
+        if self.skills.reflexes:
+            reflexes = self.skills.reflexes
+            actions, holds = apply_reflexes(reflexes, obs, actions, self.action_space)
+            if turn.overridden is not None:
+                turn.overridden[rows] |= holds
+        return actions
+
+    def begin(self, memory: Memory, rows: Array, choice: Array) -> None:
+        """Start the calls of ``choice`` (k,) in environments ``rows`` (k,).
+
+        A skill that is called again at once, in the same episode, goes on with its memory; after
+        another skill's call, or in a new episode, it starts with a fresh one.
+        """
+        skill, lengths = self.skills.skill_of(choice), self.skills.lengths
+        if lengths:
+            memory["limit"][rows] = np.array(lengths)[choice % len(lengths)]
+        changed = memory["skill"][rows] != skill
+        memory["skill"][rows] = skill
+        memory["elapsed"][rows] = 0
+        memory["end"][rows] = CallEnd.RUNNING
+        for i, keys in enumerate(self._keys):
+            if keys and len(fresh := rows[changed & (skill == i)]):
+                _put(self.of_skill(memory, i), fresh, self.actors[i].start(len(fresh)))
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> Array:
+        """Notice a step of environments ``rows`` (k,); return why calls ended, (k,) int8.
+
+        Args:
+            step: of these environments; ``elapsed`` is the time as whoever calls this player counts
+                it, each skill sees that of its own call.
+        """
+        memory["elapsed"][rows] += 1
+        elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
+        end = np.zeros(len(rows), np.int8)
+        if self.skills.lengths:
+            end[elapsed >= memory["limit"][rows]] = CallEnd.LIMIT
+        for i, limit in enumerate(self._limits):
+            if limit is not None:
+                end[(running == i) & (elapsed >= limit)] = CallEnd.LIMIT
+        for i, actor in enumerate(self.actors):
+            if actor.watches or self._stops[i]:
+                mine = np.flatnonzero(running == i)
+                if len(mine):
+                    self._observe_skill(memory, i, rows, mine, elapsed[mine], step, end)
+        if self.skills.interruption is not None:
+            self._interrupt(self.skills.interruption, running, step.next_obs, end)
+        end[step.terminated | step.truncated] = CallEnd.EPISODE
+        memory["end"][rows] = end
+        self._watch(memory, rows, step, running, elapsed, end)
+        return end
+
+    def allowed(self, memory: Memory, rows: Array, obs: Array) -> Array | None:
+        """Return the choices that may be made next in environments ``rows`` (k,), (k, choices).
+
+        Nothing changes: of a guide, only what is known before it sees ``obs`` (k, …) counts. None:
+        all, always. Where none is left, all are True.
+        """
+        if not self.restricts and self.guide is None:
+            return None
+        may = self.skills.startable(obs)
+        if self.guide is not None:
+            may = self.guide.ahead(memory, rows, may)
+        return may | ~may.any(axis=1, keepdims=True)
+
+    def of_skill(self, memory: Memory, i: int) -> Memory:
+        """Return the memory of skill ``i``'s policy, the same arrays under its own names."""
+        return {k: memory[f"{i}.{k}"] for k in self._keys[i]}
+
+    def of_selector(self, memory: Memory) -> Memory:
+        """Return the selector's memory, the same arrays under its own names."""
+        return {k: memory[f"selector.{k}"] for k in self._selector_keys}
+
+    def _decide(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> None:
+        """Choose in environments ``rows`` (k,), and start the calls."""
+        may, guide = self.skills.mask(obs, None if turn.age is None else turn.age[rows]), self.guide
+        greedy = turn.deterministic and self.skills.greedy_selector
+        if guide is not None:
+            may = self.skills.startable(obs) if may is None else may
+            chances = guide.ask(memory, rows, obs, may, turn.deterministic, turn.rng)
+            memory["chances"][rows] = chances
+            may = chances > 0.0 if guide.restricts else may
+        if self.selector is None:
+            assert may is not None, "nothing chooses"
+            choice = may.argmax(axis=1)  # the guide has left one
+        else:
+            how = Turn(greedy, turn.rng, turn.age)
+            choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
+        self.begin(memory, rows, choice)
+
+    def _observe_skill(
+        self, memory: Memory, i: int, rows: Array, mine: Array, elapsed: Array, step: Step,
+        end: Array,
+    ) -> None:  # fmt: skip
+        """Let skill ``i`` notice a step in ``rows[mine]``; where its call ends, set ``end``."""
+        skill, actor = self.skills.skills[i], self.actors[i]
+        part = seen_by(skill, step, elapsed, mine)
+        if actor.watches:
+            below = self.of_skill(memory, i)
+            actor.observe(below, rows[mine], part)
+            if isinstance(actor, Player) and actor.restricts:
+                end[mine[actor.is_stuck(below, rows[mine], part.next_obs)]] = CallEnd.LIMIT
+        if self._stops[i]:
+            end[mine[judge(skill, part, rows[mine]).stops]] = CallEnd.OWN
+
+    def is_stuck(self, memory: Memory, rows: Array, obs: Array) -> Array:
+        """(k,) bool, the selector must decide, but no skill may start; its own call ends there."""
+        stuck = np.zeros(len(rows), bool)
+        ended = np.isin(memory["end"][rows], (CallEnd.RUNNING, CallEnd.EPISODE), invert=True)
+        waits = np.flatnonzero(ended)
+        if len(waits):
+            stuck[waits] = ~self.skills.startable(obs[waits]).any(axis=1)
+        return stuck
+
+    def _interrupt(self, how: Interruption, running: Array, obs: Array, end: Array) -> None:
+        """End calls where a new decision is worth clearly more, in place."""
+        rows = np.flatnonzero(end == CallEnd.RUNNING)
+        if not len(rows):
+            return
+        worth, n = how.worth(obs[rows]), len(self.actors)
+        goes_on = worth[np.arange(len(rows)), running[rows]]
+        may = self.skills.startable(obs[rows])[:, :: max(1, len(self.skills.lengths))]
+        again = np.where(may.any(axis=1), worth[:, n], -np.inf)  # else no skill could be called
+        end[rows[again - goes_on > how.margin]] = CallEnd.INTERRUPTED
+
+    def _watch(
+        self, memory: Memory, rows: Array, step: Step, running: Array, elapsed: Array, end: Array
+    ) -> None:
+        """Show a step to a guide and to a ready selector, and how the last calls ended."""
+        if self.guide is None and self._ready is None:
+            return
+        last = LastCall(running, end, self.succeeded(rows, step, running, elapsed, end))
+        if self.guide is not None:
+            self.guide.watch(memory, rows, step, last)
+        if self._ready is not None:
+            below = self.of_selector(memory)
+            before = {k: v[rows] for k, v in below.items()}
+            _put(below, rows, self._ready.watch(before, step, last))
+
+    def succeeded(
+        self, rows: Array, step: Step, running: Array, elapsed: Array, end: Array
+    ) -> Array:
+        """(k,) bool: the calls that are over have succeeded.
+
+        By the skill's ``success``; of a skill without one, if its own termination ended the call.
+        """
+        found: Array = end == CallEnd.OWN
+        for i, skill in enumerate(self.skills.skills):
+            if not skill.defines("success"):
+                continue
+            over = np.flatnonzero((running == i) & (end != CallEnd.RUNNING))
+            if len(over):
+                part = seen_by(skill, step, elapsed[over], over)
+                found[over] = judge(skill, part, rows[over]).success
+        return found
+
+    def _named(self, i: int) -> tuple[str, ...]:
+        """The names of what skill ``i``'s policy remembers, checked."""
+        fresh = self.actors[i].start(1)
+        for k, v in fresh.items():
+            if v.dtype.kind not in "biuf":  # a checkpoint could not hold it
+                raise PolicyError(
+                    f"skill {self.skills.skills[i].name!r}: its policy remembers {k!r} as "
+                    f"{v.dtype}; a memory is an array of numbers whose first axis is the "
+                    "environment"
+                )
+        return tuple(fresh)
+
+
+def player_of(policy: Any) -> Player | None:
+    """Return the player of a policy that is a hierarchy; None: it is none."""
+    found = policy if isinstance(policy, Player) else getattr(policy, "player", None)
+    return found if isinstance(found, Player) else None
+
+
+def _actor_of(policy: Any, blamed: str) -> Any:
+    if isinstance(policy, LearnerActor):
+        return policy
+    return player_of(policy) or PolicyActor(policy, blamed)
+
+
+def _put(memory: Memory, rows: Array, values: Memory) -> None:
+    for k, v in values.items():
+        memory[k][rows] = v
