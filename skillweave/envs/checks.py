@@ -184,7 +184,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         else:
             try:
                 mask = self._masks()
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise self._wrong(f"action_masks() raised {told(error)}") from error
         others = {key: value for key, value in info.items() if key != MASK}
         if mask is None:  # everything is allowed
