@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.common import median, report, table
-from benchmarks.grouped import regroup
+from benchmarks.grouped import act_by, regroup
 from skillweave import Hierarchy, recipes
 from skillweave.skills import Skill
 from skillweave.types import Policy
@@ -77,7 +77,7 @@ def score(h: Hierarchy, seed: int) -> tuple[float, float]:
 def alone(policy: Policy, seed: int) -> tuple[float, float]:
     h = recipes.load("lunar-lander")
     skill: Skill = h.skill("landing")
-    skill.policy = policy
+    act_by(skill, policy)
     h.skills = [skill]
     regroup(h, selector_steps=1)
     return score(h, seed)
@@ -94,7 +94,7 @@ def main() -> None:
         for name, change in SELECTORS.items():
             h = recipes.load("lunar-lander")
             for skill in h.skills:
-                skill.policy = policies[skill.name]
+                act_by(skill, policies[skill.name])
             change(h)
             found.setdefault(name, []).append(score(h, seed))
         for name, settings in LANDINGS.items():

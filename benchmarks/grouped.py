@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
-from skillweave import Apart, Hierarchy, Selection, Together, TrainDefaults
+from skillweave import Apart, Hierarchy, Selection, Skill, Together, TrainDefaults
+from skillweave.types import Policy
 
 GROUPS: dict[str, Any] = {
     "apart": Apart,
@@ -47,3 +48,8 @@ def regroup(hierarchy: Hierarchy, **settings: Any) -> None:
     own = {name: getattr(hierarchy, name) for name in GROUPS}
     for name, value in grouped(own | settings).items():
         setattr(hierarchy, name, value)
+
+
+def act_by(skill: Skill, policy: Policy) -> None:
+    """Let a skill act by a policy that is there already, without its settings of training."""
+    skill.policy, skill.algorithm, skill.steps = policy, None, None

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import median, report, table, workers
+from benchmarks.grouped import act_by
 from skillweave import DQN, Hierarchy, Network, recipes
 
 SELECTOR = DQN(
@@ -59,7 +60,7 @@ def selected(folder: Path, seed: int, dqn: bool) -> float:
     shipped: Any = Hierarchy.pretrained("lunar-lander")
     hierarchy = recipes.load("lunar-lander")
     for skill, policy in zip(hierarchy.skills, shipped.policy.skills.policies, strict=True):
-        skill.policy = policy
+        act_by(skill, policy)
     if dqn:
         hierarchy.selector = SELECTOR
     run = hierarchy.train(folder, seed=seed, quiet=True)

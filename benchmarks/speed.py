@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import cast
 
 from benchmarks.common import median, recorded, report, table, warm_up
+from benchmarks.grouped import act_by
 from skillweave import Hierarchy, HierarchyPolicy, recipes
 
 
@@ -49,7 +50,7 @@ def selector(seed: int) -> tuple[float, float]:
     run = Hierarchy.pretrained("lunar-lander")
     hierarchy, woven = run.hierarchy, cast(HierarchyPolicy, run.policy)
     for skill, policy in zip(hierarchy.skills, woven.skills.policies, strict=True):
-        skill.policy = policy
+        act_by(skill, policy)
     return trained(hierarchy, seed, False)
 
 

@@ -31,7 +31,7 @@ from typing import Any
 
 from benchmarks.chains import TASKS, Task
 from benchmarks.common import cases_asked, median, report, table, workers
-from benchmarks.grouped import PLACES, regroup
+from benchmarks.grouped import PLACES, act_by, regroup
 from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.suite import Seldom, Shaped
@@ -258,7 +258,7 @@ def without_selector(
     """F4: the score of skills that were learnt when chosen by lot, and of each called alone."""
     policy: Any = run.policy
     for skill, learnt in zip(same.skills, policy.skills.policies, strict=True):
-        skill.policy = learnt
+        act_by(skill, learnt)
     greedy = policy.skills.greedy
     regroup(same, greedy_skills=greedy)  # as in the run itself
     chosen = by_lot(same, seed).train(path, seed=seed, quiet=True)

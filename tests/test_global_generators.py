@@ -159,6 +159,7 @@ USES = {
     "evaluate": lambda run, to: run.evaluate(2, quiet=True),
     "evaluate a skill": lambda run, to: run.evaluate(2, skill="left", quiet=True),
     "render": lambda run, to: run.render(to / "film.gif", quiet=True),
+    "make_options_env": lambda run, to: sw.make_options_env(run, 2, 0.99).close(),
     "report": lambda run, to: run.report(to / "report.html", episodes=2, films=0, quiet=True),
 }
 
@@ -175,6 +176,16 @@ def test_generators_of_the_caller_stand_where_they_stood_after(use, everywhere, 
         warnings.simplefilter("ignore")
         USES[use](everywhere, tmp_path)
     assert (random.random(), np.random.random(), torch.rand(())) == expected
+
+
+def test_environments_of_skills_are_made_from_the_seed(everywhere):
+    made = []
+    for number, seed in enumerate((1, 1, 2)):
+        disturb(number)
+        env = sw.make_options_env(everywhere, 2, 0.99, seed=seed)
+        made.append([one.unwrapped.weight for one in env.engine._envs.envs])
+        env.close()
+    assert made[0] == made[1] != made[2]
 
 
 def test_two_films_of_a_run_are_the_same(everywhere, tmp_path):

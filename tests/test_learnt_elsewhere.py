@@ -106,6 +106,21 @@ def test_settings_that_come_later_are_refused_too():
             declare(skill)
 
 
+@pytest.mark.parametrize("first", ["policy", "algorithm"])
+def test_a_policy_and_settings_of_training_on_one_object_are_refused_in_any_order(first):
+    class Ready(sw.Skill):
+        def __init__(self):
+            for name in sorted(("policy", "algorithm"), key=lambda name: name != first):
+                setattr(self, name, {"policy": right, "algorithm": SMALL}[name])
+
+    says = r"its algorithm would be ignored: leave out algorithm \(or .*skill\.algorithm = None\)"
+    with pytest.raises(sw.SkillweaveError, match=says):
+        declare(Ready())
+    skill = Ready()
+    skill.algorithm = None
+    assert not declare(skill).any_skill_learns
+
+
 def test_a_ready_skill_of_another_run_takes_none_either(tmp_path):
     run = sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", quiet=True)
     with pytest.raises(sw.SkillweaveError, match=r"'moves' has a policy.* its steps would be"):

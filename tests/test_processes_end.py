@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 PROGRAM = """
-import multiprocessing, os, socket, sys, time
+import multiprocessing, os, socket, subprocess, sys, time
 import gymnasium as gym, numpy as np
 import skillweave as sw
 
@@ -30,12 +30,16 @@ class Env(gym.Env):
     def __init__(self):
         if multiprocessing.parent_process() is not None:
             open(f"pid-{os.getpid()}", "w").close()
+            if what == "children":
+                open(f"child-{subprocess.Popen(['sleep', '60']).pid}", "w").close()
             if what == "constructor":
                 time.sleep(1000)
     def reset(self, *, seed=None, options=None):
         return np.zeros(1, np.float32), {}
     def step(self, action):
         if multiprocessing.parent_process() is not None:
+            if what == "children":
+                forever()
             if what in blocks:
                 blocks[what]()
             time.sleep(0.002)
@@ -70,7 +74,7 @@ def begun(folder: Path) -> set[int]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
-@pytest.mark.parametrize("what", [*CLOSES, "constructor", "swallows"])
+@pytest.mark.parametrize("what", [*CLOSES, "constructor", "swallows", "children"])
 def test_processes_end_soon_after_their_parent_was_killed(what, tmp_path):
     (tmp_path / "program.py").write_text(PROGRAM)
     paths = {"PYTHONPATH": str(Path(__file__).parents[1])}
@@ -84,6 +88,8 @@ def test_processes_end_soon_after_their_parent_was_killed(what, tmp_path):
     parent.wait()
     pids, until = begun(tmp_path), time.monotonic() + 10
     assert len(pids) == 2
+    pids |= {int(file.name.split("-")[1]) for file in tmp_path.glob("child-*")}
+    assert (len(pids) > 2) == (what == "children")
     try:
         while any(map(alive, pids)) and time.monotonic() < until:
             time.sleep(0.1)

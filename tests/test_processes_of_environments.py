@@ -103,6 +103,34 @@ def test_processes_that_environments_leave_in_workers_are_ended(env, tmp_path, c
     assert capfd.readouterr().err == ""
 
 
+class Killed(Simulated):
+    """Is killed once, in its second step, with a process that no module of Python waits for."""
+
+    def __init__(self):
+        self.simulator = subprocess.Popen(["sleep", "30"])
+        (self.folder / str(self.simulator.pid)).touch()
+
+    def step(self, action):
+        once = self.folder / "once"
+        if self.t == 1 and multiprocessing.parent_process() is not None and once.exists():
+            once.unlink(missing_ok=True)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+
+    def close(self):
+        self.simulator.terminate()
+        self.simulator.wait()
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+def test_processes_of_a_worker_that_was_killed_are_ended(tmp_path):
+    (tmp_path / "once").touch()
+    train(Killed, tmp_path, 2)
+    assert not (tmp_path / "once").exists()
+    pids = {int(f.name) for f in tmp_path.iterdir() if f.name.isdigit()}
+    assert not any(map(alive, pids))
+
+
 PROGRAM = """
 import sys, time
 sys.path.insert(0, {tests!r})

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.grouped import regroup
+from benchmarks.grouped import act_by, regroup
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Seldom, Shaped, Suite, Task
@@ -150,7 +150,7 @@ class Bench:
         hierarchy = self.suite.hierarchy(task, skills)
         for skill in hierarchy.skills:
             if skill.policy is None:
-                skill.policy = skills[skill.name]
+                act_by(skill, skills[skill.name])
         return by_lot(hierarchy, self.seed)
 
     def _ready(self, task: Task, agent: str, hierarchy: Hierarchy) -> Run:

@@ -93,7 +93,7 @@ def scheduled(config: Any, remaining: float) -> float:
     try:
         value = schedule(remaining)
         rate = float(value)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise SkillweaveError(f"{where}: {schedule}({remaining:g}) raised {told(error)}") from error
     if not _is_rate(rate):
         raise SkillweaveError(

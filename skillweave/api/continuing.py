@@ -179,8 +179,6 @@ MADE_AT_THE_END = (
     "best",
     "sha256",
     "policies",
-    "metrics_bytes",
-    "lineage_bytes",
 )
 """Of a stage's entry what training writes again when it has continued."""
 

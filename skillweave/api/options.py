@@ -9,6 +9,7 @@ from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short, whole_number
+from skillweave.seeding import Seeds, global_generators
 
 
 @checked_names
@@ -22,7 +23,7 @@ def make_options_env(
             ready policy.
         num_envs: environments side by side.
         gamma: γ of one environment step, over 0 and at most 1.
-        seed: of skills that sample.
+        seed: of skills that sample, and of environments that draw when they are made.
 
     Returns:
         ``OptionsEnv``; its ``skills`` go into ``HierarchyPolicy`` with the selector once trained.
@@ -47,4 +48,6 @@ def make_options_env(
                 "declare the skill with a policy"
             )
         skills = hierarchy.skill_set([ready[s.name] for s in hierarchy.skills])
-    return OptionsEnv(make_engine(spec, num_envs), skills, float(gamma), seed)
+    with global_generators(Seeds(seed) / "options"):
+        engine = make_engine(spec, num_envs)
+    return OptionsEnv(engine, skills, float(gamma), seed)

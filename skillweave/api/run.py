@@ -93,7 +93,7 @@ class Run:
                 environment's; ``skills`` has its call in each episode, by its own reward and
                 success: from where it may start to its own end.
             num_envs: environments that exist at once; None: at most as many as in training. It
-                does not change the result of a greedy policy.
+                does not change the result of a greedy policy; what is sampled differs with it.
             max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
             save: keep the result in the run's directory, where ``info`` finds it, instead of the
                 one before. A sampled one is kept beside the score, and does not replace it. Not

@@ -19,7 +19,7 @@ from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.collecting.where import HERE, Where
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import Interrupted, SkillweaveError
-from skillweave.evolution.plan import Evolve, make_learner, plan
+from skillweave.evolution.plan import Evolve, check_several, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.nesting import copied, every_hierarchy
@@ -178,6 +178,7 @@ def _plan(
     """Check everything, and write into a manifest's stages how they are trained; the spaces."""
     observation_space, action_space = declared.check_spaces()
     plan(content["stages"], evolve)
+    check_several(content["stages"], declared.spec)
     check_stages(content["stages"], content["eval_every"], content["keep"])
     spec = declared.spec
     _check(cluster)

@@ -18,6 +18,7 @@ from time import monotonic
 from typing import Any
 
 from skillweave.collecting.channel import Channel, channels
+from skillweave.collecting.process_groups import end_group
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.collecting.start_methods import GUARD
 from skillweave.collecting.worker_process import TorchModes, work
@@ -179,6 +180,8 @@ class ProcessWorker:
         """Return words for how its process ended."""
         self.process.join(PATIENCE)
         code = self.process.exitcode
+        if code is not None:
+            end_group(self.process.pid)
         if code is None:
             return f"closed its connection while it was {self._asked}"
         if code < 0:
@@ -270,6 +273,9 @@ def close_all(workers: Sequence[ProcessWorker]) -> None:
                 getattr(process, end)()
             process.join(max(0.0, until - monotonic()))
         until = monotonic() + PATIENCE / 2
+    for worker in workers:
+        if worker.process is not None and worker.process.exitcode:
+            end_group(worker.process.pid)  # it was killed before its environments were closed
     for worker in workers:
         _tell_last(worker)
         worker.forget()

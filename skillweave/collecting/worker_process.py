@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from skillweave.collecting.channel import Channel
+from skillweave.collecting.process_groups import kill_group, lead_group
 from skillweave.collecting.workers import SentError, Station, error_to_send
 from skillweave.notices import Notices, collect_notices
 from skillweave.signals import handle_here
@@ -75,6 +76,7 @@ def work(
     """
     import torch
 
+    lead_group()
     handle_here(signal.SIGINT, signal.SIG_IGN)  # at Ctrl-C the parent closes its workers
     handle_here(signal.SIGTERM, _end)
     torch.set_num_threads(1)
@@ -149,7 +151,7 @@ def _end_with(parent: int | None) -> None:
         with suppress(OSError, ValueError):
             signal.pthread_kill(main, signal.SIGTERM)
         sleep(GRACE)
-        os.kill(os.getpid(), signal.SIGKILL)
+        kill_group()
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
 

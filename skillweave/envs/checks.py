@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
 from skillweave.errors import SkillweaveError
 from skillweave.messages import short, told
@@ -183,7 +184,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         else:
             try:
                 mask = self._masks()
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise self._wrong(f"action_masks() raised {told(error)}") from error
         others = {key: value for key, value in info.items() if key != MASK}
         if mask is None:  # everything is allowed
@@ -317,6 +318,7 @@ class Watch:
         self._places = tuple(_numbers_in(space))
         self._elapsed = np.zeros(num_envs, np.int64)
         self._told_coarse = first != 0  # the first of several speaks for all
+        self._bounds = ImageBounds(name, space) if first == 0 else None
 
     def begun(self, obs: Array, ids: Array | None = None) -> Array:
         """The first observations of environments ``ids`` (None: all), unchanged.
@@ -365,6 +367,8 @@ class Watch:
             if (coarse or not real) and not self._told_coarse and size.max(initial=0) > COARSE:
                 self._told_coarse = True
                 self._tell_coarse(float(size.max()), place, part.dtype)
+        if self._bounds is not None and not self._bounds.see(obs):
+            self._bounds = None
 
     def _out_of_range(
         self, part: Array, place: tuple[str, ...], ids: Array | None

@@ -178,8 +178,7 @@ class GymnasiumEngine:
         self._envs.close()
 
     def _next_seed(self, row: int) -> int:
-        node = np.random.SeedSequence(self._root, spawn_key=(row, int(self._episode[row])))
-        return int(node.generate_state(1, np.uint32)[0] >> 1)
+        return episode_seed(self._root, row, int(self._episode[row]))
 
     def _begin(self, ids: Array) -> Array:
         """Reset environments ``ids`` to their seeds."""
@@ -216,6 +215,12 @@ class GymnasiumEngine:
         self._watch.stepped(raw, ids)
         raw.truncated = (truncated | self._watch.too_long(ids)) & ~terminated
         return raw
+
+
+def episode_seed(root: int, row: int, episode: int) -> int:
+    """Return the seed of an episode of environment ``row``, where all were reset to ``root``."""
+    node = np.random.SeedSequence(root, spawn_key=(row, episode))
+    return int(node.generate_state(1, np.uint32)[0] >> 1)
 
 
 def checksums(obs: Array) -> Array:

@@ -249,7 +249,8 @@ class Evolution:
     generations: int = 20
     """How often they are compared; what is left of the budget is shared evenly between them."""
     episodes: int = 10
-    """Episodes that a member's fitness is the mean return of; the same starts for all."""
+    """Episodes that a member's fitness is the mean return of; the same starts for all. They are
+    played in at most as many environments as a member trains in (``num_envs``)."""
     target: float | None = None
     """Fitness at which evolution ends early; None: never."""
     start: Literal["config", "random"] = "config"

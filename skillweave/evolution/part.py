@@ -17,11 +17,12 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector, joined_from, parted
 from skillweave.collecting.group import Collectors
 from skillweave.envs.joined import JoinedEngines
+from skillweave.errors import EnvError, SkillweaveError
+from skillweave.evolution.fitness import FitnessArena
 from skillweave.evolution.stacks import Member, grouped, join, split
 from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
-from skillweave.training.arena import returns_of
 from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
 from skillweave.training.loop import Progress, train
@@ -55,11 +56,15 @@ class Part:
         self.spaces, self.row_steps = spaces_of(scene), scene.row_steps
         self._seeds, self._first, each = seeds, first, config.num_envs
         self.replays = make_algorithm(config, *self.spaces).store == "replay"
-        self.places = [
-            scene.learners_collector(each, None, (first + i) * each, self.replays)
-            for i in range(count)
-        ]
+        self.places: list[Collector] = []
         """Where members act: an heir goes on with its place's open episodes."""
+        try:
+            for i in range(first, first + count):
+                place = scene.learners_collector(each, None, i * each, self.replays)
+                self.places.append(place)
+        except SkillweaveError as error:
+            self.close()
+            raise too_many(error, f"{count * each} of them to train in") from error
         self.num_envs = count * each
         self.episodes = Episodes(scene.log_info)
         self.rounds = 0
@@ -169,10 +174,10 @@ class Part:
         """Which logged keys of ``info`` occurred."""
         return self.episodes.tally
 
-    def fitness(self, members: Sequence[Member], arena: Collector, seeds: Seeds) -> Array:
+    def fitness(self, members: Sequence[Member], arena: FitnessArena, seeds: Seeds) -> Array:
         """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
         return np.array([
-            -np.inf if has_diverged(m) else score(policy_of(m, self.spaces), arena, seeds)
+            -np.inf if has_diverged(m) else arena.score(policy_of(m, self.spaces), seeds)
             for m in members
         ])  # fmt: skip
 
@@ -218,6 +223,14 @@ class Part:
             place.close()
 
 
+def too_many(error: SkillweaveError, needed: str) -> EnvError:
+    """Return the error of a population for which not enough environments could be made."""
+    return EnvError(
+        f"{error}. A population needs several environments at once, here {needed}: if there can be "
+        "no more, give it fewer members (population) and num_envs, or leave out evolve"
+    )
+
+
 def spaces_of(scene: Scene) -> tuple[Any, Any]:
     """What algorithms are made for: (observation space, action space)."""
     return scene.observation_space, scene.action_space
@@ -237,12 +250,6 @@ def _count(members: Sequence[Member], steps: int) -> None:
 def policy_of(member: Member, spaces: tuple[Any, Any]) -> AgentPolicy:
     """What a member has learnt."""
     return AgentPolicy.of(member.algorithm(spaces), member.state)
-
-
-def score(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> float:
-    """Mean return of an episode in each environment; −inf if it is not finite."""
-    returns = returns_of(policy, arena, seeds)
-    return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
 
 
 def has_diverged(member: Member) -> bool:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from typing import Any
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.collecting.where import HERE, Where
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
+from skillweave.evolution.part import too_many
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
@@ -42,6 +45,22 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
         if how.target is not None:
             entry["target"] = {"of": "return", "at_least": how.target}
         entry["budget"] *= how.population
+
+
+def check_several(stages: Sequence[Mapping[str, Any]], spec: EnvSpec) -> None:
+    """Raise an EnvError where a stage evolves, and there cannot be two environments at once.
+
+    Stages before it would be trained in vain.
+    """
+    evolving = [entry for entry in stages if entry.get("evolution")]
+    if not evolving:
+        return
+    needed = max(e["evolution"]["population"] * e["algorithm"]["num_envs"] for e in evolving)
+    with closing(spec.make()):
+        try:
+            spec.make(number=1).close()
+        except SkillweaveError as error:
+            raise too_many(error, f"{needed} of them to train in") from error
 
 
 def make_learner(stages: list[dict[str, Any]], evolve: Evolve, where: Where = HERE) -> MakeLearner:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.collector import Collector
 from skillweave.evolution.config import Evolution
+from skillweave.evolution.fitness import FitnessArena
 from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.part import OnGenerationTick, Part, policy_of, spaces_of
 from skillweave.evolution.selection import select
@@ -83,7 +83,7 @@ class Population:
         """Train every member until it has ``until`` steps."""
         self.part.train(self.members, until, schedule_steps, seeds, on_tick)
 
-    def fitness(self, arena: Collector, seeds: Seeds) -> Array:
+    def fitness(self, arena: FitnessArena, seeds: Seeds) -> Array:
         """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
         return self.part.fitness(self.members, arena, seeds)
 

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import joined_states, split_states
 from skillweave.collecting.where import MakeWorkers
+from skillweave.evolution.fitness import FitnessArena
 from skillweave.evolution.part import OnGenerationTick, Part
 from skillweave.evolution.stacks import Member
 from skillweave.seeding import Seeds, seed_global_generators
@@ -107,7 +107,7 @@ class Parts:
             for member, state, steps in zip(group, trained.states, trained.steps, strict=True):
                 member.state, member.steps = type(member.state)(**_tensors(state)), steps
 
-    def fitness(self, members: Sequence[Member], arena: Collector, seeds: Seeds) -> Array:
+    def fitness(self, members: Sequence[Member], arena: FitnessArena, seeds: Seeds) -> Array:
         """As ``Part.fitness``, in arenas of the parts' own."""
         tasks = [(_sent(group), seeds) for group in self._divided(members)]
         found = self._workers.ask("fitness", tasks, kept=False)
@@ -145,8 +145,8 @@ class Parts:
 class StationedPart:
     """A part where its worker is: it speaks of plain data alone."""
 
-    def __init__(self, part: Part, scene: Scene, episodes: int) -> None:
-        self._part, self._arena = part, scene.collector(episodes, None)
+    def __init__(self, part: Part, arena: FitnessArena) -> None:
+        self._part, self._arena = part, arena
 
     def train(self, task: Training) -> Trained:
         """Train members."""
@@ -159,10 +159,10 @@ class StationedPart:
 
     def fitness(self, task: tuple[Sequence[Sent], Seeds]) -> tuple[Array, int]:
         """Their fitness, and the environment steps that it took."""
-        before = self._arena.engine.steps_made
+        before = self._arena.steps_made
         members = _received(task[0], self._part.spaces)
         found = self._part.fitness(members, self._arena, task[1])
-        return found, self._arena.engine.steps_made - before
+        return found, self._arena.steps_made - before
 
     def state(self) -> dict[str, Array]:
         """What ``restore`` needs."""
@@ -189,7 +189,8 @@ def _stationed(
 ) -> StationedPart:
     seed_global_generators(seeds / "global" / number)
     first, end = bounds[number], bounds[number + 1]
-    return StationedPart(Part(scene, config, seeds, end - first, first), scene, episodes)
+    part = Part(scene, config, seeds, end - first, first)
+    return StationedPart(part, FitnessArena(scene, episodes, config.num_envs))
 
 
 def _alone(config: AlgorithmConfig) -> AlgorithmConfig:

@@ -19,8 +19,9 @@ from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.collecting.where import HERE, Where
 from skillweave.evolution.config import evolution_from_json
+from skillweave.evolution.fitness import FitnessArena
 from skillweave.evolution.lineage import lineage_of, settings_of
-from skillweave.evolution.part import score, spaces_of
+from skillweave.evolution.part import spaces_of
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, Origin
@@ -72,7 +73,7 @@ class EvolvingPopulation:
 
     def open(self) -> None:
         """Make the environments where fitness is measured."""
-        self.arena = self.stage.scene.collector(self.evolution.episodes, None)
+        self.arena = FitnessArena(self.stage.scene, self.evolution.episodes, self.config.num_envs)
         self._open.callback(self.arena.close)
         self.spaces = spaces_of(self.stage.scene)
         self.parts = self._parts()
@@ -171,7 +172,7 @@ class EvolvingPopulation:
     @property
     def _measured(self) -> int:
         """Environment steps that measuring fitness has taken in this process's time."""
-        return self.arena.engine.steps_made + self.population.part.steps_elsewhere
+        return self.arena.steps_made + self.population.part.steps_elsewhere
 
     def _finish(self) -> AgentPolicy:
         """The policy that the stage ends with."""
@@ -208,7 +209,7 @@ class EvolvingPopulation:
     def _keep_best(self, fitness: Array, seeds: Seeds) -> None:
         """Keep the best policy so far: the old one plays this generation's episodes, too."""
         if self.best is not None:
-            self.best.fitness = score(self.best.policy, self.arena, seeds)
+            self.best.fitness = self.arena.score(self.best.policy, seeds)
         # Of equals the latest: it has learnt for longer.
         if self.best is None or fitness.max() >= self.best.fitness:
             member = self.population.members[int(fitness.argmax())]

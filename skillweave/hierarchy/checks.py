@@ -75,20 +75,23 @@ _OF_TRAINING = ("algorithm", "steps", "task_weight", "target_return", "target_su
 def _check_untrained(skill: Skill) -> None:
     """Raise a SkillweaveError where a skill with a policy says how it is to be trained.
 
-    A policy that is given later (to the object, or in a subclass) takes the place of a training:
-    what was said of it before is no mistake.
+    A policy that is given later (to the object of a class, or in a subclass) takes the place of a
+    training: what was said of it before is no mistake.
     """
     given = _distance(skill, "policy")
     ignored = [
         field
         for field in _OF_TRAINING
-        if given and getattr(skill, field) is not None and _distance(skill, field) <= given
+        if getattr(skill, field) is not None and _distance(skill, field) <= given
     ]
     if ignored:
         fields = " and ".join(ignored)
+        how = f"leave out {fields}"
+        if not given:  # perhaps a function has made the object and set them
+            how += f" (or set them to None: {', '.join(f'skill.{f} = None' for f in ignored)})"
         raise SkillweaveError(
             f"skill {skill.name!r} has a policy, so it is not trained, and its {fields} would be "
-            f"ignored: leave out {fields}, or leave out policy to train it. What another run of "
+            f"ignored: {how}, or leave out policy to train it. What another run of "
             "Skillweave has learnt can be trained further: leave out policy, and "
             f"train(start_from={{{skill.name!r}: run}})"
         )

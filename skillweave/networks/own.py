@@ -113,7 +113,7 @@ class ModuleEncoder:
                 module = self._factory.function(self.space)
             except SkillweaveError:
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise SkillweaveError(
                     f"{self._who} raised {told(error)} when it was called with the observation "
                     f"space {short(self.space, 200)}"
@@ -135,7 +135,7 @@ class ModuleEncoder:
         try:
             with usual_defaults(), torch.no_grad():
                 return module(_nested(self._obs.space, iter(examples)))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             shapes = ", ".join(str(tuple(leaf.shape)) for leaf in examples)
             raise SkillweaveError(
                 f"{self._who}: forward raised {told(error)} for observations of shape {shapes}"

@@ -271,6 +271,7 @@ def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     found = declare(rooms, **({"apart": replace(APART, selector_steps=1_500_000)} | how))
     for skill in found.skills:
         skill.policy = skills[skill.name]
+        skill.steps = None  # it is not trained
     return found
 
 

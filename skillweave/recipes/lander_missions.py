@@ -232,6 +232,7 @@ def with_skills(
     found = declare(mission, gusts, **{"apart": Apart(selector_steps=300_000)} | how)
     for skill in found.skills:
         skill.policy = skills[skill.name]
+        skill.steps = None  # it is not trained
     return found
 
 

@@ -37,7 +37,7 @@ def _has_egl() -> bool:
     return ctypes.util.find_library("EGL") is not None
 
 
-def hint(error: Exception) -> str:
+def hint(error: BaseException) -> str:
     """A sentence, after a space, on what to do where OpenGL could not draw; or nothing."""
     told = f"{type(error).__module__} {error}".lower()
     if sys.platform != "linux" or not any(k in told for k in ("opengl", "egl", "osmesa", "glfw")):

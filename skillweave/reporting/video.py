@@ -135,7 +135,7 @@ def frame_of(env: gym.Env[Any, Any]) -> Array:
     name = type(env.unwrapped).__name__
     try:
         frame: Any = env.render()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise SkillweaveError(
             f"{name} cannot be filmed: its render() raised {told(error)}.{hint(error)}"
         ) from error

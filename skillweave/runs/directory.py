@@ -456,14 +456,22 @@ class RunDirectory:
     def rewind(self, at: Mapping[str, Any]) -> list[str]:
         """Drop the lines after those that ``line_bytes`` told: training writes them again.
 
+        Args:
+            at: what ``line_bytes`` returned; a size that it lacks drops nothing.
+
         Returns:
-            The files that lack lines, as they were removed or shortened.
+            The files that lack lines, as they were removed or shortened; each is returned once.
         """
-        whole = {
-            "metrics.jsonl": self._metrics.rewind(at.get("metrics_bytes")),
-            "lineage.jsonl": self.lineage.rewind(at.get("lineage_bytes")),
-        }
-        return [name for name, complete in whole.items() if not complete]
+        lacking = []
+        for key, lines in zip(LINES, (self._metrics, self.lineage), strict=True):
+            entries = [entry for entry in self.manifest["stages"] if key in entry]
+            least = max([at.get(key, 0), *(entry[key] for entry in entries)])
+            lines.rewind(at.get(key))
+            if lines.size < least:
+                lacking.append(lines.path.name)
+                for entry in entries:
+                    entry[key] = min(entry[key], lines.size)
+        return lacking
 
     def _next_step(self) -> str:
         return resume_words(self)

@@ -57,11 +57,8 @@ class JsonLines:
     def _next(self) -> str:
         return "" if self._next_step is None else f", then: {self._next_step()}"
 
-    def rewind(self, size: int | None) -> bool:
-        """Remove all after ``size`` bytes: training will write it again.
-
-        Returns:
-            Whether there were so many bytes, or it is not known how many there should be.
+    def rewind(self, size: int | None) -> None:
+        """Remove all after ``size`` bytes: training will write it again; None: remove nothing.
 
         Raises:
             SkillweaveError: the disk cannot be written.
@@ -73,7 +70,6 @@ class JsonLines:
                 os.truncate(self.path, size)
         except OSError as error:
             raise SkillweaveError(f"could not write {self.path}: {error.strerror}") from error
-        return size is None or self.size >= size
 
     def read(self) -> Iterator[dict[str, Any]]:
         """The records, without a last line that is incomplete.

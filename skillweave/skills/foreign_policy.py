@@ -88,7 +88,7 @@ class Foreign(Memoryless):
             self.act(self.start(2), made_up(self.observation_space, 2))
         except SkillweaveError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             space = short(self.observation_space, 300)
             raise SkillweaveError(
                 f"{self._who} fails on observations of {space}: {told(error)}"

@@ -29,7 +29,7 @@ def called(
         return function(argument)
     except SkillweaveError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         about = getattr(argument, "shape", None)
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
@@ -38,7 +38,7 @@ def called(
         ) from error
 
 
-def _advice(error: Exception, function: Any, argument: Any, ids: Array | None) -> str:
+def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:
     """What to write instead, for the mistakes that are made most; else nothing."""
     text, step = str(error), isinstance(argument, Step)
     name = getattr(error, "name", None) if isinstance(error, AttributeError) else None
@@ -70,13 +70,13 @@ def _advice(error: Exception, function: Any, argument: Any, ids: Array | None) -
     return ""
 
 
-def _not_entered(error: Exception) -> bool:
+def _not_entered(error: BaseException) -> bool:
     """Whether a function was called wrongly, and none of its lines ran."""
     frames = error.__traceback__
     return frames is not None and frames.tb_next is None
 
 
-def blame(error: Exception, who: str) -> NoReturn:
+def blame(error: BaseException, who: str) -> NoReturn:
     """Raise a SkillweaveError that names ``who`` where the user's code raised ``error``.
 
     Otherwise raise ``error`` itself: its traceback shows what is wrong in this library.

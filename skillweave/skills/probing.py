@@ -95,7 +95,7 @@ def probe(
             rows = np.arange(m) % n
             try:
                 answer = function(*(_taken(a, rows, n) for a in arguments))
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 if not certain:
                     return
                 raise SkillweaveError(

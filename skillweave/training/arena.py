@@ -2,37 +2,77 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import RETURN, Collector
 from skillweave.envs.checks import longest_evaluation
+from skillweave.envs.engine import Engine, GymnasiumEngine, RawStep, episode_seed
+from skillweave.envs.infos import allowed_rows
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds, global_generators
 from skillweave.types import Array
 
 
-def returns_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
-    """Returns of one episode in each of the arena's environments, as of ``episodes_of``."""
-    returns: Array = episodes_of(policy, arena, seeds)[:, RETURN]
-    return returns
-
-
-def episodes_of(policy: AgentPolicy, arena: Collector, seeds: Seeds) -> Array:
+def episodes_of(
+    policy: AgentPolicy, arena: Collector, seeds: Seeds, first: int = 0, count: int | None = None
+) -> Array:
     """What one episode in each environment came to, acting greedily, as ``Collected.episodes``.
+
+    Args:
+        first: the number of the first episode. An episode starts by its number, so that several
+            rounds in few environments have the starts of one round in many.
+        count: of how many environments, the first of the arena; None: of all.
 
     Returns:
         (n, 4), n at least 1; environments where a skill could never start are left out.
     """
-    algorithm = policy.algorithm
-    player = arena.like(arena.engine, Acting([(algorithm, 1)], arena.num_envs))
+    algorithm, engine = policy.algorithm, arena.engine
+    if first or count not in (None, arena.num_envs):
+        engine = cast(Engine, _Round(engine, first, count or arena.num_envs))
+    # Each round has random streams of its own.
+    acts, draws = (seeds / k / first if first else seeds / k for k in ("act", "global"))
+    player = arena.like(engine, Acting([(algorithm, 1)], engine.num_envs))
     params = algorithm.acting_params_of(policy.weights)
     gamma = np.array([algorithm.config.gamma])
-    request = Request(0, (params,), gamma, seeds / "act", greedy=True)
-    limit = longest_evaluation(arena.engine.time_limit)
+    request = Request(0, (params,), gamma, acts, greedy=True)
+    limit = longest_evaluation(engine.time_limit)
     # Several threads wait for each other, for ever on a busy machine.
-    with torch_threads(1), global_generators(seeds / "global"):
+    with torch_threads(1), global_generators(draws):
         found: Array = player.play(request, seeds / "start", limit)
     began: Array = ~np.isnan(found[:, RETURN])
     return found[began]
+
+
+class _Round:
+    """The first ``num_envs`` environments of an engine, for episodes from number ``first`` on.
+
+    Where environments take seeds, episodes start as in an engine that has one environment for
+    each. Pools take none.
+    """
+
+    def __init__(self, engine: Engine, first: int, num_envs: int) -> None:
+        self._engine, self._first, self.num_envs = engine, first, num_envs
+        self._rows = np.arange(num_envs)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def reset(self, seed: int) -> Array:
+        """Start the episodes, all from one seed; observations (num_envs, *obs_shape)."""
+        engine, first = self._engine, self._first
+        if not isinstance(engine, GymnasiumEngine):
+            return engine.reset((Seeds(seed) / first).integer())[: self.num_envs]
+        seeds = [episode_seed(seed, first + row, 0) for row in range(self.num_envs)]
+        return engine.reset_some(self._rows, seeds)
+
+    def step(self, action: Array, ids: Array | None = None) -> RawStep:
+        """Act in some environments; None: in these."""
+        return self._engine.step(action, self._rows if ids is None else ids)
+
+    def mask(self) -> Array | None:
+        """(num_envs, A) bool, the actions allowed now; None: all always are."""
+        return allowed_rows(self._engine.mask(), self._rows)

@@ -202,7 +202,9 @@ def evaluate(
         policy: who acts; one made elsewhere (``from_function``) takes the environment's spaces.
         env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
         seed: picks the episodes; the same seed gives the same starts to every policy.
-        deterministic: act greedily, else sample.
+        deterministic: act greedily, else sample. Skills of a hierarchy that was kept because they
+            sample do so in any case. A step's random numbers are drawn for all environments
+            together, so that what is sampled differs with ``num_envs``.
         num_envs: environments side by side, as many as exist at once; does not change the result
             of a greedy policy. None: ``USUAL_ENVS``. In a pool there is one for each episode, so
             at most 65,536.

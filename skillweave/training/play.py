@@ -82,7 +82,7 @@ def play(
         obs, mask = episodes.obs[rows], episodes.mask()
         try:
             action, own = policy.act(own, obs, mask, deterministic=deterministic, rng=rng)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             blame(error, "the policy's act()")
         if before_step is not None:
             before_step(own)

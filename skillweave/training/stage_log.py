@@ -84,8 +84,10 @@ class StageLog:
         self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), dict(at)
         self._callbacks = [x for x in listeners if isinstance(x, TrainCallback)]
         self._has_final = False
-        lack = run.rewind(self.entry | self.at)
-        known = self.entry if not lack else {}
+        # Before a stage trains, its entry has the size that the files had when it was last done.
+        begins = self.entry["status"] != "training"
+        lack = run.rewind(self.at if begins else self.entry | self.at)
+        known = {} if begins or lack else self.entry
         self.entry.update(run.line_bytes() | known, status="training")
         run.save()
         for listener in listeners:
@@ -270,6 +272,7 @@ class StageLog:
         if self._has_final:
             self.run.keep_final(entry["name"])
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
+        entry.update(self.run.line_bytes())  # so that a later stage sees if lines were removed
         entry["evaluation_steps"] = at["evaluation_steps"]
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
         entry["final"] = at["metrics"]

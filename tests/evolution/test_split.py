@@ -31,6 +31,7 @@ from skillweave import (
 from skillweave.collecting.group import make_collectors
 from skillweave.collecting.where import Where
 from skillweave.collecting.workers import Station, Workers
+from skillweave.evolution.fitness import FitnessArena
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.seeding import Seeds
@@ -157,7 +158,7 @@ def test_one_part_is_the_population_itself(network):
     parts = Parts(workers_here, scene, config, seeds, 5, 1, 2)
     split = Population.fresh(config, evolution, scene, seeds, parts)
     plain = Population.fresh(config, evolution, scene, seeds)
-    arena = scene.collector(2, None)
+    arena = FitnessArena(scene, 2, 2)
     for generation in range(3):
         told: tuple[list[Any], list[Any]] = [], []
         found = []
@@ -175,7 +176,7 @@ def test_one_part_is_the_population_itself(network):
             )  # fmt: skip
             for name, value in vars(theirs.state).items():
                 assert torch.equal(getattr(ours.state, name), value)
-    assert parts.steps_elsewhere == arena.engine.steps_made == 3 * 5 * 2 * 7
+    assert parts.steps_elsewhere == arena.steps_made == 3 * 5 * 2 * 7
     arena.close()
     split.close()
     plain.close()

@@ -34,6 +34,7 @@ from skillweave import (
     train_agent,
 )
 from skillweave.evolution import stage as evolving
+from skillweave.evolution.fitness import FitnessArena
 from skillweave.evolution.part import has_diverged
 from skillweave.evolution.population import Population
 from skillweave.runs.directory import RunDirectory
@@ -153,7 +154,7 @@ def test_the_best_so_far_must_hold_its_own_on_the_same_episodes(tmp_path, monkey
     told = iter([np.array([1.0, 3.0]), np.array([9.0, 4.0]), np.array([5.0, 6.0])])
     old = iter([9.5, 6.0])  # what the old best gets in the second and third generation
     monkeypatch.setattr(Population, "fitness", lambda *_: next(told))
-    monkeypatch.setattr(evolving, "score", lambda *_: next(old))
+    monkeypatch.setattr(FitnessArena, "score", lambda *_: next(old))
     by = Evolution(2, 3, 2, selection=Tournament(2), mutations=EVERYTHING)
     run = train("ppo", tmp_path / "run", by)
     flagged = [(x["generation"], x["member"]) for x in lineage(run.path) if x["best"]]
@@ -246,27 +247,28 @@ def test_the_same_seed_gives_the_same_lineage_and_another_one_another(tmp_path):
     assert first != other
 
 
-def test_fitness_is_measured_on_the_same_starts_for_all(tmp_path, monkeypatch):
-    starts: dict[int, set[bytes]] = {}
-    played = evolving.Population.fitness
+class Paid(Aim):
+    """Pays in each step what its first observation was."""
 
-    def watch(self: Population, env: Any, seeds: Seeds) -> Any:
-        reset = env.engine.reset
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        obs, info = super().reset(seed=seed)
+        self.start = float(obs[0])
+        return obs, info
 
-        def seen(seed: int) -> Any:
-            obs = reset(seed)
-            starts.setdefault(seeds.path[-2], set()).add(obs.tobytes())
-            return obs
+    def step(self, action: Any) -> Any:
+        obs, _, *rest = super().step(action)
+        return obs, self.start, *rest
 
-        monkeypatch.setattr(env.engine, "reset", seen)
-        found = played(self, env, seeds)
-        monkeypatch.setattr(env.engine, "reset", reset)
-        return found
 
-    monkeypatch.setattr(Population, "fitness", watch)
-    train("ppo", tmp_path / "run")
-    assert [len(s) for s in starts.values()] == [1] * 4
-    assert len(set.union(*starts.values())) == 4  # another generation, other starts
+def test_fitness_is_measured_on_the_same_starts_for_all(tmp_path):
+    how = Evolution(4, 4, 3, mutations=EVERYTHING)
+    env = EnvSpec(Paid, kwargs={"choices": True}, engine="sync")
+    run = train_agent(env, CONFIGS["ppo"], 256, tmp_path / "run", quiet=True, evolve=how)
+    found: dict[int, set[float]] = {}
+    for line in lineage(run.path):
+        found.setdefault(line["generation"], set()).add(line["fitness"])
+    assert [len(fitness) for fitness in found.values()] == [1] * 4
+    assert len(set.union(*found.values())) == 4  # another generation, other starts
 
 
 @pytest.mark.fast_cases(1)
@@ -306,7 +308,7 @@ def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tm
     sick.state.params.fill_(float("nan"))
     population.train(256, 256, Seeds(1), lambda steps, metrics: None)
     assert [has_diverged(m) for m in population.members] == [False, True, False]
-    fitness = population.fitness(scene.collector(2, None), Seeds(2))
+    fitness = population.fitness(FitnessArena(scene, 2, 2), Seeds(2))
     assert np.isfinite(fitness).tolist() == [True, False, True]
 
 

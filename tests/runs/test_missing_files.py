@@ -90,6 +90,35 @@ def test_lines_of_metrics(tmp_path, capsys):
     assert f"there is no {file}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("lost", ["all", "half"])
+def test_lines_of_metrics_of_a_finished_run_that_gets_more_steps(lost, tmp_path, capsys):
+    def agent(steps: int) -> Agent:
+        return Agent("CartPole-v1", ON, steps)
+
+    run = agent(64).train(tmp_path / "run", quiet=True).path
+    whole = shutil.copytree(run, tmp_path / "whole")
+    file = run / "metrics.jsonl"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    if lost == "all":
+        file.unlink()
+    sentence = f"{file} was removed or shortened: curves lack what stood there"
+    agent(128).train(run, resume=True)
+    assert capsys.readouterr().err.count(sentence) == 1
+    agent(128).train(whole, resume=True)
+    agent(192).train(run, resume=True)  # what is lost already is not said again
+    assert "removed or shortened" not in capsys.readouterr().err
+    agent(192).train(whole, resume=True, quiet=True)
+    assert policies(run) == policies(whole)
+
+
+@pytest.mark.slow
+def test_lines_of_metrics_of_several_stages(runs, tmp_path, capsys):
+    run = shutil.copytree(runs / "finished", tmp_path / "run")
+    (run / "metrics.jsonl").unlink()
+    tree(2).train(run, resume=True)
+    assert capsys.readouterr().err.count("metrics.jsonl was removed or shortened") == 1
+
+
 @pytest.mark.slow
 def test_a_state_to_go_on_with(runs, tmp_path, capsys):
     run = shutil.copytree(runs / "early", tmp_path / "run")

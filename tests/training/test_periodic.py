@@ -22,11 +22,12 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.collecting.collector import RETURN
 from skillweave.envs import checks
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
-from skillweave.training.arena import episodes_of, returns_of
+from skillweave.training.arena import episodes_of
 from skillweave.training.periodic import PeriodicEvaluation
 
 SMALL = Network((8,), "relu")
@@ -39,7 +40,7 @@ def fresh(env: Toy) -> AgentPolicy:
 
 
 def played(env: Toy, seed: int = 0) -> list[float]:
-    return returns_of(fresh(env), env.collector(None), Seeds(seed)).tolist()
+    return episodes_of(fresh(env), env.collector(None), Seeds(seed))[:, RETURN].tolist()
 
 
 def played_by_hand(env: Any, policy: AgentPolicy) -> list[float]:

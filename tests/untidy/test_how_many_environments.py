@@ -1,5 +1,7 @@
 """How many environments exist at once: as many as in training, whatever is done with a run."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -108,6 +110,59 @@ def test_evaluations_make_no_more_than_training(learn, tmp_path):
     sw.evaluate(run.policy, Counted, episodes=40)
     assert Counted.most == 16
     assert Counted.alive == 0
+
+
+class Starts(Counted):
+    """Pays in each step the number that its episode has drawn at its start."""
+
+    def reset(self, *, seed=None, options=None):
+        obs, info = super().reset(seed=seed)
+        self.start = float(self.np_random.random())
+        return obs, info
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, self.start, *rest
+
+
+def test_members_of_a_population_are_compared_in_no_more_than_they_train_in(tmp_path):
+    """Seven episodes: the same starts for all members, in any number of environments."""
+    found = []
+    for n in (1, 2, 16):
+        Counted.alive = Counted.most = 0
+        spec = sw.EnvSpec(Starts, engine="sync", workers=1)
+        how = sw.Evolution(population=2, generations=2, episodes=7)
+        run = sw.train_agent(spec, small(n), 256 * n, tmp_path / f"{n}", evolve=how, quiet=True)
+        lines = (run.path / "lineage.jsonl").read_text().splitlines()
+        found.append([json.loads(line)["fitness"] for line in lines])
+        assert Counted.most == 2 * n + min(n, 7)
+        assert Counted.alive == 0
+    assert found[0] == found[1] == found[2]
+    assert found[0][0] == found[0][1]
+    assert found[0][0] != found[0][2]
+
+
+@pytest.mark.parametrize("stage", ["agent", "selector"])
+def test_a_population_of_a_simulator_of_which_there_can_be_one_is_refused_at_once(stage, tmp_path):
+    Counted.allowed = 1
+    search = sw.Evolution(population=3)
+    says = r"port 2000 is in use.*A population needs several environments at once, here 3 of them"
+    agent = sw.Agent(sw.EnvSpec(Counted, workers=1), small(1), 600)
+    declared = agent if stage == "agent" else hierarchy("apart", 1)
+    with pytest.raises(sw.EnvError, match=says):
+        declared.train(tmp_path / "run", evolve={stage: search}, quiet=True)
+    assert (Counted.begun, Counted.alive) == (0, 0)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_population_that_needs_more_than_can_be_made_names_its_settings(tmp_path):
+    Counted.allowed = 4
+    with pytest.raises(sw.EnvError, match=r"here 8 of them to train in.*\(population\) and num"):
+        sw.train_agent(
+            sw.EnvSpec(Counted, workers=1), small(2), 600, tmp_path / "run", quiet=True,
+            evolve=sw.Evolution(population=4, episodes=3),
+        )  # fmt: skip
+    assert (Counted.begun, Counted.alive) == (0, 0)
 
 
 @pytest.mark.slow

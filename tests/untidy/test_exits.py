@@ -1,0 +1,112 @@
+"""``sys.exit()`` in the code of a user is an error that says where, as any other exception is."""
+
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import skillweave as sw
+
+SMALL = sw.PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=1, network=sw.Network((4,)))
+WHERE = r".* SystemExit: enough \(test_exits\.py, line \d+\)"
+
+
+class Ramp(gym.Env):
+    observation_space = gym.spaces.Box(-10.0, 10.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.array([self.t], np.float32), 1.0, self.t >= 8, False, {}
+
+
+def leave(*_):
+    sys.exit("enough")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_in_action_masks(workers, tmp_path):
+    class Masked(Ramp):
+        def action_masks(self):
+            if self.t == 3:
+                leave()
+            return np.ones(2, bool)
+
+    spec = sw.EnvSpec(Masked, engine="sync", workers=workers)
+    with pytest.raises(sw.SkillweaveError) as found:
+        sw.train_agent(spec, SMALL, 64, tmp_path / "run", quiet=True)
+    assert found.match(r"environment 0, step 3 of its episode: action_masks\(\) raised" + WHERE)
+
+
+class Stay(sw.Skill):
+    max_steps = 4
+
+
+def skill(**methods):
+    return type("Leaves", (sw.Skill,), {"name": "leaves", "max_steps": 4, **methods})()
+
+
+SKILLS = {
+    **{method: {method: leave} for method in ("reward", "initiation", "termination", "success")},
+    "policy": {"policy": leave},
+}
+
+
+@pytest.mark.parametrize("learn", ["together", "apart"])
+@pytest.mark.parametrize("methods", SKILLS.values(), ids=SKILLS)
+def test_in_a_function_of_a_skill(methods, learn, tmp_path):
+    with pytest.raises(sw.SkillweaveError) as found:
+        sw.Hierarchy(
+            Ramp, [skill(**methods), Stay()], algorithm=SMALL, selector=SMALL, steps=64, learn=learn
+        ).train(tmp_path / "run", quiet=True)
+    assert found.match("skill 'leaves'")
+    assert found.match(r"(?s).* raised" + WHERE)
+
+
+def test_in_a_function_that_answers_once(tmp_path):
+    """Functions are called a second time, for other numbers of environments."""
+
+    def later(self, obs):
+        later.calls += 1
+        return np.ones(len(obs), bool) if later.calls == 1 else leave()
+
+    later.calls = 0
+    with pytest.raises(sw.SkillweaveError, match=r"skill 'leaves': initiation\(\)") as found:
+        sw.Hierarchy(
+            Ramp, [skill(initiation=later), Stay()], algorithm=SMALL, selector=SMALL, steps=64
+        ).train(tmp_path / "run", quiet=True)
+    assert found.match(WHERE)
+
+
+AROUND = {
+    "selector": lambda: {"selector": leave},
+    "reflex": lambda: {"reflexes": [sw.Reflex(leave, 0)]},
+    "guide": lambda: {"guide": sw.Guide(leave, restrict=False, target_kl=0.1)},
+    "learning rate": lambda: {"algorithm": sw.PPO(num_envs=2, n_steps=8, learning_rate=leave)},
+    "network": lambda: {
+        "algorithm": sw.PPO(num_envs=2, n_steps=8, network=sw.Network(encoder=leave))
+    },
+}
+
+
+@pytest.mark.parametrize("how", AROUND.values(), ids=AROUND)
+def test_in_a_function_of_a_hierarchy(how, tmp_path):
+    settings = {"algorithm": SMALL, "selector": SMALL, "steps": 64}
+
+    def train():
+        declared = sw.Hierarchy(Ramp, [Stay()], **settings | how())
+        declared.train(tmp_path / "run", quiet=True)
+
+    with pytest.raises(sw.SkillweaveError, match=r"raised" + WHERE):
+        train()
+
+
+def test_in_a_policy_that_is_evaluated():
+    with pytest.raises(sw.SkillweaveError, match=r"raised" + WHERE):
+        sw.evaluate(sw.from_function(leave), Ramp, episodes=1)
