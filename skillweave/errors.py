@@ -48,7 +48,11 @@ class MissingExtra(SkillweaveError, ImportError):
 
 
 class Interrupted(ShortTraceback, KeyboardInterrupt):
-    """Training was interrupted; the message says what is saved and how to continue."""
+    """Training was interrupted; the message says what is saved and how to continue.
+
+    Args:
+        message: what is shown.
+    """
 
     def __init__(self, message: str = "") -> None:
         super().__init__(printable(message))

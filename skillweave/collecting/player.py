@@ -90,7 +90,7 @@ class PolicyActor:
         how: Any = {"deterministic": turn.deterministic, "rng": turn.rng}
         try:
             actions, after = self._policy.act(before, obs, mask, **how)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             blame(error, self._blamed)
         _put(memory, rows, after)
         return actions
