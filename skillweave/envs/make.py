@@ -6,8 +6,9 @@ import functools
 import os
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +24,7 @@ from skillweave.envs.pool import MakePool, envpool
 from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, short, shortened, told, whole_number
 from skillweave.reading import as_json
+from skillweave.seeding import Seeds, global_generators
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 
 MOST = 65_536
@@ -34,6 +36,13 @@ PIECES, STEPS = 5, 50
 PIECE_SECONDS = 0.1
 """A piece that takes longer ends."""
 EngineName = Literal["auto", "envpool", "sync"]
+
+
+class Spaces(NamedTuple):
+    """What an environment shows, and what it takes."""
+
+    observation: gym.Space[Any]
+    action: gym.Space[Any]
 
 
 @checked_names
@@ -112,6 +121,27 @@ class EnvSpec:
             raise SkillweaveError(
                 f"{self.name}: no engine {short(self.engine)}; there are: {known}"
             )
+
+    @property
+    def spaces(self) -> Spaces:
+        """The environment's spaces; one is made to read them, the first time."""
+        known: Spaces | None = vars(self).get("_spaces")
+        return self.read_spaces() if known is None else known
+
+    @global_generators(Seeds(0) / "spaces")
+    def read_spaces(self) -> Spaces:
+        """Make an environment, and return its spaces.
+
+        Raises:
+            EnvError: it cannot be made.
+        """
+        with closing(self.make()) as env:
+            found = Spaces(env.observation_space, env.action_space)
+        object.__setattr__(self, "_spaces", found)
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if k != "_spaces"}
 
     def make(self, render_mode: str | None = None, number: int | None = None) -> CheckedEnv:
         """One environment of Gymnasium's, whose errors say its name and its ``number``.
@@ -231,6 +261,16 @@ class EnvSpec:
         """Whether an id and plain settings say it all, without any code of the user's."""
         plain = not self.wrappers and self.pool is None
         return isinstance(self.env, str) and ":" not in self.env and plain
+
+
+def spec_of(declared: Any) -> EnvSpec:
+    """Return the environment of a declaration, fully specified; the same one as long as it is."""
+    if isinstance(declared.env, EnvSpec):
+        return declared.env
+    known: EnvSpec | None = vars(declared).get("_spec")
+    if known is None or known.env is not declared.env:
+        known = vars(declared)["_spec"] = EnvSpec(declared.env)
+    return known
 
 
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0) -> Engine:
