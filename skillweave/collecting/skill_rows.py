@@ -10,9 +10,9 @@ import numpy as np
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.columns import Columns
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.starters import StartPolicy
+from skillweave.collecting.writer import BatchWriter
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import TrainingError
 from skillweave.experience import Batch
@@ -105,16 +105,24 @@ class SkillCollector(Collector):
 
     def _collect(self, request: Request) -> dict[str, Batch]:
         self._prepare(request)
-        out = Columns(self, request.rows)
+        out = BatchWriter(request.rows, self.num_envs)
+        state = None if self.memory is None else self.memory.copy()
+        starts = self.kept["elapsed"] == 0
         for _ in range(request.rows):
             self._step(out)
-        return {"": out.batch()}
+        batch = out.batch(recurrent_state=state)
+        if state is None:
+            return {"": batch}
+        episode_start = np.concatenate([starts[None], batch.ended[:-1]])
+        if (valid := batch.get("valid")) is not None:  # the first row after a search
+            episode_start[1:] |= valid[1:] & ~valid[:-1]
+        return {"": batch.replace(episode_start=episode_start)}
 
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request)
         self._rng = (request.seeds / "search").numpy()
 
-    def _step(self, out: Columns | None = None) -> None:
+    def _step(self, out: BatchWriter | None = None) -> None:
         """One step of every environment."""
         if self._start_calls:
             self._draw_calls()
@@ -144,8 +152,20 @@ class SkillCollector(Collector):
         judged = self._judge(step, playing)
         ended = judged.terminated | judged.truncated
         if out is not None:
-            next_mask = self.engine.mask()
-            out.put(obs, mask, acted, judged, raw.next_obs, next_mask, playing, overridden)
+            out.write(
+                obs=obs,
+                action=acted.action,
+                reward=judged.reward,
+                terminated=judged.terminated,
+                truncated=judged.truncated,
+                next_obs=raw.next_obs,
+                valid=playing,
+                mask=mask,
+                next_mask=self.engine.mask(),
+                dist_params=acted.dist_params,
+                overridden=overridden,
+            )
+            out.next()
         self._count(raw, judged, playing)
         if memory is not None and acted.recurrent_state is not None:
             memory[:] = acted.recurrent_state

@@ -14,11 +14,12 @@ from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.judge import judge, seen_by, terminated_in_call
 from skillweave.collecting.levels import CRITIC, SELECTOR, Level, NestedLevel, with_learners
-from skillweave.collecting.woven_rows import Rows
+from skillweave.collecting.writer import BatchWriter
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import DeclarationError
 from skillweave.experience import Batch
 from skillweave.skills import Skill
+from skillweave.spaces import action_codec
 from skillweave.types import Array, Step
 
 
@@ -60,14 +61,14 @@ class WovenCollector(DecisionCollector):
         self.kept["leaf"] = np.zeros(self.num_envs, np.int64)  # the latest that acted; 0: none yet
         self.ranges["leaf"] = range(self.root.end)
         self._fresh = np.zeros(self.num_envs, bool)  # the leaf that acts starts to
-        self._rows: Rows | None = None
+        self._rows: _Rows | None = None
 
     def like(self, engine: Engine, acting: Acting) -> Any:
         """Not possible: populations of hierarchies that learn as a whole are not built."""
         raise DeclarationError("hierarchies that learn as a whole do not evolve")
 
     def _collect(self, request: Request) -> dict[str, Batch]:
-        self._rows = Rows(self, request.rows, self.root.all())
+        self._rows = _Rows(self, request.rows)
         selectors = super()._collect(request)
         found = {SELECTOR: selectors[""]} if selectors else {}
         found |= {path: self._part(path) for path in self.learners}
@@ -108,7 +109,7 @@ class WovenCollector(DecisionCollector):
         self._fresh, self.kept["leaf"][:] = ~same, leaf
         self._decided(self.root, self._all)
         if self._rows is not None:
-            self._rows.go_on(np.flatnonzero(same))
+            self._rows.go_on(same)
         return action
 
     def _decided(self, level: Level, ids: Array) -> None:
@@ -121,12 +122,37 @@ class WovenCollector(DecisionCollector):
 
     def _record(self, step: Step, raw: RawStep, mask: Array | None, end: Array) -> None:
         """Keep the step for all who learn below the selector."""
-        assert self._rows is not None
-        self._rows.put(step, self.kept["leaf"], self._fresh, mask, self.engine.mask())
+        rows = self._rows
+        assert rows is not None
+        rows.goes_on[:] = False
+        rows.shared.write(
+            obs=step.obs,
+            next_obs=step.next_obs,
+            mask=mask,
+            next_mask=self.engine.mask(),
+            overridden=self.overridden,
+        )
+        rows.leaf[rows.shared.row], rows.fresh[rows.shared.row] = self.kept["leaf"], self._fresh
         truncated = raw.truncated & ~raw.terminated
-        self._rows.put_critic(self.root, self._all, raw.reward, raw.terminated, truncated)
+        self._write_critic(self.root, self._all, raw.reward, raw.terminated, truncated)
         self._walk(self.root, self._all, step, end)
-        self._rows.next()
+        rows.next()
+
+    def _write_critic(
+        self, level: Level, ids: Array, reward: Array, terminated: Array, truncated: Array
+    ) -> None:
+        """Write a step for a level's critic, in environments ``ids`` (k,) where the level acts."""
+        assert self._rows is not None
+        if (out := self._rows.critics.get(level.path)) is not None:
+            out.write(
+                ids,
+                action=self.memory[f"{level.prefix}skill"][ids],
+                reward=reward,
+                terminated=terminated,
+                truncated=truncated,
+                call_start=self.memory[f"{level.prefix}elapsed"][ids] == 1,
+            )
+            self._rows.acts[level.path][out.row, ids] = True
 
     def _walk(self, level: Level, ids: Array, step: Step, end: Array) -> None:
         """What a step was to the skills of a level, in environments ``ids`` (k,).
@@ -147,11 +173,17 @@ class WovenCollector(DecisionCollector):
         skill, part = level.skills.skills[i], self._part_of(level, i, mine, step)
         terminated = terminated_in_call(skill, part, end, mine)
         over = (end != CallEnd.RUNNING) & ~terminated
-        goes_on = over & (end != CallEnd.EPISODE) & ~part.timed_out
         latest = level.learning[i].latest
         assert latest is not None
-        self._rows.judge(mine, judge(skill, part, mine).reward, terminated, over, goes_on)
-        self._rows.put_skill(level.leaves[i], mine, latest.acted)
+        self._rows.shared.write(
+            mine,
+            action=latest.acted.action,
+            reward=judge(skill, part, mine).reward,
+            terminated=terminated,
+            truncated=over,
+        )
+        self._rows.goes_on[mine] = over & (end != CallEnd.EPISODE) & ~part.timed_out
+        self._rows.own[level.leaves[i]].write(mine, dist_params=latest.acted.dist_params)
 
     def _inside(self, level: Level, i: int, mine: Array, step: Step, end: Array) -> None:
         """Judge a step of skill ``i``, which is a hierarchy, and for all in it."""
@@ -161,7 +193,7 @@ class WovenCollector(DecisionCollector):
         reward = judge(skill, part, mine).reward
         terminated = terminated_in_call(skill, part, end, mine)
         over = (end != CallEnd.RUNNING) & ~terminated
-        self._rows.put_critic(below, mine, reward, terminated, over)
+        self._write_critic(below, mine, reward, terminated, over)
         if below.selector is not None:
             gamma = self._gammas[below.path + SELECTOR]
             own = self.memory[f"{below.prefix}end"][mine] != CallEnd.RUNNING
@@ -173,3 +205,73 @@ class WovenCollector(DecisionCollector):
         """A step of environments ``mine`` (k,) as skill ``i`` of a level sees it."""
         elapsed = self.memory[f"{level.prefix}elapsed"][mine]
         return seen_by(level.skills.skills[i], step, elapsed, mine)
+
+
+class _Rows:
+    """Rows of leaves that learn, and of critics of skills, from the same steps."""
+
+    def __init__(self, collector: WovenCollector, rows: int) -> None:
+        n, levels = collector.num_envs, list(collector.root.all())
+        self.shared = BatchWriter(rows, n)
+        """Of all leaves that learn: in each step exactly one acts."""
+        codec = action_codec(collector.engine.action_space)  # all skills act in this space
+        units = codec.from_env(np.asarray(codec.space.sample())[None])
+        # These are there even if no leaf that learns acts.
+        self.shared.column("action", units)
+        self.shared.column("reward", np.zeros(1, np.float32))
+        self.shared.column("terminated", _FLAG)
+        self.shared.column("truncated", _FLAG)
+        self.leaf = np.empty((rows, n), np.int64)
+        """(T, N), which leaf acts."""
+        self.fresh = np.empty((rows, n), bool)
+        """(T, N), it starts to."""
+        self.goes_on = np.zeros(n, bool)
+        """(N,), the trajectory continues if the same leaf acts in the next step."""
+        learning = [(x, i) for x in levels for i in x.learning]
+        self.own = {x.leaves[i]: BatchWriter(rows, n) for x, i in learning}
+        """By leaf, what is its alone."""
+        self._states = {
+            x.leaves[i]: collector.memory[f"{x.prefix}{i}.rnn"].copy()
+            for x, i in learning
+            if x.learning[i].acting.memory_size
+        }
+        critics = [level.path for level in levels if level.has_critic]
+        self.critics = {path: BatchWriter(rows, n) for path in critics}
+        """By the path of a level."""
+        for out in self.critics.values():
+            out.column("action", np.zeros(1, np.int64))
+            out.column("reward", np.zeros(1, np.float32))
+            for name in ("terminated", "truncated", "call_start"):
+                out.column(name, _FLAG)
+        self.acts = {path: np.zeros((rows, n), bool) for path in critics}
+        """(T, N), the level acts."""
+
+    def go_on(self, same: Array) -> None:
+        """Continue trajectories where the ``same`` leaf (N,) acts again."""
+        if self.shared.row:
+            truncated = self.shared.column("truncated", _FLAG)
+            truncated[self.shared.row - 1, self.goes_on & same] = False
+
+    def next(self) -> None:
+        """Start the next row."""
+        for out in (self.shared, *self.own.values(), *self.critics.values()):
+            out.next()
+
+    def of_leaf(self, leaf: int) -> Batch:
+        """Return what a leaf did."""
+        state = self._states.get(leaf)
+        return self.shared.batch(
+            valid=self.leaf == leaf,
+            dist_params=self.own[leaf].get("dist_params"),
+            recurrent_state=state,
+            episode_start=None if state is None else self.fresh,
+        )
+
+    def of_critic(self, path: str) -> Batch:
+        """Return all steps of a level, for its critic."""
+        out, acts = self.critics[path], self.acts[path]
+        shared = {name: self.shared.get(name) for name in ("obs", "next_obs")}
+        return out.batch(**shared, valid=None if acts.all() else acts)
+
+
+_FLAG = np.zeros(1, bool)
