@@ -15,23 +15,15 @@ from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.selectors import Automaton, ReadySelector, ready_selector
 from skillweave.skills.foreign_policy import fitted, source_of
-from skillweave.training.checks import check_algorithm
 from skillweave.training.stage import SELECTOR
 
 if TYPE_CHECKING:
     from skillweave.hierarchy.declaration import Declaration
 
-WAYS = ("apart", "together", "apart, then together")
-
 
 def check_selection(declared: Declaration) -> None:
     """Raise a SkillweaveError where selector, guide and how they learn do not fit together."""
-    if declared.learn not in WAYS:
-        raise SkillweaveError(
-            f"learn is {short(declared.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
-        )
     if declared.ready_selector is None:
-        check_algorithm(declared.selector, "selector", also="function, Automaton or tree")
         if declared.guide is not None:
             _check_guide(declared)
         return
