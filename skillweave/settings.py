@@ -46,7 +46,7 @@ LONGEST_TEXT = 4096
 class Check(NamedTuple):
     """A condition on a field: ``Annotated[int, Check("at least 1", lambda x: x >= 1)]``.
 
-    Beside a plain type the text continues "a whole number". Beside any other type it replaces the
+    Beside numbers the text continues "a whole number". Beside any other type it replaces the
     description of the type.
     """
 
@@ -95,7 +95,8 @@ class Fitting:
     def fit(self, kind: Any, value: Any, path: str) -> Any:
         """Return ``value`` as a ``kind``.
 
-        Lists become tuples and dicts become settings where the kind asks for them.
+        Lists become tuples and dicts become settings where the kind asks for them; NumPy's numbers
+        become Python's.
 
         Args:
             path: the field, for messages: ``PPO.gamma``.
@@ -103,6 +104,7 @@ class Fitting:
         Raises:
             Unfit: it does not fit; the error's ``path`` may be a part of the field.
         """
+        value = value if kind is Any else _plain(value)
         if not self.accepts(kind, value):
             raise Unfit(path, value, self.describe(kind) + _hint(kind, value))
         kind, checks = _parts(kind)
@@ -121,8 +123,8 @@ class Fitting:
 
     def accepts(self, kind: Any, value: Any) -> bool:
         """Return whether a value is of a kind, whatever its range and its entries are."""
-        if get_origin(kind) is Annotated and RECORDED in get_args(kind) and isinstance(value, str):
-            return True
+        if isinstance(value, str) and get_origin(kind) is Annotated and RECORDED in get_args(kind):
+            return ":" in value
         kind, _ = _parts(kind)
         origin, inner = get_origin(kind), get_args(kind)
         if origin in (Union, UnionType):
@@ -179,14 +181,16 @@ class Fitting:
         """Return descriptions of the values of a kind: several where any of them will do."""
         kind, checks = _parts(kind)
         texts = [check.text for check in checks]
-        nouns = {int: "a whole number", str: "a text", float: "a number"}
-        if kind in nouns:
-            return [", ".join([nouns[kind], *texts])] if texts or kind is not float else [_FINITE]
+        if kind in (int, float):
+            noun = "a whole number" if kind is int else "a number" if texts else _FINITE
+            return [", ".join([noun, *texts])]
         if texts:
             return [", ".join(texts)]
         origin, inner = get_origin(kind), get_args(kind)
         if origin in (Union, UnionType):
             return [word for option in inner for word in self._words(option)]
+        if kind is str:
+            return ["a text"]
         if kind is bool:
             return list(self.yes_and_no)
         if origin is Literal:
@@ -259,6 +263,12 @@ def _parts(kind: Any) -> tuple[Any, tuple[Check, ...]]:
         return kind, ()
     inner, *notes = get_args(kind)
     return inner, tuple(note for note in notes if isinstance(note, Check))
+
+
+def _plain(value: Any) -> Any:
+    """Return NumPy's numbers and texts as Python's, where Python has them."""
+    found = value.item() if isinstance(value, np.generic) else value
+    return value if isinstance(found, np.generic) else found
 
 
 def _callable(kind: Any) -> bool:
@@ -353,7 +363,7 @@ def check_fields(settings: Any) -> None:
 
 
 def fitted(kind: Any, value: Any, where: str) -> Any:
-    """Return a setting in its plainest form: NumPy's numbers as Python's, a list as a tuple.
+    """Return a setting in its plainest form; see ``Fitting.fit``.
 
     Args:
         kind: its annotation.
@@ -363,21 +373,9 @@ def fitted(kind: Any, value: Any, where: str) -> Any:
         DeclarationError: it does not fit.
     """
     try:
-        return _SETTINGS.fit(kind, plain(value), where)
+        return _SETTINGS.fit(kind, value, where)
     except Unfit as error:
         raise DeclarationError(str(error)) from None
-
-
-def plain(value: Any) -> Any:
-    """A setting with Python's numbers and texts in place of NumPy's, also in a tuple or a list."""
-    if isinstance(value, np.generic):
-        found = value.item()
-        return value if isinstance(found, np.generic) else found
-    if type(value) in (tuple, list):
-        converted = [plain(one) for one in value]
-        same = all(a is b for a, b in zip(value, converted, strict=True))
-        return value if same else type(value)(converted)
-    return value
 
 
 def described(kind: Any) -> str:

@@ -43,12 +43,12 @@ class Linear:
         return self.end + remaining * (self.start - self.end)
 
 
-_RATE = (
-    "a positive number, Linear(start, end), or a function of the share of the budget that remains"
-)
 LearningRate = Annotated[
     Positive | Linear | Annotated[Callable[[float], float], RECORDED],
-    Check(_RATE),
+    Check(
+        "a positive number, Linear(start, end), or a function of the share of the budget that "
+        "remains"
+    ),
 ]
 """A number, or a schedule."""
 
@@ -66,8 +66,6 @@ def check_rate(config: Any) -> None:
     value, where = config.learning_rate, f"{type(config).__name__}.learning_rate"
     if isinstance(value, str) or (callable(value) and not isinstance(value, Linear)):
         value = named(value, where)
-        if isinstance(value, str) and ":" not in value:
-            raise DeclarationError(f"{where} is {short(value)}; it must be {_RATE}")
         object.__setattr__(config, "learning_rate", value)
     if isinstance(value, Linear | Named):
         for remaining in (1.0, 0.5, 0.0):

@@ -45,7 +45,7 @@ class Ray:
     """How many; the environments of a stage are shared out equally, or the members of a population.
     None: as many as there would be processes without Ray. A run keeps the number, as results depend
     on it."""
-    address: Annotated[str, Check("such as '10.0.0.1:6379'")] | None = None
+    address: Annotated[str, Check("a text such as '10.0.0.1:6379'")] | None = None
     """``host:port`` of a cluster's head, ``ray://host:port``, or ``auto``: the one that runs on
     this machine. None: what RAY_ADDRESS says, or else a new one of this machine alone."""
     cpus: Positive = 1.0

@@ -45,7 +45,8 @@ from skillweave.types import Policy
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
 """Names of stages that are not skills."""
 CallSteps = Annotated[
-    AtLeastOne | Lengths | None, Check("at least 1, Lengths(1, ..., 128), or None")
+    AtLeastOne | Lengths | None,
+    Check("a whole number of at least 1, Lengths(1, ..., 128), or None"),
 ]
 """How long calls may last."""
 SelectorValue = Annotated[

@@ -185,7 +185,7 @@ class Manifest(TypedDict):
     """``run.json``."""
 
     kind: Literal["hierarchy", "agent"]
-    env: Annotated[str, Check("at most 300 characters", lambda x: len(x) <= 300)]
+    env: Annotated[str, Check("a text of at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
     seed: Count
     checkpoint_every: AtLeastOne

@@ -11,7 +11,7 @@ from skillweave.settings import AtLeastOne, Check, annotations_of, checked_setti
 
 InfoKeys = Annotated[
     Sequence[Annotated[str, Check("a key of info, such as 'distance'", bool)]],
-    Check("a list of keys of info: log_info=['distance']"),
+    Check("a list of keys of info, such as ['distance']"),
 ]
 """Keys of ``info``."""
 
