@@ -212,7 +212,7 @@ class Fitting:
     def describe_other(self, kind: Any) -> str:
         """Return what an instance of a class is called."""
         name = getattr(kind, "__name__", str(kind))
-        return f"{name}()" if is_dataclass(kind) else f"a {name}"
+        return f"{name}()" if is_dataclass(kind) else f"an instance of {name}"
 
     def _inside(self, kind: Any, value: Any, path: str) -> Any:
         """Return a value of the right kind with its entries and fields fitted."""

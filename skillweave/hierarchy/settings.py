@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from skillweave.errors import DeclarationError
 from skillweave.selectors.ready import ReadyValue
-from skillweave.settings import AtLeastOne, NonNegative, Positive, checked_settings
+from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
+
+GuideValue = Annotated[
+    ReadyValue,
+    Check("a function of observations, an Automaton or a tree", lambda x: not isinstance(x, type)),
+]
+"""A ready selector that guides."""
 
 
 @checked_settings
@@ -70,7 +77,7 @@ class Guide:
         DeclarationError: it has no effect, or a value is out of its range.
     """
 
-    selector: ReadyValue
+    selector: GuideValue
     """A function of observations, an ``Automaton``, or a tree."""
     restrict: bool = True
     """Only skills that the guide may choose are called, in training and afterwards."""

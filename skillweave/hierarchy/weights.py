@@ -26,7 +26,7 @@ from skillweave.messages import short
 from skillweave.reading import fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.selectors import ReadySelector
-from skillweave.settings import AtLeastOne
+from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT, PlainAgent
@@ -123,7 +123,7 @@ class InnerHeader(TypedDict):
 
     call_steps: AtLeastOne | None
     call_lengths: NotRequired[list[AtLeastOne]]
-    interrupt: NotRequired[float | None]
+    interrupt: NotRequired[NonNegative | None]
     greedy_skills: bool
     greedy_selector: bool
     guide: NotRequired[Source]

@@ -18,7 +18,7 @@ from skillweave.errors import SkillweaveError
 from skillweave.reading import fit, shown
 from skillweave.runs.files import read_json
 from skillweave.runs.kept import Kept
-from skillweave.settings import AtLeastOne, Check, Count, NonNegative
+from skillweave.settings import AtLeastOne, Check, Count, NonNegative, Positive
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 
@@ -41,7 +41,7 @@ class NestedEntry(TypedDict):
 
     call_steps: AtLeastOne | None
     call_lengths: NotRequired[list[AtLeastOne]]
-    interrupt: float | None
+    interrupt: NonNegative | None
     """By how much a new decision must be worth more to interrupt a call."""
     learn: Literal["apart", "together", "apart, then together"]
     greedy_skills: bool | None
@@ -52,12 +52,12 @@ class NestedEntry(TypedDict):
     guide: NotRequired[Source]
     """Of the ready selector that a trained one keeps to."""
     guide_restrict: NotRequired[bool]
-    guide_kl: NotRequired[float | None]
+    guide_kl: NotRequired[Positive | None]
     reflexes: list[str]
-    start_calls: int | None
-    search_steps: int | None
+    start_calls: AtLeastOne | None
+    search_steps: AtLeastOne | None
     episode_calls: AtLeastOne
-    call_cost: float
+    call_cost: NonNegative
 
 
 class SkillEntry(TypedDict):
@@ -165,9 +165,9 @@ class StageEntry(TypedDict):
     """How skills and selector learn together."""
     algorithms: NotRequired[dict[NodePath, dict[str, Any]]]
     """Of the skills that learn together with the selector."""
-    task_weights: NotRequired[dict[NodePath, float]]
+    task_weights: NotRequired[dict[NodePath, NonNegative]]
     """Of skills whose ``task_weight`` is not that of ``together``."""
-    guide_kl: NotRequired[float]
+    guide_kl: NotRequired[Positive]
     """The KL within which the selector stays of its guide."""
     compared: NotRequired[bool]
     """What is learnt together is kept only if it is better than what was there before."""
