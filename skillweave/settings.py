@@ -390,13 +390,17 @@ def check(settings: object, name: str, ok: bool, text: str) -> None:
         raise DeclarationError(str(Unfit(where, getattr(settings, name), text)))
 
 
-@cache
 def annotations_of(kind: Any) -> dict[str, Any]:
     """Return the annotations of a class's fields, with their checks.
 
     A user's subclass of settings cannot loosen the checks of the fields that it inherits. Where it
     names a type that only type checkers import, its own fields are not checked.
     """
+    return _annotations_of(kind)
+
+
+@cache
+def _annotations_of(kind: Any) -> dict[str, Any]:
     base = next((k for k in kind.__mro__ if "_checks_fields" in vars(k)), None)
     if base is None or base is kind:
         return get_type_hints(kind, include_extras=True)
