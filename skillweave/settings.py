@@ -26,7 +26,7 @@ from typing import (
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave.arguments import checked_names, meant
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.messages import short
 
@@ -289,8 +289,12 @@ def _hint(kind: Any, value: Any) -> str:
     if isinstance(value, type) and issubclass(value, kinds):
         return f" (write {value.__name__}(), not {value.__name__})"
     if _has_names(value) and value and len(kinds) == 1:
+        group, known = kinds[0].__name__, [f.name for f in fields(kinds[0])]
+        for name in value:
+            if name not in known:
+                return f" ({group} has no setting {name!r}{meant(name, known, 'they are')})"
         settings = ", ".join(f"{k}={short(v, 40)}" for k, v in value.items())
-        return f" (write {kinds[0].__name__}({settings}))"
+        return f" (write {group}({settings}))"
     return ""
 
 

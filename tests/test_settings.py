@@ -71,7 +71,7 @@ def or_none(kind: Kind) -> Kind:
 
 def settings(*taken: Any) -> Kind:
     """Other settings, and no class of them."""
-    return Kind((5, "x", True, None, [], type(taken[0])), taken)
+    return Kind((5, "x", True, None, [], {"x": 1}, type(taken[0])), taken)
 
 
 POSITIVE, NON_NEGATIVE, FRACTION, ANY = number(0, zero=False), number(0), number(0, 1), number()
@@ -374,6 +374,11 @@ def test_a_file_is_held_against_the_same_checks(kind: Any) -> None:
             lambda: make(sw.Hierarchy, "apart", {"start_calls": 5}),
             "Hierarchy.apart is {'start_calls': 5}; it must be Apart() "
             "(write Apart(start_calls=5))",
+        ),
+        (
+            lambda: make(sw.Hierarchy, "apart", {"start_call": 5}),
+            "Hierarchy.apart is {'start_call': 5}; it must be Apart() "
+            "(Apart has no setting 'start_call': is 'start_calls' meant?)",
         ),
         (
             lambda: make(sw.Hierarchy, "learn", "x"),
