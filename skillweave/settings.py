@@ -35,7 +35,7 @@ C = TypeVar("C", bound=type[Any])
 LARGEST = 2**63
 """Whole numbers are smaller than this."""
 LARGEST_FLOAT = 3.4e38
-"""Other numbers are at most this: tensors of float32 must hold them."""
+"""Other numbers are smaller than this: tensors of float32 must hold them."""
 LONGEST_TEXT = 4096
 """Characters of a text: the longest path that a system takes."""
 
@@ -66,8 +66,6 @@ Fraction = Annotated[float, Check("between 0 and 1", lambda x: 0 <= x <= 1)]
 """A number from 0 to 1."""
 Share = Annotated[float, Check("more than 0 and at most 1", lambda x: 0 < x <= 1)]
 """A number from 0 to 1, without 0."""
-
-
 RECORDED = "recorded by its name"
 """Beside a kind of function: the name under which files record the function is taken, too."""
 
@@ -200,6 +198,8 @@ class Fitting:
             return ["None"]
         if _callable(kind):
             return ["a function"]
+        if kind in (list, tuple) or (origin in (list, tuple, Sequence) and not inner):
+            return ["a list"]
         if origin in (list, tuple, Sequence):
             each = [k for k in inner if k is not Ellipsis]
             if origin is tuple and Ellipsis not in inner:
@@ -229,9 +229,9 @@ class Fitting:
                 raise error from None
         if isinstance(value, str) and len(value) > LONGEST_TEXT:
             raise Unfit(path, value, f"a text of at most {LONGEST_TEXT} characters")
-        if origin in (list, tuple, Sequence):
+        if origin in (list, tuple, Sequence) and inner:
             return self._sequence(origin, inner, value, path)
-        if origin in (dict, Mapping):
+        if origin in (dict, Mapping) and inner:
             return {k: self.fit(inner[1], v, f"{path}[{short(k)}]") for k, v in value.items()}
         if isinstance(value, Mapping) and _is_record(kind):
             return self.record(kind, value, path)
@@ -333,7 +333,7 @@ def checked_settings(kind: C) -> C:
 
     def checked(self: Any) -> None:
         first = next(k for k in type(self).__mro__ if "_checks_fields" in vars(k))
-        if first is kind:  # else a class above it has checked already, or will
+        if first is kind:  # else the subclass that called this has checked already
             check_fields(self)
         if own is not None:
             own(self)

@@ -6,6 +6,7 @@ lost or loosened fails here.
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -346,6 +347,29 @@ def test_a_file_is_held_against_the_same_checks(kind: Any) -> None:
             assert f"stages[0].algorithm.{name}" in said, value
 
 
+SKILL = {
+    "max_steps": or_none(AT_LEAST_ONE), "call_steps": or_none(AT_LEAST_ONE),
+    "steps": or_none(AT_LEAST_ONE), "task_weight": or_none(NON_NEGATIVE),
+    "target_return": or_none(ANY), "target_success": or_none(SHARE),
+    "algorithm": or_none(ALGORITHM),
+}  # fmt: skip
+"""What the class attributes of a skill must be."""
+
+
+@pytest.mark.parametrize("name", SKILL)
+def test_a_skills_wrong_attribute_is_named_with_the_skill(name: str) -> None:
+    for value in SKILL[name].refused:
+        odd = type("Odd", (sw.Skill,), {name: value})()
+        with pytest.raises(DeclarationError, match=rf"^skill 'odd'.*: {name} is "):
+            sw.Hierarchy("CartPole-v1", [odd])
+    for value in SKILL[name].taken:
+        right = type("Right", (Stay,), {name: value, "success": Stay.termination})()
+        sw.Hierarchy("CartPole-v1", [right])
+        plain = value.item() if isinstance(value, np.generic) else value
+        assert getattr(right, name) == plain
+        assert type(getattr(right, name)) is type(plain)
+
+
 # Messages
 
 
@@ -445,6 +469,23 @@ def test_a_type_that_only_a_type_checker_knows_does_no_harm() -> None:
 
 
 @pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (list, [1, "x"]),
+        (typing.List, [1, "x"]),  # noqa: UP006
+        (typing.Tuple, (1, "x")),  # noqa: UP006
+        (typing.Dict, {"x": 1}),  # noqa: UP006
+        (typing.TypeVar("T"), object),
+        (type[int], int),
+        (Any, [np.int64(1)]),
+        (gym.Env | None, None),
+    ],
+)
+def test_a_kind_that_says_nothing_of_its_parts_takes_any(kind: Any, value: Any) -> None:
+    assert fitted(kind, value, "x") is value
+
+
+@pytest.mark.parametrize(
     ("kind", "says"),
     [
         (int, "a whole number"),
@@ -456,6 +497,10 @@ def test_a_type_that_only_a_type_checker_knows_does_no_harm() -> None:
         (tuple[int, ...], "a list, each entry a whole number"),
         (tuple[int, int], "a list of 2"),
         (list[Any], "a list"),
+        (list, "a list"),
+        (typing.List, "a list"),  # noqa: UP006
+        (typing.Tuple, "a list"),  # noqa: UP006
+        (typing.Dict, "a dict with texts as keys"),  # noqa: UP006
         (dict[str, int], "a dict with texts as keys"),
         (sw.PPO | sw.DQN, "PPO() or DQN()"),
         (Callable[[], int], "a function"),
