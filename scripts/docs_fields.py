@@ -1,9 +1,12 @@
-"""What griffe asks while it reads the library: a comment beside a field says what the field is."""
+"""What griffe asks while it reads the library: comments beside fields, and plain annotations."""
 
 from __future__ import annotations
 
 import ast
+import copy
 import re
+from collections.abc import Iterator
+from dataclasses import fields
 from typing import Any
 
 import griffe
@@ -20,3 +23,49 @@ class Comments(griffe.Extension):
         if found := re.search(r"  # (.+)$", line):
             text = found[1][0].upper() + found[1][1:] + "."
             attr.docstring = griffe.Docstring(text, lineno=node.lineno, parent=attr)
+
+
+class PlainTypes(griffe.Extension):
+    """``gamma: Fraction`` reads in the reference as ``gamma: float``: a type without its checks."""
+
+    def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
+        """Replace every annotated type in the annotations of classes' fields."""
+        named = {
+            attribute.canonical_path: attribute.value.slice
+            for module in _modules(pkg)
+            for attribute in module.attributes.values()
+            if _is_annotated(attribute.value)
+        }
+        for module in _modules(pkg):
+            for kind in module.classes.values():
+                for attribute in kind.attributes.values() if not kind.is_alias else ():
+                    if attribute.annotation is not None:
+                        attribute.annotation = plain(attribute.annotation, named)
+
+
+def plain(part: Any, named: dict[str, Any]) -> Any:
+    """Return an annotation with plain types in place of annotated ones, which may have a name."""
+    if isinstance(part, list | tuple):
+        return type(part)(plain(one, named) for one in part)
+    if isinstance(part, griffe.ExprName) and part.canonical_path in named:
+        return plain(named[part.canonical_path].elements[0], named)
+    if _is_annotated(part):
+        return plain(part.slice.elements[0], named)
+    if not isinstance(part, griffe.Expr) or isinstance(part, griffe.ExprName):
+        return part
+    changed = copy.copy(part)
+    for field in fields(part):
+        setattr(changed, field.name, plain(getattr(part, field.name), named))
+    return changed
+
+
+def _is_annotated(part: Any) -> bool:
+    left = getattr(part, "left", None)
+    return isinstance(part, griffe.ExprSubscript) and getattr(left, "name", "") == "Annotated"
+
+
+def _modules(module: griffe.Module) -> Iterator[griffe.Module]:
+    yield module
+    for inner in module.modules.values():
+        if not inner.is_alias:
+            yield from _modules(inner)

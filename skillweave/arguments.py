@@ -1,7 +1,7 @@
 """Errors for wrong arguments and attributes: they name the one that was probably meant.
 
 ``@checked_names`` stands above public functions and classes. Where an argument is misspelt, missing
-or one too many, it raises a ``SkillweaveError`` that says what to write, in place of Python's
+or one too many, it raises a ``DeclarationError`` that says what to write, in place of Python's
 TypeError; and it refuses to set an attribute that does not exist.
 """
 
@@ -16,9 +16,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from difflib import SequenceMatcher
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
-
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 
 T = TypeVar("T", bound=Callable[..., Any])
@@ -72,10 +70,10 @@ STARTS_BY = (
 
 
 def checked_names(target: T) -> T:
-    """Let a function, or a class, raise a SkillweaveError where its arguments are wrong.
+    """Let a function, or a class, raise a DeclarationError where its arguments are wrong.
 
     Of a dataclass, attributes are checked as well: those of a frozen one cannot be set, those of
-    another only if they exist. NumPy's numbers become Python's.
+    another only if they exist.
 
     Args:
         target: a function, a method, or a class (above ``@dataclass``, if it is one).
@@ -86,37 +84,22 @@ def checked_names(target: T) -> T:
     if not isinstance(target, type):
         return typing.cast(T, _checked(target))
     kind: Any = target
-    made = "__dataclass_params__" in vars(kind)
-    kind.__init__ = _checked(kind.__init__, settings=made)
-    if made:
+    kind.__init__ = _checked(kind.__init__)
+    if "__dataclass_params__" in vars(kind):
         _check_attributes(kind, kind.__dataclass_params__.frozen)
     return target
 
 
-def plain(value: Any) -> Any:
-    """A setting with Python's numbers and texts in place of NumPy's, also in a tuple or a list."""
-    if isinstance(value, np.generic):
-        found = value.item()
-        return value if isinstance(found, np.generic) else found
-    if type(value) in (tuple, list):
-        converted = [plain(one) for one in value]
-        same = all(a is b for a, b in zip(value, converted, strict=True))
-        return value if same else type(value)(converted)
-    return value
-
-
-def _checked(function: Callable[..., Any], settings: bool = False) -> Callable[..., Any]:
+def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def checked(*args: Any, **named: Any) -> Any:
-        if settings:
-            args, named = tuple(map(plain, args)), {k: plain(v) for k, v in named.items()}
         try:
             return function(*args, **named)
         except TypeError:
             # The function's body may have raised it: then the arguments fit.
             if (wrong := _wrong_arguments(function, args, named)) is None:
                 raise
-        raise SkillweaveError(wrong)
+        raise DeclarationError(wrong)
 
     return checked
 
@@ -282,8 +265,8 @@ def _refuse_change(self: Any, name: str, value: Any) -> None:
     kind = type(self).__name__
     own = [f.name for f in fields(self)]
     if name not in own:
-        raise SkillweaveError(f"{kind} has no setting {name!r}{meant(name, own, 'they are')}")
-    raise SkillweaveError(
+        raise DeclarationError(f"{kind} has no setting {name!r}{meant(name, own, 'they are')}")
+    raise DeclarationError(
         f"{kind} cannot be changed: make another one, with "
         f"dataclasses.replace(..., {name}={short(value)})"
     )
@@ -298,12 +281,12 @@ def _set_known(self: Any, name: str, value: Any) -> None:
         if kind.__module__.split(".")[0] == __name__.split(".")[0]:
             groups = list(_groups(kind, "{}"))
             end = meant(name, places + groups, "its settings are")
-            raise SkillweaveError(f"{kind.__name__} has no setting {name!r}{end}")
+            raise DeclarationError(f"{kind.__name__} has no setting {name!r}{end}")
         # A user's subclass may have attributes of its own, but none that looks like a misspelt one.
         if end := meant(name, places, "", 0.85):
-            raise SkillweaveError(f"{kind.__name__} has no setting {name!r}{end}")
+            raise DeclarationError(f"{kind.__name__} has no setting {name!r}{end}")
     if isinstance(computed := getattr(kind, name, None), property) and computed.fset is None:
-        raise SkillweaveError(f"{kind.__name__}.{name} is computed; it cannot be set")
+        raise DeclarationError(f"{kind.__name__}.{name} is computed; it cannot be set")
     object.__setattr__(self, name, value)
 
 

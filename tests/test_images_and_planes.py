@@ -303,7 +303,7 @@ def test_the_command_line_sets_it(tmp_path, capsys):
     assert 'PPO(network=Network(planes="first"))' in capsys.readouterr().err
     both = [f"--set={who}.network.planes={{}}" for who in ("algorithm", "selector")]
     assert main([*train, *(word.format("middle") for word in both)]) == 1
-    assert "expected one of first, last, none" in capsys.readouterr().err
+    assert "expected one of first, last, None" in capsys.readouterr().err
     assert main([*train, *(word.format("last") for word in both)]) == 0
 
 

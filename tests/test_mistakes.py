@@ -301,7 +301,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "algorithm as text": (lambda: train(algorithm="PPO"), "algorithm is 'PPO'"),
     "algorithm class": (lambda: train(algorithm=sw.PPO), "write PPO(), not PPO"),
     "misspelt way of learning": (lambda: train(learn="jointly"), "'apart, then together'"),
-    "call_steps=0": (lambda: train(call_steps=0), "call_steps is 0; it must be at least 1"),
+    "call_steps=0": (lambda: train(call_steps=0), "call_steps is 0; it must be a whole number"),
     # Runs
     "run_dir is a file": (file_in_the_way, "afile"),
     "run_dir not writable": (lambda: declare().train("/proc/x/run", quiet=True), "/proc/x/run"),
@@ -395,11 +395,11 @@ def changed(**attributes: Any) -> None:
 
 CHANGED = {
     "learn": ("jointly", "it must be one of"),
-    "call_steps": (0, "it must be at least 1"),
-    "algorithm": ("PPO", "no algorithm's settings"),
+    "call_steps": (0, "it must be a whole number of at least 1"),
+    "algorithm": ("PPO", "it must be the settings of an algorithm"),
     "selector": (3, "selector is 3"),
     "steps": (-4, "steps is -4"),
-    "apart": ({"skill_steps": 5}, "write apart=Apart(skill_steps=100_000)"),
+    "apart": ({"skill_steps": 5}, "write Apart(skill_steps=5)"),
     "skills": ([Good], "write Center(), not Center"),
     "reflexes": (None, "reflexes=[Reflex(...)]"),
     "env": (None, "it must be a Gymnasium id"),

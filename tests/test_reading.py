@@ -12,17 +12,8 @@ import pytest
 from skillweave.algorithms.config import DQN, PPO, config_from_json, config_to_json
 from skillweave.errors import SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_from_json, evolution_to_json
-from skillweave.reading import (
-    DEEPEST,
-    LARGEST,
-    Count,
-    Positive,
-    check_file,
-    fit,
-    parse_json,
-    read_file,
-    shown,
-)
+from skillweave.reading import DEEPEST, check_file, fit, parse_json, read_file, shown
+from skillweave.settings import LARGEST, AtLeastOne, Count
 
 
 class Inner(TypedDict):
@@ -39,7 +30,7 @@ class Made:
 
 class Outer(TypedDict):
     parts: list[Inner]
-    limit: Positive | None
+    limit: AtLeastOne | None
     made: NotRequired[Made]
     names: NotRequired[dict[str, str]]
     on: NotRequired[bool]
@@ -68,13 +59,13 @@ GOOD: dict[str, Any] = {"parts": [{"status": "done"}], "limit": None}
             "steps is True; it must be a whole number",
         ),
         ({"limit": 0}, "limit is 0; it must be at least 1"),
-        ({"limit": 2.0}, "limit is 2.0; it must be a whole number below 2^63"),
-        ({"limit": LARGEST}, "limit is 9223372036854775808; it must be a whole number below 2^63"),
+        ({"limit": 2.0}, "limit is 2.0; it must be a whole number, at least 1, or None"),
+        ({"limit": LARGEST}, "limit is 9223372036854775808; it must be below 2^63"),
         ({"made": {"sizes": [1, "a"]}}, "made.sizes[1] is 'a'; it must be a whole number"),
         ({"made": {"pair": [1]}}, "made.pair is [1]; it must be a list of 2"),
         ({"made": {"rate": float("nan")}}, "made.rate is nan; it must be a finite number"),
-        ({"made": {"rate": 10**400}}, "it must be a finite number"),
-        ({"made": {"rate": 1e39}}, "made.rate is 1e+39; it must be a finite number, of float32"),
+        ({"made": {"rate": 10**400}}, "it must be below 2^63"),
+        ({"made": {"rate": 1e39}}, "made.rate is 1e+39; it must be below 3.4e38"),
         ({"made": {"size": 1}}, "x.json: made has no field size: made by a newer version?"),
         ({"names": {"a": 1}}, "names['a'] is 1; it must be a text"),
         ({"names": {"a": "b" * 5000}}, "it must be a text of at most 4096 characters"),

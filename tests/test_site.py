@@ -80,3 +80,10 @@ def test_search_finds_pages_that_are_opened_from_the_disk(site: Path) -> None:
         first.wait_for(timeout=20_000)
         assert "evolution" in page.locator(".md-search-result__list").inner_text().lower()
         window.close()
+
+
+def test_the_reference_shows_plain_types_not_the_names_of_their_checks(site: Path) -> None:
+    text = (site / "reference" / "ppo.html").read_text()
+    assert "gae_lambda" in text
+    found = re.findall(r"\b(?:Fraction|AtLeastOne|NonNegative|Annotated|LearningRate)\b", text)
+    assert found == []

@@ -482,7 +482,7 @@ def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
 
 WRONG = {
     "learn is 'both'": {"learn": "both"},
-    "it must be at least 1, Lengths": {"call_steps": 0},
+    "it must be a whole number of at least 1, Lengths": {"call_steps": 0},
     "call_cost is -1": {"call_cost": -1},
     "interrupt is 3": {"interrupt": 3},
 }

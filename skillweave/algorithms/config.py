@@ -7,7 +7,7 @@ does not import torch, so that ``--help`` and argument errors are instant.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import gymnasium as gym
 
@@ -16,9 +16,14 @@ from skillweave.algorithms.config_on_policy import PPO, OnPolicy, SelfImitationP
 from skillweave.errors import SkillweaveError
 from skillweave.named import Named
 from skillweave.reading import as_json, fit, shown
+from skillweave.settings import Check
 
 AlgorithmConfig: TypeAlias = OnPolicy | OffPolicy
 """Any algorithm's settings, those of users' own algorithms included."""
+AlgorithmSettings: TypeAlias = Annotated[
+    AlgorithmConfig, Check("the settings of an algorithm, such as PPO()")
+]
+"""The same as a field of other settings."""
 
 
 @dataclass(frozen=True)

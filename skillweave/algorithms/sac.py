@@ -19,7 +19,6 @@ from torch import Tensor
 from skillweave.algorithms.actor_critic import ActorCriticAlgorithm, ActorCriticState, Critics
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import SAC
-from skillweave.algorithms.config_checks import check
 from skillweave.algorithms.off_policy import normal
 from skillweave.experience import Sample
 from skillweave.networks.encoders import Inputs
@@ -37,6 +36,7 @@ from skillweave.ops.losses import expected_soft_value, masked_entropy_target
 from skillweave.ops.optim import adam_
 from skillweave.ops.returns import discounted, td_target
 from skillweave.seeding import Seeds
+from skillweave.settings import check
 
 
 @dataclass

@@ -5,41 +5,52 @@ This module does not import torch; see ``config``.
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short, told
 from skillweave.named import Named, known_names, named
+from skillweave.settings import (
+    LARGEST_FLOAT,
+    RECORDED,
+    Check,
+    NonNegative,
+    Positive,
+    checked_settings,
+)
 
 
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Linear:
     """A learning rate that changes linearly: ``PPO(learning_rate=Linear(3e-4, 0))``.
 
     Raises:
-        SkillweaveError: a value is negative, or not finite.
+        DeclarationError: a value is negative, or not finite.
     """
 
-    start: float
-    """The value at the start."""
-    end: float
-    """The value at the end of the budget."""
+    _from_dict = True
 
-    def __post_init__(self) -> None:
-        for name in ("start", "end"):
-            value = getattr(self, name)
-            if not _is_rate(value):
-                raise SkillweaveError(
-                    f"Linear.{name} is {short(value)}; it must be a finite number of at least 0"
-                )
+    start: NonNegative
+    """The value at the start."""
+    end: NonNegative
+    """The value at the end of the budget."""
 
     def __call__(self, remaining: float) -> float:
         """Return the value where this share of the budget remains: 1 at the start, 0 at its end."""
         return self.end + remaining * (self.start - self.end)
+
+
+LearningRate = Annotated[
+    Positive | Linear | Annotated[Callable[[float], float], RECORDED],
+    Check(
+        "a positive number, Linear(start, end), or a function of the share of the budget that "
+        "remains"
+    ),
+]
+"""A number, or a schedule."""
 
 
 def is_schedule(rate: Any) -> bool:
@@ -48,26 +59,19 @@ def is_schedule(rate: Any) -> bool:
 
 
 def check_rate(config: Any) -> None:
-    """Raise where ``learning_rate`` is neither a positive number nor a schedule.
+    """Raise a DeclarationError where a schedule in ``learning_rate`` cannot be followed.
 
-    A dict becomes a ``Linear``, and a function is replaced by its name, which leads to it.
+    A function is replaced by its name, which leads to it.
     """
     value, where = config.learning_rate, f"{type(config).__name__}.learning_rate"
-    if isinstance(value, dict) and set(value) == {"start", "end"}:
-        value = Linear(**value)
     if isinstance(value, str) or (callable(value) and not isinstance(value, Linear)):
         value = named(value, where)
-        if isinstance(value, str) and ":" not in value:
-            raise SkillweaveError(
-                f"{where} is {short(value)}; it must be a number, Linear(start, end), or a "
-                "function of the share of the budget that remains"
-            )
-    object.__setattr__(config, "learning_rate", value)
+        object.__setattr__(config, "learning_rate", value)
     if isinstance(value, Linear | Named):
         for remaining in (1.0, 0.5, 0.0):
             scheduled(config, remaining)
     if is_schedule(value) and getattr(config, "learning_rate_schedule", "") == "kl":
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{type(config).__name__}.learning_rate_schedule is 'kl', which adapts a number, but "
             f"learning_rate is {short(value)}: give one of the two"
         )
@@ -80,12 +84,12 @@ def scheduled(config: Any, remaining: float) -> float:
         remaining: the share of the budget that remains, as in Stable-Baselines3.
 
     Raises:
-        SkillweaveError: its function is not known here, or raised, or returned no finite number
+        DeclarationError: its function is not known here, or raised, or returned no finite number
             of at least 0.
     """
     schedule, where = config.learning_rate, f"{type(config).__name__}.learning_rate"
     if not callable(schedule):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where} is {schedule!r}, a function of your own, and its code is not loaded: resume "
             "by the declaration that has it, or on the command line by --recipe FILE.py "
             f"(functions that are loaded: {known_names()})"
@@ -94,9 +98,10 @@ def scheduled(config: Any, remaining: float) -> float:
         value = schedule(remaining)
         rate = float(value)
     except (Exception, SystemExit) as error:
-        raise SkillweaveError(f"{where}: {schedule}({remaining:g}) raised {told(error)}") from error
-    if not _is_rate(rate):
-        raise SkillweaveError(
+        message = f"{where}: {schedule}({remaining:g}) raised {told(error)}"
+        raise DeclarationError(message) from error
+    if not 0.0 <= rate < LARGEST_FLOAT:
+        raise DeclarationError(
             f"{where}: {schedule}({remaining:g}) returned {short(value)}; it must return a finite "
             "number of at least 0"
         )
@@ -114,7 +119,3 @@ def start_rate(config: Any) -> float:
 def own_schedules(config: Any) -> bool:
     """Return whether learning by these settings needs a function of the user."""
     return isinstance(getattr(config, "learning_rate", None), str)
-
-
-def _is_rate(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and value >= 0 and value < 1e38

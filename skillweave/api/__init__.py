@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import gymnasium as gym
 
-from skillweave import recipes
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
 from skillweave.api.loading import load
 from skillweave.api.notebook_tables import agent_html, agent_line, hierarchy_html, hierarchy_line
+from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.run import Run
 from skillweave.api.running import begin, evolving, go_on
 from skillweave.api.starting import StartFrom
@@ -30,6 +30,7 @@ from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
 from skillweave.messages import as_path, whole_number
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
+from skillweave.shipped import weights_path
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.callback import Callback
 from skillweave.training.plain_agent import PlainAgent
@@ -326,7 +327,7 @@ class Hierarchy(Declaration):
     @checked_names
     def pretrained(name: str) -> Run:
         """The shipped recipe ``name`` with its shipped weights."""
-        return recipes.load(name).load_weights(recipes.weights_path(name))
+        return hierarchy_in(name, Hierarchy).load_weights(weights_path(name))
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from skillweave import recipes
 from skillweave.api import Agent, Hierarchy
+from skillweave.api.recipe_file import hierarchy_in
 from skillweave.errors import SkillweaveError
 from skillweave.runs.directory import RunDirectory
+from skillweave.shipped import names
 
 ASK = "Point to the file that defines it, if you trust it: --recipe FILE.py"
 
@@ -36,7 +37,7 @@ def declared_in(recipe: str | None, given: str | None, where: str, ask: str = AS
     Raises:
         SkillweaveError: it is neither; the message begins with ``where``.
     """
-    if recipe is not None and (given is not None or recipe in recipes.names()):
-        return recipes.load(recipe)
+    if recipe is not None and (given is not None or recipe in names()):
+        return hierarchy_in(recipe, Hierarchy)
     made = f"in {recipe}" if recipe else "in Python"
     raise SkillweaveError(f"{where} was declared {made}, and needs that code. {ask}")

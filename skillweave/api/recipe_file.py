@@ -1,20 +1,58 @@
-"""Reads a recipe's Python file, with the files beside it that it imports."""
+"""Reads a recipe's Python file, with the files beside it that it imports, and its hierarchy."""
 
 from __future__ import annotations
 
 import ast
+import difflib
 import importlib.util
 import sys
 from collections.abc import Iterator
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
+from typing import Any, TypeVar
 
 from skillweave.api.running import READING
 from skillweave.collecting.shipping import add_folder
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import told
+from skillweave.shipped import FOLDER, file_of, names
 from skillweave.tracebacks import place
+
+H = TypeVar("H", bound=Declaration)
+
+
+def hierarchy_in(recipe: str, kind: type[H]) -> H:
+    """Return the hierarchy of a shipped recipe, or of a Python file that defines one.
+
+    Args:
+        recipe: a shipped recipe's name, or the path of a file.
+        kind: ``Hierarchy``.
+
+    Raises:
+        DeclarationError: no such recipe (with close matches) or file, no hierarchy in it, the file
+            trains as soon as it is read, or it raises an error.
+    """
+    path = file_of(recipe)
+    if path.suffix == ".py" and path.is_file():
+        module = read_recipe_file(path, recipe, shipped=path.parent == FOLDER)
+    else:
+        near = difflib.get_close_matches(recipe, names(), n=3, cutoff=0.4)
+        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        raise DeclarationError(
+            f"no recipe or Python file {recipe!r}.{hint} Shipped recipes: {', '.join(names())}"
+        )
+    declared = {k: v for k, v in vars(module).items() if isinstance(v, kind)}
+    if "hierarchy" not in declared and len(declared) != 1:
+        raise DeclarationError(
+            f"{recipe} defines {len(declared) or 'no'} Hierarchy; define one, as the variable "
+            "'hierarchy'"
+        )
+    hierarchy: Any = declared.get("hierarchy") or next(iter(declared.values()))
+    hierarchy.recipe = recipe
+    found: H = hierarchy
+    return found
 
 
 def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> ModuleType:

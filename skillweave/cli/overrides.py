@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import difflib
 import re
-import types
 import typing
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -16,6 +15,7 @@ from skillweave.algorithms.schedules import Linear
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.settings import annotations_of, described, options_of
 from skillweave.skills import Skill
 
 PLAIN = ("call_steps", "steps", "learn")
@@ -50,10 +50,10 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
             raise SkillweaveError(f"--set {setting!r}: write name=value, for example call_steps=20")
         head, *rest = name.split(".")
         if head in PLAIN and not rest:
-            hint = typing.get_type_hints(Declaration)[head]
+            hint = annotations_of(Declaration)[head]
             setattr(declaration, head, _parse(name, text, hint))
         elif head == "skills" and len(rest) == 2 and rest[1] in OF_SKILLS:
-            hint = typing.get_type_hints(Skill)[rest[1]]
+            hint = annotations_of(Skill)[rest[1]]
             setattr(declaration.skill(rest[0]), rest[1], _parse(name, text, hint))
         elif head == "skills" and len(rest) == 1:
             kinds[head, rest[0]] = text
@@ -129,7 +129,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
 
 def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
     """``config`` with the fields at these paths set to values parsed from (full name, text)."""
-    known, hints = [f.name for f in fields(config)], typing.get_type_hints(type(config))
+    known, hints = [f.name for f in fields(config)], annotations_of(type(config))
     values: dict[str, Any] = {}
     deeper: dict[str, dict[tuple[str, ...], tuple[str, str]]] = {}
     for (field, *rest), (name, text) in changes.items():
@@ -145,7 +145,7 @@ def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> An
         if inner is None and field == "critic":
             inner = values.get("network", getattr(config, "network", None))  # its default
         if inner is None:
-            parts: list[Any] = [t for t in typing.get_args(hints[field]) if is_dataclass(t)]
+            parts: list[Any] = [kind for kind in options_of(hints[field]) if is_dataclass(kind)]
             inner = parts[0]() if parts else None
         if not is_dataclass(inner):
             name = next(iter(inner_changes.values()))[0]
@@ -159,9 +159,7 @@ _LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 def _parse(name: str, text: str, hint: Any) -> Any:
     """``text`` as a value of the annotated type."""
-    options = [hint]
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        options = list(typing.get_args(hint))
+    options = options_of(hint)
     if type(None) in options and text.lower() in ("none", "null"):
         return None
     try:
@@ -189,14 +187,9 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return tuple(value) if isinstance(value, tuple | list) else (value,)
         if origin is typing.Literal and value in typing.get_args(option):
             return value
-    wanted = getattr(hint, "__name__", str(hint).replace("typing.", ""))
-    if typing.get_origin(hint) is Sequence:
+    wanted = described(hint)
+    if typing.get_origin(options[0]) is Sequence:
         wanted = "names with commas between them"
-    words = [option for option in options if option is not type(None)]
-    if all(typing.get_origin(option) is typing.Literal for option in words):
-        known = [word for option in words for word in typing.get_args(option)]
-        known += ["none"] if len(words) < len(options) else []
-        wanted = "one of " + ", ".join(map(str, known))
     raise SkillweaveError(f"{name}={text}: expected {wanted}")
 
 

@@ -9,21 +9,21 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from skillweave.arguments import checked_names
 from skillweave.collecting.group import Collectors, MakeCollector, share_of
 from skillweave.collecting.where import Where
 from skillweave.collecting.workers import MakeStanding, Workers
 from skillweave.envs.make import cores
 from skillweave.errors import MissingExtra, SkillweaveError
-from skillweave.messages import short, told, whole_number
+from skillweave.messages import short, told
+from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
 
 PATIENCE = 5.0
 """Seconds that an address has to answer."""
 
 
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Ray:
     """Collectors as actors of Ray, on this machine or on a cluster.
@@ -38,33 +38,20 @@ class Ray:
     ```
 
     Raises:
-        SkillweaveError: a value is out of its range.
+        DeclarationError: a value is out of its range.
     """
 
-    collectors: int | None = None
+    collectors: AtLeastOne | None = None
     """How many; the environments of a stage are shared out equally, or the members of a population.
     None: as many as there would be processes without Ray. A run keeps the number, as results depend
     on it."""
-    address: str | None = None
+    address: Annotated[str, Check("a text such as '10.0.0.1:6379'")] | None = None
     """``host:port`` of a cluster's head, ``ray://host:port``, or ``auto``: the one that runs on
     this machine. None: what RAY_ADDRESS says, or else a new one of this machine alone."""
-    cpus: float = 1.0
+    cpus: Positive = 1.0
     """Of the cluster's CPUs, what each collector takes."""
-    patience: float = 300.0
+    patience: NonNegative = 300.0
     """Seconds to wait while the cluster has no room for all collectors, or lost some of it."""
-
-    def __post_init__(self) -> None:
-        if self.collectors is not None:
-            whole_number(self.collectors, "Ray: collectors", 1)
-        if self.address is not None and not isinstance(self.address, str):
-            raise SkillweaveError(
-                f"Ray: address is {short(self.address)}; it must be a text such as '10.0.0.1:6379'"
-            )
-        for name, least in (("cpus", "more than 0"), ("patience", "at least 0")):
-            value: Any = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not 0 <= value < math.inf or (name == "cpus" and value == 0):
-                raise SkillweaveError(f"Ray: {name} is {short(value)}; it must be {least}")
 
     def check(self) -> None:
         """Raise a SkillweaveError where Ray is not installed, or nobody listens at the address."""

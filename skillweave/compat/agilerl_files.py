@@ -21,8 +21,9 @@ from skillweave.compat.pickles import read_torch_pickle
 from skillweave.errors import SkillweaveError
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
-from skillweave.reading import Asked, Positive, fit, shown
+from skillweave.reading import fit, shown
 from skillweave.seeding import Seeds
+from skillweave.settings import AtLeastOne, Check
 
 _KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "DDPG": TD3, "TD3": TD3}
 _OUTPUTS = {"PPO": "Softmax", "DQN": None, "DDPG": "Tanh", "TD3": "Tanh"}
@@ -71,7 +72,7 @@ def convert(path: Path, out: Path) -> str:
 
 
 _MOST_UNITS = 10**6
-_Units = Annotated[int, Asked("between 1 and a million", lambda n: 1 <= n <= _MOST_UNITS)]
+_Units = Annotated[int, Check("between 1 and a million", lambda n: 1 <= n <= _MOST_UNITS)]
 
 
 def _is_size(data: Any) -> bool:
@@ -82,7 +83,7 @@ def _is_size(data: Any) -> bool:
 class _Init(TypedDict):
     """The description of an MLP, as AgileRL writes it."""
 
-    num_inputs: NotRequired[Annotated[Any, Asked("sizes, a million in all at most", _is_size)]]
+    num_inputs: NotRequired[Annotated[Any, Check("sizes, a million in all at most", _is_size)]]
     num_outputs: NotRequired[_Units]
     hidden_size: NotRequired[list[_Units]]
     mlp_output_activation: NotRequired[str | None]
@@ -106,8 +107,8 @@ class _Checkpoint(TypedDict):
     lr: NotRequired[float]
     lr_actor: NotRequired[float]
     lr_critic: NotRequired[float]
-    learn_step: NotRequired[Positive]
-    policy_freq: NotRequired[Positive]
+    learn_step: NotRequired[AtLeastOne]
+    policy_freq: NotRequired[AtLeastOne]
 
 
 def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,9 +22,10 @@ from skillweave.envs.infos import ActionMasks, batched_infos, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
 from skillweave.errors import MissingExtra, SkillweaveError
-from skillweave.messages import close_matches, short, shortened, told, whole_number
+from skillweave.messages import close_matches, short, shortened, told
 from skillweave.reading import as_json
 from skillweave.seeding import Seeds, global_generators
+from skillweave.settings import AtLeastOne, Check, check_fields
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 
 MOST = 65_536
@@ -36,6 +37,32 @@ PIECES, STEPS = 5, 50
 PIECE_SECONDS = 0.1
 """A piece that takes longer ends."""
 EngineName = Literal["auto", "envpool", "sync"]
+Maker = Annotated[
+    str | Callable[..., gym.Env[Any, Any]],
+    Check(
+        "a Gymnasium id, or a function that makes an environment (environments are made many "
+        "times over)",
+        lambda x: not isinstance(x, gym.Env),
+    ),
+]
+"""What makes an environment."""
+Wrappers = Annotated[
+    tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...],
+    Check("a tuple of functions that take an environment and return one"),
+]
+"""What wraps an environment, first one first."""
+PoolMaker = Annotated[
+    MakePool, Check("a function of num_envs, threads and seed that makes a pool", callable)
+]
+"""What makes environments side by side."""
+Names = Annotated[
+    ObsNames,
+    Check(
+        "a list with a name for each number of an observation, or for a Dict such lists by key: "
+        '{"place": ["x", "y"]}'
+    ),
+]
+"""Names of the numbers of an observation."""
 
 
 class Spaces(NamedTuple):
@@ -76,51 +103,24 @@ class EnvSpec:
             a Dict such lists by key. None: those of the environment's attribute ``obs_names``.
 
     Raises:
-        SkillweaveError: a field is of another kind, or fields do not fit each other; the message
+        DeclarationError: a field is of another kind, or fields do not fit each other; the message
             says which.
     """
 
-    env: str | Callable[..., gym.Env[Any, Any]]
+    env: Maker
     kwargs: dict[str, Any] = field(default_factory=dict)
-    wrappers: tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...] = ()
+    wrappers: Wrappers = ()
     engine: EngineName = "auto"
-    workers: int | None = None
-    pool: MakePool | None = None
+    workers: AtLeastOne | None = None
+    pool: PoolMaker | None = None
     # What numbers are called makes no other environment.
-    obs_names: ObsNames | None = field(default=None, compare=False, repr=False)
+    obs_names: Names | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if is_batched(self.env):
             raise refuse_batched(short(self.env))
-        made = isinstance(self.env, gym.Env)
-        if made or not (isinstance(self.env, str) or callable(self.env)):
-            raise SkillweaveError(
-                f"env is {short(self.env)}; it must be a Gymnasium id, or a function that makes an "
-                "environment (environments are made many times over)"
-            )
-        if not isinstance(self.kwargs, dict) or not all(isinstance(k, str) for k in self.kwargs):
-            raise SkillweaveError(
-                f"{self.name}: kwargs is {short(self.kwargs)}; it must be a dict with names as keys"
-            )
-        wrappers = self.wrappers
-        if not isinstance(wrappers, tuple | list) or not all(callable(w) for w in wrappers):
-            raise SkillweaveError(
-                f"{self.name}: wrappers is {short(wrappers)}; it must be a tuple of functions that "
-                "take an environment and return one"
-            )
-        if self.pool is not None and not callable(self.pool):
-            raise SkillweaveError(
-                f"{self.name}: pool is {short(self.pool)}; it must be a function of num_envs, "
-                "threads and seed that makes a pool"
-            )
-        if self.workers is not None:
-            whole_number(self.workers, f"{self.name}: workers", 1)
+        check_fields(self)
         checked_obs_names(self.obs_names, self.name)
-        if self.engine not in get_args(EngineName):
-            known = ", ".join(get_args(EngineName))
-            raise SkillweaveError(
-                f"{self.name}: no engine {short(self.engine)}; there are: {known}"
-            )
 
     @property
     def spaces(self) -> Spaces:

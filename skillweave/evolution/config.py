@@ -5,28 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal, TypedDict, get_args
+from typing import Annotated, Any, Literal, TypedDict, get_args
 
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.config_checks import check, number, one_of, whole
 from skillweave.algorithms.schedules import is_schedule
-from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.networks.config import Activation
 from skillweave.reading import fit
+from skillweave.settings import AtLeastOne, Check, Fraction, NonNegative, check, checked_settings
 
 Scale = Literal["linear", "log", "complement"]
 KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")
 """The kinds of mutation; ``Mutations`` has a probability of each."""
 
 
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Range:
     """Where a setting may lie, and how it moves there.
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
     low: float
@@ -37,15 +36,11 @@ class Range:
     """linear; log: ratios count; complement: ratios of 1 − x count (γ, λ)."""
 
     def __post_init__(self) -> None:
-        if self.scale not in get_args(Scale):
-            known = ", ".join(get_args(Scale))
-            raise SkillweaveError(f"Range.scale is {self.scale!r}; it must be one of {known}")
-        if not self.low < self.high:
-            raise SkillweaveError(f"Range.high is {self.high}; it must be more than {self.low}")
-        if self.scale == "log" and self.low <= 0.0:
-            raise SkillweaveError(f"Range.low is {self.low}; on a log scale it must be positive")
-        if self.scale == "complement" and self.high >= 1.0:
-            raise SkillweaveError(f"Range.high is {self.high}; as a complement it must be below 1")
+        check(self, "high", self.low < self.high, f"more than low ({self.low})")
+        if self.scale == "log":
+            check(self, "low", self.low > 0.0, "positive on a log scale")
+        if self.scale == "complement":
+            check(self, "high", self.high < 1.0, "below 1 as a complement")
 
     def to_unit(self, value: float) -> float:
         """Where a ``value`` lies between low (0) and high (1)."""
@@ -91,61 +86,64 @@ _MUTATED = ("learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "ta
 """Those that do where nothing else is said: they never part a stack."""
 
 
-@checked_names
+Limits = Annotated[
+    tuple[AtLeastOne, AtLeastOne],
+    Check("(fewest, most) in this order, each at least 1", lambda x: x[0] <= x[1]),
+]
+"""Fewest and most."""
+Activations = Annotated[
+    tuple[Activation, ...], Check(f"some of {', '.join(get_args(Activation))}", bool)
+]
+"""At least one nonlinearity."""
+
+
+@checked_settings
 @dataclass(frozen=True)
 class Mutations:
     """What happens to an heir: one kind of change, by these probabilities.
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    none: float = 0.2
+    none: Fraction = 0.2
     """Nothing."""
-    hyperparameters: float = 0.4
+    hyperparameters: Fraction = 0.4
     """One setting moves within its range."""
-    parameters: float = 0.1
+    parameters: Fraction = 0.1
     """Gaussian noise on a share of the policy's weights."""
-    architecture: float = 0.2
+    architecture: Fraction = 0.2
     """Units or a layer are added or removed; growth leaves the function as it was."""
-    activation: float = 0.1
+    activation: Fraction = 0.1
     """Another nonlinearity."""
     ranges: Mapping[str, Range] | None = None
     """By setting; None: learning_rate, gamma and others, where the start value is usual."""
-    strength: float = 0.1
+    strength: NonNegative = 0.1
     """Deviation of the noise on weights, in units of the layer's weights' own."""
-    share: float = 0.1
+    share: Fraction = 0.1
     """Share of the weights that get noise."""
-    step: float = 0.1
+    step: Fraction = 0.1
     """How far a setting moves: this share of its range, up or down."""
-    layer_share: float = 0.2
+    layer_share: Fraction = 0.2
     """Share of architecture mutations that add or remove a layer; the others change units."""
-    layers: tuple[int, int] = (1, 3)
+    layers: Limits = (1, 3)
     """Fewest and most hidden layers."""
-    units: tuple[int, int] = (16, 256)
+    units: Limits = (16, 256)
     """Fewest and most units of a hidden layer."""
-    channels: tuple[int, int] = (8, 64)
+    channels: Limits = (8, 64)
     """Fewest and most channels of a convolution."""
-    kernels: tuple[int, int] = (1, 8)
+    kernels: Limits = (1, 8)
     """Smallest and largest kernel of a convolution; it changes where no output's size does."""
-    activations: tuple[Activation, ...] = ("tanh", "relu", "elu", "silu")
+    activations: Activations = ("tanh", "relu", "elu", "silu")
     """Nonlinearities to choose from."""
 
     def __post_init__(self) -> None:
-        number(self, *KINDS, "share", "step", "layer_share", high=1.0)
         total = sum(getattr(self, name) for name in KINDS)
         if abs(total - 1.0) > 1e-6:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"Mutations: the probabilities {', '.join(KINDS)} sum to {total:g}; "
                 "they must sum to 1"
             )
-        number(self, "strength")
-        for name in ("layers", "units", "channels", "kernels"):
-            low, high = getattr(self, name)
-            check(self, name, 1 <= low <= high, "(fewest, most), at least 1")
-        known = get_args(Activation)
-        fits = bool(self.activations) and all(a in known for a in self.activations)
-        check(self, "activations", fits, f"some of {', '.join(known)}")
 
     def ranges_of(self, config: AlgorithmConfig, *, start: bool = True) -> dict[str, Range]:
         """The ranges of an algorithm's settings.
@@ -158,7 +156,7 @@ class Mutations:
             By setting, its range.
 
         Raises:
-            SkillweaveError: a setting that it does not have, or a range without the start value.
+            DeclarationError: a setting that it does not have, or a range without the start value.
         """
         own = {f.name for f in fields(config)}
         learnt = {"ent_coef"} if getattr(config, "learn_ent_coef", False) else set()
@@ -171,64 +169,58 @@ class Mutations:
             kind = type(config).__name__
             if name not in own or name not in USUAL:
                 can = ", ".join(k for k in USUAL if k in own - learnt)
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"Mutations.ranges: {kind} has no setting {name!r} that can mutate; "
                     f"those that can: {can}"
                 )
             if name in learnt:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"Mutations.ranges: {kind} learns {name} (learn_{name}=True), so a mutation "
                     f"would change nothing: leave it out, or set learn_{name}=False"
                 )
             if name == "learning_rate" and scheduled:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"Mutations.ranges: {kind}.learning_rate is a schedule, which cannot mutate: "
                     "leave it out, or give a number"
                 )
             value = getattr(config, name)
             if start and (value is None or not found.low <= value <= found.high):
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"Mutations.ranges[{name!r}] is {found.low:g} to {found.high:g}, which "
                     f"excludes the start value {kind}.{name} = {value}"
                 )
         return dict(self.ranges)
 
 
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Tournament:
     """Each heir's parent is the best of a few members drawn at random.
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    size: int = 2
+    size: AtLeastOne = 2
     """Members in a tournament."""
     elitism: bool = True
     """The best member goes on as it is."""
 
-    def __post_init__(self) -> None:
-        whole(self, "size")
 
-
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Truncation:
     """The worst members become heirs of the best; all others go on (Jaderberg et al. 2017).
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    share: float = 0.25
+    share: Annotated[float, Check("more than 0 and at most 0.5", lambda x: 0 < x <= 0.5)] = 0.25
     """Of the members, how many are replaced, and by how many."""
 
-    def __post_init__(self) -> None:
-        check(self, "share", 0.0 < self.share <= 0.5, "more than 0 and at most 0.5")
 
-
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Evolution:
     """A population in place of one agent: it trains, is compared, selected and mutated.
@@ -241,14 +233,14 @@ class Evolution:
     ```
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    population: int = 8
+    population: AtLeastOne = 8
     """Members."""
-    generations: int = 20
+    generations: AtLeastOne = 20
     """How often they are compared; what is left of the budget is shared evenly between them."""
-    episodes: int = 10
+    episodes: AtLeastOne = 10
     """Episodes that a member's fitness is the mean return of; the same starts for all. They are
     played in at most as many environments as a member trains in (``num_envs``)."""
     target: float | None = None
@@ -261,8 +253,6 @@ class Evolution:
     """What changes from parent to heir."""
 
     def __post_init__(self) -> None:
-        whole(self, "population", "generations", "episodes")
-        one_of(self, "start", ("config", "random"))
         if isinstance(self.selection, Tournament) and self.selection.elitism:
             check(self, "population", self.population > 1, "at least 2 with Tournament.elitism")
         if isinstance(self.selection, Tournament):
@@ -271,7 +261,6 @@ class Evolution:
         if not isinstance(self.selection, Tournament | Truncation):
             able = callable(getattr(self.selection, "select", None))
             check(self, "selection", able, "Tournament(), Truncation() or have select()")
-        check(self, "mutations", isinstance(self.mutations, Mutations), "a Mutations()")
 
 
 def evolution_to_json(evolution: Evolution) -> dict[str, Any]:
@@ -287,7 +276,7 @@ def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = No
     """The inverse of ``evolution_to_json``; ``selection``: the user's own, which is not in it.
 
     Raises:
-        SkillweaveError: an unknown field, a value of another type or out of range, or the
+        DeclarationError: an unknown field, a value of another type or out of range, or the
             selection is missing.
     """
     values: dict[str, Any] = fit(dict[str, Any], data, where, "evolution")
@@ -295,7 +284,7 @@ def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = No
     kind = chosen.pop("kind")
     known: dict[str, Any] = {"Tournament": Tournament, "Truncation": Truncation}
     if kind not in known and type(selection).__name__ != kind:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where} evolves by a selection of your own, {kind[:60]}; give it: "
             f"resume(..., evolve=Evolution(selection={kind[:60]}(), ...))"
         )

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
 from skillweave.arguments import checked_names
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec, Spaces, spec_of
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.budgets import budgets_of, scale_budgets
-from skillweave.hierarchy.checks import check_calls, check_groups, checked_reflexes, checked_skills
+from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
 from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted_selectors
 from skillweave.hierarchy.guidance import check_selection
 from skillweave.hierarchy.nesting import (
@@ -31,16 +31,31 @@ from skillweave.messages import short
 from skillweave.networks.config import seeing_all
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
+from skillweave.settings import AtLeastOne, Check, check_fields, fitted
 from skillweave.skills import Reflex, Skill
 from skillweave.spaces import action_codec, obs_codec
-from skillweave.training.checks import check_algorithm, check_env, check_fields
+from skillweave.training.checks import EnvValue, check_env
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.plain_agent import AGENT, PlainAgent
-from skillweave.training.stage import CRITIC, SELECTOR, TOGETHER, Together, target_of
+from skillweave.training.stage import CRITIC, SELECTOR, TOGETHER, Together
 from skillweave.types import Policy
 
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
 """Names of stages that are not skills."""
+CallSteps = Annotated[
+    AtLeastOne | Lengths | None,
+    Check("a whole number of at least 1, Lengths(1, ..., 128), or None"),
+]
+"""How long calls may last."""
+SelectorValue = Annotated[
+    AlgorithmConfig | ReadyValue,
+    Check(
+        "the settings of an algorithm, such as PPO(), or a ready selector: a function of "
+        "observations, an Automaton or a tree",
+        lambda x: not isinstance(x, type),
+    ),
+]
+"""A selector that is trained, or a ready one."""
 
 
 @checked_names
@@ -49,25 +64,25 @@ class Declaration(Nestable):
     """Skills, reflexes and a selector on one environment, with budgets in environment steps.
 
     Raises:
-        SkillweaveError: the declaration is wrong; the message names the skill and the field.
+        DeclarationError: the declaration is wrong; the message names the skill and the field.
     """
 
-    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec
+    env: EnvValue
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     skills: Sequence[Skill]
     """The skills that the selector chooses from; a hierarchy among them is trained inside."""
-    call_steps: int | Lengths | None = 40
+    call_steps: CallSteps = 40
     """How long a skill acts before the selector decides again; None: until it stops by itself."""
-    steps: int | None = None
+    steps: AtLeastOne | None = None
     """Training steps in all, split by ``learn``; None: 1,000,000. A budget that a skill, ``apart``
     or ``together`` sets replaces that part and leaves the others as they are."""
     learn: Literal["together", "apart", "apart, then together"] = "together"
     """Train skills and selector from the same steps ("together"); or skills one by one, then the
     selector ("apart"); or one after the other, half of the steps each. Where no skill learns, the
     selector trains alone."""
-    algorithm: AlgorithmConfig = field(default_factory=PPO)
+    algorithm: AlgorithmSettings = field(default_factory=PPO)
     """Trains every skill that names none of its own."""
-    selector: AlgorithmConfig | ReadyValue = field(default_factory=PPO)
+    selector: SelectorValue = field(default_factory=PPO)
     """Trains the selector; its γ is that of one environment step, and so its n_steps. Or a ready
     selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
     reflexes: Sequence[Reflex] = ()
@@ -94,16 +109,13 @@ class Declaration(Nestable):
         """Check every setting; training and loading do it again, as attributes may be set.
 
         Raises:
-            SkillweaveError: something is wrong; the message names it.
+            DeclarationError: something is wrong; the message names it.
         """
         check_env(self.env)
         self.skills = checked_skills(self.skills, RESERVED)
         self.reflexes = checked_reflexes(self.reflexes)
-        check_algorithm(self.algorithm, "algorithm")
-        check_groups(self)
-        check_selection(self)
-        target_of(self.selection.target_return, None, "selector")
         check_fields(self)
+        check_selection(self)
         check_calls(self.call_steps, self.skills)
         check_ends(self)
         for _, inner in inner_hierarchies(self.skills):
@@ -199,7 +211,7 @@ class Declaration(Nestable):
         Args:
             algorithm: its settings; None: those of ``train_defaults``, or of the skills.
         """
-        check_algorithm(algorithm, "flat", optional=True)
+        algorithm = fitted(AlgorithmSettings | None, algorithm, "flat")
         steps = self.total_steps or self.steps
         if not steps:
             raise SkillweaveError(

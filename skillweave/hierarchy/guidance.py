@@ -12,26 +12,17 @@ from skillweave.algorithms.config import PPO
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import SkillweaveError
-from skillweave.messages import short
 from skillweave.selectors import Automaton, ReadySelector, ready_selector
 from skillweave.skills.foreign_policy import fitted, source_of
-from skillweave.training.checks import check_algorithm
 from skillweave.training.stage import SELECTOR
 
 if TYPE_CHECKING:
     from skillweave.hierarchy.declaration import Declaration
 
-WAYS = ("apart", "together", "apart, then together")
-
 
 def check_selection(declared: Declaration) -> None:
     """Raise a SkillweaveError where selector, guide and how they learn do not fit together."""
-    if declared.learn not in WAYS:
-        raise SkillweaveError(
-            f"learn is {short(declared.learn)}; it must be one of: {', '.join(map(repr, WAYS))}"
-        )
     if declared.ready_selector is None:
-        check_algorithm(declared.selector, "selector", also="function, Automaton or tree")
         if declared.guide is not None:
             _check_guide(declared)
         return
@@ -50,11 +41,7 @@ def _check_guide(declared: Declaration) -> None:
     """Raise a SkillweaveError where a guide could not guide."""
     guide = declared.guide
     assert guide is not None
-    if ready_guide(declared) is None:
-        raise SkillweaveError(
-            f"Guide: selector is {short(guide.selector)}; it must be a function of observations, "
-            "an Automaton or a tree"
-        )
+    ready_guide(declared)  # says which of its skills does not exist
     if guide.target_kl is not None and not isinstance(declared.selector, PPO):
         raise SkillweaveError(
             f"the guide's target_kl is {guide.target_kl:g}, but the selector learns by "

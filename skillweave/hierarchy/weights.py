@@ -23,9 +23,10 @@ from skillweave.hierarchy.guidance import check_guided, ready_guide
 from skillweave.hierarchy.nesting import every_hierarchy, every_skill, inner_of
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
-from skillweave.reading import Positive, fit, shown
+from skillweave.reading import fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.selectors import ReadySelector
+from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
 from skillweave.training.plain_agent import AGENT, PlainAgent
@@ -120,9 +121,9 @@ def _restricting(declaration: Declaration) -> ReadySelector | None:
 class InnerHeader(TypedDict):
     """What the file says of how a hierarchy calls its skills."""
 
-    call_steps: Positive | None
-    call_lengths: NotRequired[list[Positive]]
-    interrupt: NotRequired[float | None]
+    call_steps: AtLeastOne | None
+    call_lengths: NotRequired[list[AtLeastOne]]
+    interrupt: NotRequired[NonNegative | None]
     greedy_skills: bool
     greedy_selector: bool
     guide: NotRequired[Source]

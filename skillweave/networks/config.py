@@ -2,49 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
-from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
-from skillweave.messages import short
+from skillweave.errors import DeclarationError
 from skillweave.named import named
+from skillweave.settings import Check, Count, check, checked_settings
 
 T = TypeVar("T")
 WIDEST = 65_536
 """Units of a layer."""
 Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
+Width = Annotated[int, Check(f"at least 1 and at most {WIDEST:,}", lambda x: 1 <= x <= WIDEST)]
+"""Units of a layer, channels, or pixels of a kernel."""
+Places = Annotated[
+    tuple[Count, ...],
+    Check(
+        "a tuple of places in an observation, from 0 on, each once: sees=(0, 1, 4)",
+        lambda x: 0 < len(x) == len(set(x)),
+    ),
+]
+"""Places of numbers in an observation."""
+EncoderValue = Annotated[
+    str | Callable[[Any], Any],
+    Check(
+        "a function f(observation_space) that returns a torch.nn.Module, or the name of a "
+        "registered encoder"
+    ),
+]
+"""An encoder as the user gives it."""
 
 
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class CNN:
     """How images become features; ``CNN()`` is Nature's (Mnih et al. 2015).
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
+
+    _from_dict = True
 
     kind: Literal["plain", "impala"] = "plain"
     """plain: convolutions in a row; impala: residual stages, each halving the image."""
-    channels: tuple[int, ...] = (32, 64, 64)
+    channels: tuple[Width, ...] = (32, 64, 64)
     """Channels of each convolution, or of each residual stage."""
-    kernels: tuple[int, ...] = (8, 4, 3)
+    kernels: tuple[Width, ...] = (8, 4, 3)
     """Kernel size of each convolution, in pixels; impala's are always 3."""
-    strides: tuple[int, ...] = (4, 2, 1)
+    strides: tuple[Width, ...] = (4, 2, 1)
     """Stride of each convolution, in pixels."""
 
     def __post_init__(self) -> None:
-        as_tuples(self, "channels", "kernels", "strides")
-        _choice(self, "kind", ("plain", "impala"))
-        for name in ("channels", "kernels", "strides"):
-            _widths(self, name)
-        if not self.channels:
-            raise SkillweaveError("CNN.channels is (); it needs at least one layer")
+        check(self, "channels", len(self.channels) > 0, "a list of at least one layer")
         sizes = {len(self.channels), len(self.kernels), len(self.strides)}
         if self.kind == "plain" and len(sizes) > 1:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"CNN.channels, kernels and strides have {len(self.channels)}, "
                 f"{len(self.kernels)} and {len(self.strides)} entries; they must be as many"
             )
@@ -71,29 +85,24 @@ class CNN:
         return cls("plain", (16,), (3,), (1,))
 
 
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class RNN:
     """A memory after the hidden layers.
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
+
+    _from_dict = True
 
     kind: Literal["lstm", "gru"] = "lstm"
     """lstm (Hochreiter & Schmidhuber 1997) or gru (Cho et al. 2014)."""
-    size: int = 64
+    size: Width = 64
     """Numbers that it outputs."""
 
-    def __post_init__(self) -> None:
-        _choice(self, "kind", ("lstm", "gru"))
-        if not _is_width(self.size):
-            raise SkillweaveError(
-                f"RNN.size is {short(self.size)}; it must be at least 1 and at most {WIDEST:,}"
-            )
 
-
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Network:
     """Images through a CNN, everything else as it is, then hidden layers, then a memory.
@@ -111,10 +120,12 @@ class Network:
     ```
 
     Raises:
-        SkillweaveError: a setting is wrong or out of its range; the message names it.
+        DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
-    hidden: tuple[int, ...] = (64, 64)
+    _from_dict = True
+
+    hidden: tuple[Width, ...] = (64, 64)
     """Width of each hidden layer."""
     activation: Activation = "tanh"
     """Nonlinearity after each hidden layer, and after each convolution."""
@@ -125,7 +136,7 @@ class Network:
     kernel where an image has less than 3 pixels."""
     rnn: RNN | None = None
     """A memory, for PPO; None: the policy sees one observation at a time."""
-    encoder: str | Callable[[Any], Any] | None = None
+    encoder: EncoderValue | None = None
     """A network of your own in front of the hidden layers: a function ``f(observation_space)`` that
     returns a ``torch.nn.Module``, or such a class. Its ``forward`` turns observations (B, *shape)
     into features (B, F), as a features extractor of Stable-Baselines3 does. The space describes
@@ -133,7 +144,7 @@ class Network:
     them, images as (C, H, W) from 0 to 1, choices one-hot, a Dict or Tuple as a dict or tuple. Its
     parameters are learnt and saved with the policy; a run records its name, and needs its code to
     be loaded. Or the name of an encoder that was registered; see ``register_encoder``."""
-    sees: tuple[int, ...] | None = None
+    sees: Places | None = None
     """Which numbers of the observation it sees, by their places; None: all. The places are those of
     the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without images,
     which are seen in any case. For a skill that is not to know of the task around it."""
@@ -143,59 +154,27 @@ class Network:
     example; where each shape does, for all."""
 
     def __post_init__(self) -> None:
-        as_tuples(self, "hidden", "sees")
-        for name, kind in (("cnn", CNN), ("rnn", RNN)):
-            from_dict(self, name, kind)
-        _widths(self, "hidden")
-        _choice(self, "activation", get_args(Activation))
-        _choice(self, "layer_norm", (True, False))
-        _choice(self, "planes", ("first", "last", None))
         if self.encoder is not None:
             object.__setattr__(self, "encoder", _encoder(self.encoder))
-        if self.sees is not None:
-            _places(self.sees)
-            if self.encoder is not None:
-                raise SkillweaveError("Network: give sees or encoder, not both")
-        for name, kind in (("cnn", CNN), ("rnn", RNN)):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise SkillweaveError(
-                    f"Network.{name} is {short(value)}; it must be a {kind.__name__}() or None"
-                )
+        if self.sees is not None and self.encoder is not None:
+            raise DeclarationError("Network: give sees or encoder, not both")
 
 
-def as_tuples(config: object, *names: str) -> None:
-    """Turn the lists in these fields of frozen settings into tuples."""
-    for name in names:
-        if isinstance(value := getattr(config, name), list):
-            object.__setattr__(config, name, tuple(value))
-
-
-def from_dict(config: object, name: str, kind: type[Any]) -> None:
-    """Turn a dict in a field of frozen settings into the settings that it names.
-
-    Raises:
-        SkillweaveError: it names one that does not exist, or a value is wrong.
-    """
-    value = getattr(config, name)
-    if isinstance(value, Mapping) and all(isinstance(k, str) for k in value):
-        try:
-            object.__setattr__(config, name, kind(**value))
-        except SkillweaveError as error:
-            raise SkillweaveError(f"{type(config).__name__}.{name}: {error}") from error
+def check_critic(config: Any) -> None:
+    """Raise a DeclarationError where the ``critic`` of settings does not fit the ``network``."""
+    critic = getattr(config, "critic", None)
+    if critic is not None:
+        check(config, "critic", critic.rnn is None, "without rnn")
+        same = critic.planes in (None, config.network.planes)
+        check(config, "critic", same, "without planes: Network.planes of network counts for both")
 
 
 def _encoder(value: Any) -> str:
     """Return the name of an encoder; of a function of the user one that leads to it."""
     if not isinstance(value, str) and hasattr(value, "state_dict") and not isinstance(value, type):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"Network.encoder is a {type(value).__name__}, a module; give the class, or a function "
             "f(observation_space) that makes the module, because each network gets one of its own"
-        )
-    if not isinstance(value, str) and not callable(value):
-        raise SkillweaveError(
-            f"Network.encoder is {short(value)}; it must be a function f(observation_space) that "
-            "returns a torch.nn.Module, or the name of a registered encoder"
         )
     found: str = named(value, "Network.encoder")
     return found
@@ -206,34 +185,3 @@ def seeing_all(algorithm: T) -> T:
     networks = {k: getattr(algorithm, k, None) for k in ("network", "critic")}
     seeing = {k: replace(v, sees=None) for k, v in networks.items() if isinstance(v, Network)}
     return replace(algorithm, **seeing)  # type: ignore[type-var]
-
-
-def _places(sees: Any) -> None:
-    whole = isinstance(sees, tuple) and all(type(place) is int and place >= 0 for place in sees)
-    if not whole or not sees or len(set(sees)) < len(sees):
-        raise SkillweaveError(
-            f"Network.sees is {short(sees)}; it must be a tuple of places in an observation, from "
-            "0 on, each once: sees=(0, 1, 4)"
-        )
-
-
-def _widths(config: object, field: str) -> None:
-    value = getattr(config, field)
-    if not isinstance(value, tuple) or not all(_is_width(x) for x in value):
-        raise SkillweaveError(
-            f"{type(config).__name__}.{field} is {short(value)}; it must be a tuple whose entries "
-            f"must be at least 1 and at most {WIDEST:,}"
-        )
-
-
-def _is_width(value: object) -> bool:
-    return type(value) is int and 1 <= value <= WIDEST
-
-
-def _choice(config: object, field: str, known: tuple[Any, ...]) -> None:
-    value = getattr(config, field)
-    if not any(type(value) is type(k) and value == k for k in known):
-        raise SkillweaveError(
-            f"{type(config).__name__}.{field} is {short(value)}; "
-            f"it must be one of {', '.join(map(str, known))}"
-        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, NotRequired, TypedDict
 
-from skillweave.reading import Positive
+from skillweave.settings import AtLeastOne
 
 Candidate = Literal["before", "greedy", "skills_sample", "selector_samples", "both_sample"]
 """A hierarchy that a stage could end with."""
@@ -34,7 +34,7 @@ class Kept(TypedDict):
     skills_sample: NotRequired[float]
     selector_samples: NotRequired[float]
     both_sample: NotRequired[float]
-    episodes: Positive
+    episodes: AtLeastOne
     """Of each of them."""
     kept: Candidate
 

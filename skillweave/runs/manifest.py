@@ -15,9 +15,10 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.errors import SkillweaveError
-from skillweave.reading import Asked, Count, Positive, Seconds, fit, shown
+from skillweave.reading import fit, shown
 from skillweave.runs.files import read_json
 from skillweave.runs.kept import Kept
+from skillweave.settings import AtLeastOne, Check, Count, NonNegative, Positive
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 
@@ -30,7 +31,7 @@ def _is_path(text: str) -> bool:
 MOST_NAMES = 16
 """In a path."""
 NodePath = Annotated[
-    str, Asked("names of letters, digits, '_' and '-', with '/' between", _is_path)
+    str, Check("names of letters, digits, '_' and '-', with '/' between", _is_path)
 ]
 """A name after those of the hierarchies that it is in: ``inner/skill``."""
 
@@ -38,9 +39,9 @@ NodePath = Annotated[
 class NestedEntry(TypedDict):
     """A hierarchy: the run's, or a skill of it or of another one; its skills have entries, too."""
 
-    call_steps: Positive | None
-    call_lengths: NotRequired[list[Positive]]
-    interrupt: float | None
+    call_steps: AtLeastOne | None
+    call_lengths: NotRequired[list[AtLeastOne]]
+    interrupt: NonNegative | None
     """By how much a new decision must be worth more to interrupt a call."""
     learn: Literal["apart", "together", "apart, then together"]
     greedy_skills: bool | None
@@ -51,20 +52,20 @@ class NestedEntry(TypedDict):
     guide: NotRequired[Source]
     """Of the ready selector that a trained one keeps to."""
     guide_restrict: NotRequired[bool]
-    guide_kl: NotRequired[float | None]
+    guide_kl: NotRequired[Positive | None]
     reflexes: list[str]
-    start_calls: int | None
-    search_steps: int | None
-    episode_calls: Positive
-    call_cost: float
+    start_calls: AtLeastOne | None
+    search_steps: AtLeastOne | None
+    episode_calls: AtLeastOne
+    call_cost: NonNegative
 
 
 class SkillEntry(TypedDict):
     """A skill of the run, or of a hierarchy that is one."""
 
     name: NodePath
-    max_steps: Positive | None
-    call_steps: NotRequired[Positive]
+    max_steps: AtLeastOne | None
+    call_steps: NotRequired[AtLeastOne]
     ready: NotRequired[bool]
     policy: NotRequired[Source]
     hierarchy: NotRequired[NestedEntry]
@@ -133,14 +134,14 @@ class StageEntry(TypedDict):
 
     name: NodePath
     kind: Literal["agent", "skill", "selector", "together"]
-    learns: Annotated[list[NodePath], Asked("at least one name", bool)]
+    learns: Annotated[list[NodePath], Check("at least one name", bool)]
     """Whose weights the stage changes: "agent", "selector" or a skill's name."""
     decides: NodePath | None
     """Who chooses among the skills; None: one acts all the time."""
-    budget: Positive
+    budget: AtLeastOne
     algorithm: dict[str, Any]
     status: Literal["waiting", "training", "done"]
-    workers: NotRequired[Positive]
+    workers: NotRequired[AtLeastOne]
     evolution: NotRequired[dict[str, Any] | None]
     target: NotRequired[TargetEntry | None]
     reached: NotRequired[Reached]
@@ -150,7 +151,7 @@ class StageEntry(TypedDict):
     lineage_bytes: NotRequired[Count]
     steps: NotRequired[Count]
     evaluation_steps: NotRequired[Count]
-    seconds: NotRequired[Seconds]
+    seconds: NotRequired[NonNegative]
     steps_per_second: NotRequired[float]
     final: NotRequired[dict[str, float | None]]
     winner: NotRequired[Winner]
@@ -164,9 +165,9 @@ class StageEntry(TypedDict):
     """How skills and selector learn together."""
     algorithms: NotRequired[dict[NodePath, dict[str, Any]]]
     """Of the skills that learn together with the selector."""
-    task_weights: NotRequired[dict[NodePath, float]]
+    task_weights: NotRequired[dict[NodePath, NonNegative]]
     """Of skills whose ``task_weight`` is not that of ``together``."""
-    guide_kl: NotRequired[float]
+    guide_kl: NotRequired[Positive]
     """The KL within which the selector stays of its guide."""
     compared: NotRequired[bool]
     """What is learnt together is kept only if it is better than what was there before."""
@@ -184,17 +185,17 @@ class Manifest(TypedDict):
     """``run.json``."""
 
     kind: Literal["hierarchy", "agent"]
-    env: Annotated[str, Asked("at most 300 characters", lambda x: len(x) <= 300)]
+    env: Annotated[str, Check("a text of at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
     seed: Count
-    checkpoint_every: Positive
+    checkpoint_every: AtLeastOne
     needs_recipe: bool
     stages: list[StageEntry]
     created: str
     versions: dict[str, str]
     id: NotRequired[str]
-    eval_every: Positive | None
-    eval_episodes: Positive
+    eval_every: AtLeastOne | None
+    eval_episodes: AtLeastOne
     keep: NotRequired[Literal["last", "best"]]
     """What stages end with."""
     log_info: NotRequired[list[str]]
@@ -216,7 +217,7 @@ MetricsLine = TypedDict(
         "stage": NotRequired[NodePath],
         "update": NotRequired[Count],
         "steps": NotRequired[Count],
-        "seconds": NotRequired[Seconds],
+        "seconds": NotRequired[NonNegative],
         "return": NotRequired[float],
     },
 )
@@ -230,7 +231,7 @@ class Checkpoint(TypedDict):
     update: Count
     steps: Count
     evaluation_steps: Count
-    seconds: Seconds
+    seconds: NonNegative
     metrics: dict[str, float | None]
     metrics_bytes: Count
     lineage_bytes: NotRequired[Count]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any, TypedDict
 
-from skillweave.reading import Asked, Count
 from skillweave.runs.manifest import Checkpoint, NodePath
+from skillweave.settings import Check, Count
 
 
 class MemberEntry(TypedDict):
@@ -55,5 +55,5 @@ class Generation(Checkpoint):
     generation: Count
     rounds: Count
     next_number: Count
-    members: Annotated[list[MemberEntry], Asked("at least one member", bool)]
+    members: Annotated[list[MemberEntry], Check("at least one member", bool)]
     best: BestEntry

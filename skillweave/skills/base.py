@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -12,10 +11,11 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import Space
 
-from skillweave.arguments import checked_names, plain
+from skillweave.arguments import checked_names
 from skillweave.errors import SkillweaveError
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
+from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
 from skillweave.skills.answers import answer
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
@@ -64,13 +64,13 @@ class Skill:
     """
 
     name: str = ""
-    max_steps: int | None = None
-    call_steps: int | None = None
-    steps: int | None = None
-    task_weight: float | None = None
+    max_steps: AtLeastOne | None = None
+    call_steps: AtLeastOne | None = None
+    steps: AtLeastOne | None = None
+    task_weight: NonNegative | None = None
     algorithm: Any = None
     target_return: float | None = None
-    target_success: float | None = None
+    target_success: Share | None = None
     policy: Any = None
     color: tuple[int, int, int] | None = None
 
@@ -140,27 +140,13 @@ class Skill:
                 f"{where}: the name names files too, and {self.name!r} is a device on Windows; "
                 "choose another name"
             )
-        for field in ("max_steps", "call_steps", *(_OF_TRAINING if self.policy is None else ())):
+        kinds = annotations_of(Skill)
+        for field in ("max_steps", "call_steps", *_OF_TRAINING):
             value = getattr(self, field)
-            if isinstance(value, np.generic):
+            found = fitted(kinds[field], value, f"{where}: {field}")
+            if found is not value and (self.policy is None or field not in _OF_TRAINING):
                 with suppress(AttributeError):  # of a property
-                    setattr(self, field, plain(value))
-        for field in ("max_steps", "steps", "call_steps"):
-            value = getattr(self, field)
-            if value is not None and (type(value) is not int or value < 1):
-                raise SkillweaveError(
-                    f"{where}: {field} is {short(value)}; it must be at least 1, or None"
-                )
-        weight: Any = self.task_weight
-        if weight is not None and (
-            isinstance(weight, bool)
-            or not isinstance(weight, int | float)
-            or not 0.0 <= weight < math.inf
-        ):
-            raise SkillweaveError(
-                f"{where}: task_weight is {short(weight)}; it must be a number of at least 0, or "
-                "None"
-            )
+                    setattr(self, field, found)
         if self.color is not None and not _is_color(self.color):
             raise SkillweaveError(
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "

@@ -9,7 +9,8 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.errors import SkillweaveError
-from skillweave.reading import LARGEST, Asked, Positive, fit, shown
+from skillweave.reading import fit, shown
+from skillweave.settings import LARGEST, AtLeastOne, Check
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import OBSERVATIONS, obs_dtype, parts
 from skillweave.types import Array
@@ -30,8 +31,8 @@ def _is_shape(data: Any) -> bool:
     return all(type(n) is int and n >= 0 for n in sizes) and math.prod(sizes) <= _MOST
 
 
-_SIZES = Asked(f"sizes, of at most {_MOST:,} numbers in all", _is_shape)
-_Whole = Annotated[Any, Asked("whole numbers below 2^63", _is_whole)]
+_SIZES = Check(f"sizes, of at most {_MOST:,} numbers in all", _is_shape)
+_Whole = Annotated[Any, Check("whole numbers below 2^63", _is_whole)]
 
 
 class _Tuple(TypedDict):
@@ -50,7 +51,7 @@ class _Box(TypedDict):
 
 
 class _Discrete(TypedDict):
-    n: Positive
+    n: AtLeastOne
     start: int
     dtype: NotRequired[str]
 

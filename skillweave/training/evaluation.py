@@ -22,8 +22,8 @@ from skillweave.errors import DeclarationError, PolicyError, SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
-from skillweave.reading import Count, Positive
 from skillweave.seeding import Seeds, global_generators
+from skillweave.settings import AtLeastOne, Count
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.terminal import printable
@@ -50,7 +50,7 @@ class Evaluation:
     """
 
     returns: tuple[float, ...]  # of each episode, in the environment's own reward
-    lengths: tuple[Positive, ...]  # of each episode, in steps
+    lengths: tuple[AtLeastOne, ...]  # of each episode, in steps
     threshold: float | None  # the environment's reward_threshold
     skills: dict[str, SkillReport] = field(default_factory=dict)  # none: a plain agent
     cut: Count = 0  # episodes that nothing had ended when they were cut

@@ -12,11 +12,12 @@ from dataclasses import asdict, dataclass
 from typing import Any, NotRequired, TypedDict
 
 from skillweave.errors import RunError
-from skillweave.reading import Count, fit
+from skillweave.reading import fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.trackers import steps_of, trackers_of
+from skillweave.settings import Count
 from skillweave.training.evaluation import Evaluation
 
 SCORE, SAMPLED = "evaluation.json", "evaluation-sampled.json"

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import gymnasium as gym
-
 from skillweave.algorithms.base import read_by
-from skillweave.algorithms.config import AlgorithmConfig, check_spaces
+from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.arguments import checked_names
 from skillweave.envs.make import EnvSpec, Spaces, spec_of
 from skillweave.runs.directory import RunDirectory
+from skillweave.settings import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
-from skillweave.training.checks import check_algorithm, check_env, check_fields, check_rollout
-from skillweave.training.defaults import TrainDefaults, check_defaults
+from skillweave.training.checks import EnvValue, check_env, check_rollout
+from skillweave.training.defaults import TrainDefaults
 from skillweave.training.scene import skill_scene
 from skillweave.training.stage import Stage, target_of
 
@@ -33,15 +31,15 @@ class PlainAgent:
         DeclarationError: a setting is wrong; the message names it.
     """
 
-    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec
+    env: EnvValue
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
-    algorithm: AlgorithmConfig
+    algorithm: AlgorithmSettings
     """Its settings."""
-    steps: int
+    steps: AtLeastOne
     """Training budget in environment steps."""
     target_return: float | None = None
     """Training ends early at this mean return of the periodic evaluation; None: it does not."""
-    target_success: float | None = None
+    target_success: Share | None = None
     """Training ends early at this share of successful episodes (``info["success"]``)."""
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
     """Values for arguments of ``train`` that its caller leaves out."""
@@ -58,9 +56,7 @@ class PlainAgent:
             DeclarationError: something is wrong; the message names it.
         """
         check_env(self.env)
-        check_algorithm(self.algorithm, "algorithm")
         check_fields(self)
-        check_defaults(self.train_defaults)
         target_of(self.target_return, self.target_success, AGENT)
 
     @property

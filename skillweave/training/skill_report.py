@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.collecting.calls import SkillSet, skills_below
 from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.judge import Outcome, judge, seen_by
-from skillweave.reading import Count
+from skillweave.settings import Count
 from skillweave.skills import Skill, asked
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.play import Played

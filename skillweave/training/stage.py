@@ -12,19 +12,15 @@ from skillweave.algorithms.config import (
     config_to_json,
     own_encoders,
 )
-from skillweave.algorithms.config_checks import number, positive
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import own_schedules
-from skillweave.arguments import checked_names
 from skillweave.collecting import levels
 from skillweave.collecting.start_methods import cannot_be_sent, runs_again, why_no_processes
 from skillweave.envs.make import EnvSpec, cores, workers_for
 from skillweave.errors import DeclarationError, EnvError, SkillweaveError, reworded
-from skillweave.messages import short
 from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
-from skillweave.reading import LARGEST_FLOAT
-from skillweave.training.checks import check_fields
+from skillweave.settings import AtLeastOne, Fraction, NonNegative, Positive, checked_settings
 from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy
@@ -73,37 +69,24 @@ class Target:
 
 
 def target_of(
-    target_return: Any, target_success: Any, where: str, field: str = "target"
+    target_return: float | None, target_success: float | None, where: str
 ) -> Target | None:
-    """The target that two settings, of which one may be given, ask for.
+    """Return the target of two settings, of which one may be given.
 
     Args:
         where: whose they are, for messages.
-        field: what the settings' names begin with.
 
     Raises:
-        DeclarationError: both are given, or one is no number in its range.
+        DeclarationError: both are given.
     """
-    given = {"return": target_return, "success": target_success}
-    given = {k: v for k, v in given.items() if v is not None}
-    if len(given) > 1:
+    if target_return is not None and target_success is not None:
         raise DeclarationError(f"{where}: give target_return or target_success, not both")
-    for of, value in given.items():
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not abs(value) <= LARGEST_FLOAT:
-            raise DeclarationError(
-                f"{where}: {field}_{of} is {short(value)}; it must be a number, of float32's range"
-            )
-        if of == "success" and not 0.0 < value <= 1.0:
-            raise DeclarationError(
-                f"{where}: target_success is {short(value)}; it is a share of episodes, more than "
-                "0 and at most 1"
-            )
-        return Target("success" if of == "success" else "return", float(value))
-    return None
+    if target_return is not None:
+        return Target("return", float(target_return))
+    return None if target_success is None else Target("success", float(target_success))
 
 
-@checked_names
+@checked_settings
 @dataclass(frozen=True)
 class Together:
     """Settings of a selector and skills that learn from the same steps.
@@ -112,40 +95,31 @@ class Together:
         DeclarationError: a value is out of its range.
     """
 
-    steps: int | None = None
+    steps: AtLeastOne | None = None
     """Training steps of this stage; None: its share of ``Hierarchy.steps``."""
     interrupt: bool = False
     """The selector interrupts a call where a new decision is worth clearly more (``margin``); also
     where the selector learns apart."""
-    task_weight: float = 1.0
+    task_weight: NonNegative = 1.0
     """Weight of the task's advantage beside a skill's own, which has weight 1. It grows linearly
     from 0. A skill can set its own (``Skill.task_weight``; 0: its own reward alone). For skills
     that learn by PPO; skills with other algorithms follow their own reward alone."""
-    epsilon: float = 1.0
+    epsilon: Fraction = 1.0
     """Least share of calls chosen uniformly from the allowed ones, at the start. A selector with an
     ``epsilon`` of its own also uses its own ``epsilon_final`` and ``epsilon_fraction``."""
-    epsilon_final: float = 0.1
+    epsilon_final: Fraction = 0.1
     """The value that epsilon falls to, linearly."""
-    epsilon_fraction: float = 1.0
+    epsilon_fraction: Fraction = 1.0
     """Share of the budget over which epsilon falls."""
-    margin: float = 0.2
+    margin: NonNegative = 0.2
     """Interrupt a call where a new decision is worth this much more, in standard deviations of the
     return."""
-    reference_kl: float | None = 0.05
+    reference_kl: Positive | None = 0.05
     """Keep skills that PPO trained before within this KL of their earlier policy; None disables
     this. A skill whose calls succeeded in a share p of its own stage, at its end, may move 1/p
     times as far."""
-    quota: float = 0.25
+    quota: Fraction = 0.25
     """A skill learns when it has acted in this share of a rollout's rows, or more."""
-
-    def __post_init__(self) -> None:
-        for name in ("epsilon", "epsilon_final", "epsilon_fraction", "quota"):
-            number(self, name, high=1.0)
-        number(self, "task_weight")
-        check_fields(self)
-        number(self, "margin")
-        if self.reference_kl is not None:
-            positive(self, "reference_kl")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,6 @@ from skillweave.algorithms.config import (
     PPO,
     SAC,
     TD3,
-    OffPolicy,
     config_from_json,
     config_to_json,
 )
@@ -30,90 +29,26 @@ from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
 NAN, INF = float("nan"), float("inf")
-RANGES: list[tuple[type, str, object, str]] = [
-    *((OffPolicy, name, bad, "at least 1") for name in (
-        "num_envs", "train_freq", "batch_size", "n_step", "threads") for bad in (0, -3)),
-    *((OffPolicy, name, bad, "between 0 and 1") for name in (
-        "gamma", "tau", "priority_alpha", "priority_beta") for bad in (-0.1, 1.1, NAN)),
-    *((OffPolicy, name, bad, "positive and finite") for name in (
-        "learning_rate", "max_grad_norm", "adam_eps", "update_ratio") for bad in (0.0, INF, NAN)),
-    (OffPolicy, "device", "tpu", "one of cpu, cuda, auto"),
-    (PPO, "device", "tpu", "one of cpu, cuda, auto"),
-    *((kind, "compile", bad, "True, False or auto")
-      for kind in (OffPolicy, PPO) for bad in (1, "always")),
-    (OffPolicy, "buffer_size", 0, "at least 1"),
+TOGETHER: list[tuple[type, str, object, str]] = [
     *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN, SAC)),
     (TD3, "buffer_size", 31, r"at least 32 \(num_envs·\(n_step\+1\)\)"),
-    *((OffPolicy, "action_repeat", bad, "between 0 and 1") for bad in (-0.1, 1.1, NAN)),
-    (OffPolicy, "action_repeat_steps", 0, "at least 1"),
-    (OffPolicy, "learning_starts", -1, "at least 0 and finite"),
-    (OffPolicy, "learning_rate_schedule", "kl", "one of constant, linear"),
-    (OffPolicy, "network", None, r"a Network\(\)"),
-    (OffPolicy, "network", Network(rnn=RNN()), "without rnn: only PPO has memory"),
-    *((DQN, name, bad, "between 0 and 1") for name in (
-        "exploration_fraction", "exploration_initial_eps", "exploration_final_eps",
-    ) for bad in (-0.1, 1.1, NAN)),
-    (DQN, "target_update_interval", 0, "at least 1"),
-    (DQN, "n_atoms", 1, "at least 2"),
+    *((kind, "network", Network(rnn=RNN()), "without rnn: only PPO has memory")
+      for kind in (DQN, TD3, SAC)),
+    *((kind, "critic", Network(rnn=RNN()), "without rnn") for kind in (TD3, SAC, PPO)),
+    *((kind, "critic", Network(planes="last"), "without planes: Network.planes of network counts "
+       "for both") for kind in (TD3, SAC, PPO)),
     (DQN, "v_max", -10.0, r"more than v_min \(-10\.0\)"),
-    (DQN, "v_max", NAN, "a finite number"),
-    (DQN, "v_max", None, "a finite number"),  # as v_min is
-    (DQN, "loss", "mae", "one of huber, mse"),
-    *((TD3, name, bad, "at least 0 and finite") for name in (
-        "exploration_noise", "target_noise", "target_noise_clip", "action_l2",
-    ) for bad in (-0.1, INF, NAN)),
-    *((TD3, "actor_rate", bad, "positive and finite") for bad in (0.0, -1.0, INF, NAN)),
-    *((kind, "policy_delay", 0, "at least 1") for kind in (TD3, SAC)),
-    *((kind, "critic", (64,), r"a Network\(\) or None") for kind in (TD3, SAC, PPO)),
-    *((SAC, "ent_coef", bad, "positive and finite") for bad in (0.0, -1.0, INF, NAN)),
-    (PPO, "network", "mlp", r"a Network\(\)"),
-    (PPO, "ent_coef_final", -0.1, "at least 0 and finite"),
-    (PPO, "ent_coef_final", INF, "at least 0 and finite"),
-    (PPO, "action_std", "network", "one of parameter, state"),
+    (DQN, "v_max", None, r"a finite number where v_min is one \(-10\.0\)"),
+    (DQN, "v_min", None, r"a finite number where v_max is one \(0\.0\)"),
 ]  # fmt: skip
+"""Settings that do not fit others; tests/test_settings.py tries each one alone."""
 
 
-def fails(kind: type, name: str, value: object, asked: str) -> None:
+@pytest.mark.parametrize(("kind", "name", "value", "asked"), TOGETHER)
+def test_settings_that_do_not_fit_each_other_are_named(kind, name, value, asked):
+    beside = {"v_max": {"v_min": -10.0}, "v_min": {"v_max": 0.0}}.get(name, {})
     with pytest.raises(SkillweaveError, match=rf"{kind.__name__}\.{name} is .*must be {asked}$"):
-        kind(**{**({"v_min": -10.0} if name == "v_max" else {}), name: value})
-
-
-@pytest.mark.parametrize(("kind", "name", "value", "asked"), RANGES)
-def test_a_setting_out_of_range_is_named_with_what_it_must_be(kind, name, value, asked):
-    for each in (DQN, TD3, SAC) if kind is OffPolicy else (kind,):
-        fails(each, name, value, asked)
-
-
-@pytest.mark.parametrize("kind", [OffPolicy, DQN, TD3, SAC])
-def test_every_setting_that_has_a_range_is_tried(kind):
-    free = {"bool", "float | None"}  # on or off; and the entropy aimed at: see below
-    own = {f.name for f in fields(kind) if f.type not in free}
-    inherited = set() if kind is OffPolicy else {f.name for f in fields(OffPolicy)}
-    tried = {name for k, name, *_ in RANGES if k is kind}
-    assert own - inherited - tried - {"v_min"} == set()  # v_max is held against it
-
-
-@pytest.mark.parametrize(
-    ("kind", "settings"),
-    [
-        (DQN, {"v_max": INF, "v_min": 0.0}),
-        (DQN, {"v_min": -INF, "v_max": 0.0}),
-        (DQN, {"v_min": None, "v_max": 0.0}),
-        (SAC, {"target_entropy": NAN}),
-        (SAC, {"target_entropy": INF}),
-        (SAC, {"critic": Network(rnn=RNN())}),
-        (TD3, {"critic": Network(rnn=RNN())}),
-        (PPO, {"critic": Network(rnn=RNN())}),
-        (PPO, {"num_envs": "4"}),
-        (PPO, {"gamma": None}),
-        (DQN, {"batch_size": 2.5}),
-        (SAC, {"learning_rate": "fast"}),
-        (TD3, {"num_envs": True}),
-    ],
-)
-def test_a_setting_that_cannot_work_is_named(kind, settings):
-    with pytest.raises(SkillweaveError, match=rf"{kind.__name__}\.{next(iter(settings))} is "):
-        kind(**settings)
+        kind(**{**beside, name: value})
 
 
 @pytest.mark.parametrize(

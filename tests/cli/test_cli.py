@@ -541,7 +541,11 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "plain setting": (["train", "PLAIN", "--set", "call_step=9"], 1, ["call_steps"]),
     "skill's setting": (["train", "PLAIN", "--set", "skills.lef.steps=9"], 1, ["'lef'", "left"]),
     "no value": (["train", "PLAIN", "--set", "call_steps"], 1, ["name=value"]),
-    "value's type": (["train", "PLAIN", "--set", "call_steps=few"], 1, ["call_steps=few", "int"]),
+    "value's type": (
+        ["train", "PLAIN", "--set", "call_steps=few"],
+        1,
+        ["call_steps=few", "a whole number"],
+    ),
     "value's range": (["train", "PLAIN", "--set", "selector.gamma=2"], 1, ["gamma", "0 and 1"]),
     "call length": (["train", "PLAIN", "--set", "call_steps=0"], 1, ["call_steps", "at least 1"]),
     "scale": (["train", "PLAIN", "--scale", "0"], 1, ["scale", "positive"]),

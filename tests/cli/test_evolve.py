@@ -72,7 +72,7 @@ def test_settings_become_a_plan_for_each_stage():
     [
         ("population", "write name=value"),
         ("populatio=3", "no setting 'populatio'; did you mean population"),
-        ("left.generations=x", "left.generations=x: expected int"),
+        ("left.generations=x", "left.generations=x: expected a whole number"),
         ("selection=best", "expected one of tournament, truncation"),
         ("ranges.gamma=0.9", "write low,high"),
         ("ranges.gamma=0.9,high", "write low,high"),

@@ -240,7 +240,7 @@ def test_making_an_engine_is_silent(engine, name):
 
 
 def test_an_engine_in_processes_of_its_own_is_gone_and_the_message_says_what_there_is():
-    with pytest.raises(SkillweaveError, match="no engine 'async'; there are: auto, envpool, sync"):
+    with pytest.raises(SkillweaveError, match="must be one of auto, envpool, sync"):
         EnvSpec(Ledger, engine="async")
 
 

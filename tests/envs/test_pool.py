@@ -114,8 +114,6 @@ def test_a_pool_of_another_environment_is_told():
 
     with pytest.raises(SkillweaveError, match=r"OneClock: its pool's observation_space is Box.*3"):
         make_engine(sw.EnvSpec(OneClock, pool=Wide), 2)
-    with pytest.raises(SkillweaveError, match=r"OneClock: pool is 3; it must be a function"):
-        sw.EnvSpec(OneClock, pool=3)
 
 
 def test_what_envpool_shows_may_be_changed():

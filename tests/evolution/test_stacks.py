@@ -66,7 +66,14 @@ def learn(algorithm: Any, state: Any, action_space: Any, rows: list[int], update
             log_std = None if discrete else torch.zeros(len(rows), 1, 1, 2)
             head = each((3 if discrete else 2,), 6)
             rollout = Rollout(
-                obs, action, each((), 3), discount, next_obs, last, dist_params=head, log_std=log_std
+                obs,
+                action,
+                each((), 3),
+                discount,
+                next_obs,
+                last,
+                dist_params=head,
+                log_std=log_std,
             )
             algorithm.update(state, rollout, [(Seeds(u) / r).torch() for r in rows])
             continue

@@ -152,12 +152,6 @@ def test_a_weight_that_is_none_is_refused(weight):
         declare(Odd())
 
 
-@pytest.mark.parametrize("field", ["apart", "together", "selection", "guide", "train_defaults"])
-def test_a_group_that_is_something_else_is_refused(field):
-    with pytest.raises(SkillweaveError, match=f"{field} is .*; write {field}="):
-        declare(**{field: {"steps": 3}})
-
-
 def test_lengths_learn_together_too():
     (stage,) = stages_of(declare(call_steps=Lengths(4, 8), selector=PPO()))
     assert stage.kind == "together"

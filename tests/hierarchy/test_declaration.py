@@ -65,13 +65,6 @@ def named(name: str, **attributes) -> Skill:
 # What is wrong -------------------------------------------------------------------------------
 
 
-def test_a_target_is_told_by_the_name_of_its_setting() -> None:
-    with pytest.raises(
-        SkillweaveError, match="selector: target_return is 'x'; it must be a number"
-    ):
-        declare(target_return="x")
-
-
 WRONG = {
     "no skills": (lambda: Hierarchy("CartPole-v1", [], learn="apart"), "at least one skill"),
     "no name": (lambda: declare(named("")), "Custom.*no name"),
@@ -85,15 +78,10 @@ WRONG = {
     "max_steps=1.5": (lambda: declare(named("x", max_steps=1.5)), "'x'.*max_steps is 1.5"),
     "steps=0": (lambda: declare(named("x", steps=0)), "'x'.*steps is 0"),
     "steps='many'": (lambda: declare(named("x", steps="many")), "'x'.*steps is 'many'"),
-    "call_steps=0": (lambda: declare(call_steps=0), "call_steps is 0"),
-    "call_steps=2.5": (lambda: declare(call_steps=2.5), "call_steps is 2.5"),
     "skills that never stop": (
         lambda: declare(Center(), named("endless"), call_steps=None),
         "call_steps is None.*'endless'.*max_steps or termination",
     ),
-    "apart.skill_steps=0": (lambda: declare(skill_steps=0), "skill_steps is 0"),
-    "apart.selector_steps=-1": (lambda: declare(selector_steps=-1), "selector_steps is -1"),
-    "checkpoint_every=0": (lambda: declare(checkpoint_every=0), "checkpoint_every is 0"),
 }
 
 
@@ -110,12 +98,8 @@ NOT_CHECKED = {
         "skills",
     ),
     "a reflex that is only a function": (lambda: declare(reflexes=[zeros]), "not a Reflex"),
-    "apart.skill_steps='many'": (lambda: declare(skill_steps="many"), "skill_steps is 'many'"),
-    "settings as a class": (lambda: declare(algorithm=PPO), "algorithm"),
-    "a selector's settings as a class": (lambda: declare(selector=PPO), "selector"),
     "a skill's settings as a class": (lambda: declare(named("x", algorithm=PPO)), "'x'.*algorithm"),
     "a policy's class": (lambda: declare(named("x", policy=ScriptedPolicy)), "'x'.*policy"),
-    "an environment already made": (lambda: declare(env=gym.make("CartPole-v1")), "env"),
 }
 
 
@@ -307,19 +291,19 @@ WRONG_SETTINGS = {
     "selector.update_epoch=4": "no setting 'selector.update_epoch'.*update_epochs",
     "=4": "no setting ''",
     "selector.gamma.x=4": "gamma has no parts",
-    "call_steps=soon": "call_steps=soon: expected int",
-    "call_steps=2.5": "call_steps=2.5: expected int",
-    "call_steps=true": "call_steps=true: expected int",
-    "call_steps=": "call_steps=: expected int",
-    "selection.greedy_skills=1": "selection.greedy_skills=1: expected bool",
-    "together.interrupt=none": "together.interrupt=none: expected bool",
-    "apart.skill_steps=soon": "apart.skill_steps=soon: expected int",
-    "apart.skill_steps=1e999": "apart.skill_steps=1e999: expected int",
-    "selector.gamma=high": "selector.gamma=high: expected float",
-    "selector.gamma=true": "selector.gamma=true: expected float",
-    "selector.gamma=nan": "selector.gamma=nan: expected float",
+    "call_steps=soon": "call_steps=soon: expected a whole number",
+    "call_steps=2.5": "call_steps=2.5: expected a whole number",
+    "call_steps=true": "call_steps=true: expected a whole number",
+    "call_steps=": "call_steps=: expected a whole number",
+    "selection.greedy_skills=1": "selection.greedy_skills=1: expected True, False or None",
+    "together.interrupt=none": "together.interrupt=none: expected True or False",
+    "apart.skill_steps=soon": "apart.skill_steps=soon: expected a whole number",
+    "apart.skill_steps=1e999": "apart.skill_steps=1e999: expected a whole number",
+    "selector.gamma=high": "selector.gamma=high: expected a number, between 0 and 1",
+    "selector.gamma=true": "selector.gamma=true: expected a number, between 0 and 1",
+    "selector.gamma=nan": "selector.gamma=nan: expected a number, between 0 and 1",
     "selector.network.activation=sine": "activation=sine: expected.*tanh",
-    "selector.network.hidden=wide": "hidden=wide: expected tuple",
+    "selector.network.hidden=wide": "hidden=wide: expected a list, each entry a whole number",
     "call_steps=0": "call_steps is 0",
     "apart.skill_steps=0": "skill_steps is 0",
     "skills.lean.steps=-4": "'lean'.*steps is -4",

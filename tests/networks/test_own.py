@@ -459,5 +459,5 @@ def test_lists_and_dicts_are_taken_for_what_they_say():
     )
     with pytest.raises(SkillweaveError, match=r"PPO\.network: .*'hiden'.*'hidden' meant"):
         PPO(network={"hiden": [8]})
-    with pytest.raises(SkillweaveError, match=r"DQN\.network: Network\.hidden is \(0,\)"):
+    with pytest.raises(SkillweaveError, match=r"DQN\.network: Network\.hidden\[0\] is 0"):
         DQN(network={"hidden": [0]})

@@ -284,9 +284,6 @@ def test_a_population_of_restricted_selectors_evolves(tmp_path):
 
 
 WRONG: dict[str, dict[str, Any]] = {
-    "Guide: selector is 3; it must be a function": {"guide": 3},
-    "Guide: target_kl is -1": {"guide": AUTOMATON, "guide_kl": -1},
-    "Guide: target_kl is 'x'; it must be a number": {"guide": AUTOMATON, "guide_kl": "x"},
     "the guide has no effect": {"guide": AUTOMATON, "guide_restrict": False},
     "only PPO can be kept near": {"guide": AUTOMATON, "guide_kl": 0.1, "selector": OFF},
     "has nothing to choose": {"guide": by_rule},

@@ -175,8 +175,8 @@ def test_a_ready_selector_takes_no_steps():
 
 
 WRONG = {
-    "a class": (lambda: declare(Automaton), "selector is <class.*Automaton or tree"),
-    "text": (lambda: declare("get_key"), "selector is 'get_key'.*no function, Automaton or tree"),
+    "a class": (lambda: declare(Automaton), "selector is <class.*an Automaton or a tree"),
+    "text": (lambda: declare("get_key"), "selector is 'get_key'.*an Automaton or a tree"),
     "a target": (lambda: declare(by_rule, target_return=1.0), "selector is ready"),
     "an unknown skill": (lambda: declare(tree.Sequence("walk")), "leaf names 'walk'"),
     "a wrong choice": (

@@ -433,11 +433,11 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
         (lambda m: m.update(kind="x" * 10_000), "kind is 'xxx"),
         (
             lambda m: m["stages"][0]["algorithm"].update(gamma="a"),
-            "stages[0].algorithm.gamma is 'a'; it must be a finite number",
+            "stages[0].algorithm.gamma is 'a'; it must be a number, between 0 and 1",
         ),
         (
             lambda m: m["stages"][0]["algorithm"].update(gamma=2.0),
-            "stages[0].algorithm: PPO.gamma is 2.0; it must be between 0 and 1",
+            "stages[0].algorithm.gamma is 2.0; it must be between 0 and 1",
         ),
         (
             lambda m: m["stages"][0]["algorithm"]["network"].update(hidden=[[]]),

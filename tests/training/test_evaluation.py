@@ -130,7 +130,7 @@ def test_where_there_is_no_pool_the_engine_makes_no_difference():
         found.append(evaluate(policy, wrapped, **how, engine=engine))
         assert len(made) < 8, "there are three, and those that are asked for spaces"
     assert found[0] == found[1]
-    with pytest.raises(SkillweaveError, match="no engine 'fast'"):
+    with pytest.raises(SkillweaveError, match="engine is 'fast'; it must be one of"):
         evaluate(policy, wrapped, engine="fast")
 
 

@@ -283,10 +283,8 @@ def test_keep_without_evaluations_is_refused_before_training(flat: bool, tmp_pat
 
 @pytest.mark.parametrize("keep", ["bst", True, 3])
 def test_a_wrong_keep_is_refused(keep: Any, tmp_path: Path) -> None:
-    with pytest.raises(SkillweaveError, match=r"keep is .*; it must be 'last' or 'best'"):
+    with pytest.raises(SkillweaveError, match=r"^keep is .*; it must be one of last, best"):
         agent().train(tmp_path / "run", keep=keep)
-    with pytest.raises(SkillweaveError, match="it must be 'last' or 'best'"):
-        TrainDefaults(keep=keep)
 
 
 def test_a_recipe_may_say_what_is_kept(tmp_path: Path) -> None:

@@ -222,11 +222,8 @@ def test_a_key_that_is_no_number_stops_the_training(
 @pytest.mark.parametrize(
     ("keys", "says"),
     [
-        ("fuel", r"log_info is 'fuel'; it must be a list of keys: log_info=\['fuel'\]"),
-        (3, r"log_info is 3; it must be a list of keys: log_info=\['key'\]"),
-        ({"fuel": 1}, "log_info is {'fuel': 1}; it must be a list of keys"),
-        (["fuel", 3], "log_info has 3; each must be a key of info, such as 'distance'"),
-        ([""], "log_info has ''; each must be a key"),
+        ("fuel", r"log_info is 'fuel'; it must be a list of keys of info, such as \['"),
+        (["fuel", 3], r"^log_info\[1\] is 3; it must be a key of info, such as 'distance'"),
     ],
 )
 def test_wrong_lists_of_keys_are_refused(keys: Any, says: str, tmp_path: Path) -> None:
