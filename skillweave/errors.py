@@ -5,6 +5,8 @@ Each message is one sentence for people: what is wrong, where, and what to do ab
 
 from __future__ import annotations
 
+from typing import Any
+
 from skillweave.terminal import printable
 from skillweave.tracebacks import ShortTraceback
 
@@ -45,6 +47,10 @@ class MissingExtra(SkillweaveError, ImportError):
 
     def __init__(self, feature: str, extra: str) -> None:
         super().__init__(f"{feature} needs the extra '{extra}': pip install 'skillweave[{extra}]'")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let the error be pickled, although it is made of other arguments than its message."""
+        return make_error, ("MissingExtra", str(self))
 
 
 class Interrupted(ShortTraceback, KeyboardInterrupt):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_settings(declared: Declaration, env: gym.Env[Any, Any], path: str = "") -> None:
-    """Raise a SkillweaveError where algorithms or reflexes do not fit an environment.
+    """Raise a DeclarationError where algorithms or reflexes do not fit an environment.
 
     Args:
         path: of the hierarchy, ``inner/`` for example.
