@@ -31,7 +31,7 @@ class SkillError(SkillweaveError):
 
 
 class PolicyError(SkillweaveError):
-    """A policy from elsewhere cannot be loaded, or does not fit where it is used."""
+    """A policy cannot be loaded or exported, does not fit where it is used, or failed there."""
 
 
 class TrainingError(SkillweaveError):
@@ -39,7 +39,7 @@ class TrainingError(SkillweaveError):
 
 
 class RunError(SkillweaveError):
-    """A run or another file is missing, damaged, in use, or cannot be written."""
+    """A run or another file is missing, damaged, in use, of other settings, or not writable."""
 
 
 class MissingExtra(SkillweaveError, ImportError):
