@@ -16,7 +16,7 @@ from skillweave.cli.targets import load_run, target
 from skillweave.cli.telling import save_score, tell
 from skillweave.cli.training import resume, train
 from skillweave.compat.agilerl_files import convert
-from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -229,7 +229,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
 def _run_line(path: Path) -> dict[str, Any]:
     try:
         found = RunDirectory.open(path)
-    except SkillweaveError as error:
+    except RunError as error:
         return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
     status = "finished" if found.finished else "unfinished"
     return {"path": str(path), "status": status} | {

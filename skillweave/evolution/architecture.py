@@ -18,7 +18,7 @@ from torch import Tensor
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
@@ -103,7 +103,7 @@ def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> lis
                     [ImageEncoder(obs, i, c, "relu").sizes for c in (cnn, other)]
                     for i in range(len(obs.images))
                 ]
-            except SkillweaveError:
+            except DeclarationError:
                 continue  # larger than what is left of the image
             if all(old == new for old, new in sizes):
                 found.append(change)

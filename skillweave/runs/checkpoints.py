@@ -73,7 +73,7 @@ class Checkpoints:
         """The header of the one that a resumed run goes on from; empty where there is none."""
         fresh, latest, before = self._files
         for path in (latest, fresh, before):  # as ``clear`` and ``load`` take them
-            with suppress(SkillweaveError):
+            with suppress(RunError):
                 return read_header(path)
         return {}
 
@@ -111,7 +111,7 @@ class Checkpoints:
             move(fresh, latest)
         remove(fresh)
         for path in self._files:
-            with suppress(SkillweaveError):  # a damaged one is told when it is needed
+            with suppress(RunError):  # a damaged one is told when it is needed
                 if path.exists() and read_header(path).get("stage") in done:
                     read_tensors(path)  # not on the word of a damaged header
                     remove(path)
