@@ -33,7 +33,7 @@ class DecisionCollector(Collector):
 
     Args:
         engine: the environments.
-        acting: the selectors that learn.
+        acting: the selectors that learn; None: the guide decides, or only ``like`` is to act.
         skills: what their actions mean.
         keep_rewards: of each call, keep the reward of every step, so that others may learn from it
             with a γ of their own.
@@ -61,8 +61,8 @@ class DecisionCollector(Collector):
         """The player's, (N, …) each; changed in place."""
         self.kept |= prefixed("player", self.memory)
         self.ranges |= prefixed("player", ranges_of(self.player))
-        self._open: OpenCalls | None = None
-        if self.selector is not None:
+        self._open: OpenCalls | None = None  # None: a guide decides, and no selector learns
+        if guide is None or not guide.decides or acting is not None:
             self._open = OpenCalls(self, self.player, self.selector, self.memory, keep_rewards)
 
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:

@@ -22,7 +22,7 @@ class OpenCalls:
     Args:
         collector: of these environments.
         player: whose selector it is.
-        selector: the learner that chooses.
+        selector: the learner that chooses; None where only ``like`` of the collector is to act.
         memory: the player's.
         keep_rewards: of each call, keep the reward of every step.
         prefix: of all names, where a collector has several selectors.
@@ -32,14 +32,14 @@ class OpenCalls:
         self,
         collector: Collector,
         player: Player,
-        selector: LearnerActor,
+        selector: LearnerActor | None,
         memory: Memory,
         keep_rewards: bool = False,
         prefix: str = "",
     ) -> None:
         n = collector.num_envs
         self.player, self.selector, self.keep_rewards = player, selector, keep_rewards
-        self.memory_size = selector.acting.memory_size
+        self.memory_size = 0 if selector is None else selector.acting.memory_size
         self._memory = memory
         self._collector, self._prefix, self._all = collector, prefix, np.arange(n)
         self.kept: dict[str, Array] = {
@@ -57,6 +57,7 @@ class OpenCalls:
 
     def begin(self) -> Array:
         """Keep the decisions that the selector has just made; return their environments (k,)."""
+        assert self.selector is not None
         latest, kept = self.selector.latest, self.kept
         if latest is None:
             return self._all[:0]

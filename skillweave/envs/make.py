@@ -6,8 +6,9 @@ import functools
 import os
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +24,7 @@ from skillweave.envs.pool import MakePool, envpool
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, short, shortened, told
 from skillweave.reading import as_json
+from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Check, check_fields
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 
@@ -61,6 +63,13 @@ Names = Annotated[
     ),
 ]
 """Names of the numbers of an observation."""
+
+
+class Spaces(NamedTuple):
+    """What an environment shows, and what it takes."""
+
+    observation: gym.Space[Any]
+    action: gym.Space[Any]
 
 
 @checked_names
@@ -112,6 +121,27 @@ class EnvSpec:
             raise refuse_batched(short(self.env))
         check_fields(self)
         checked_obs_names(self.obs_names, self.name)
+
+    @property
+    def spaces(self) -> Spaces:
+        """The environment's spaces; one is made to read them, the first time."""
+        known: Spaces | None = vars(self).get("_spaces")
+        return self.read_spaces() if known is None else known
+
+    @global_generators(Seeds(0) / "spaces")
+    def read_spaces(self) -> Spaces:
+        """Make an environment, and return its spaces.
+
+        Raises:
+            EnvError: it cannot be made.
+        """
+        with closing(self.make()) as env:
+            found = Spaces(env.observation_space, env.action_space)
+        object.__setattr__(self, "_spaces", found)
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if k != "_spaces"}
 
     def make(self, render_mode: str | None = None, number: int | None = None) -> CheckedEnv:
         """One environment of Gymnasium's, whose errors say its name and its ``number``.
@@ -232,6 +262,16 @@ class EnvSpec:
         """Whether an id and plain settings say it all, without any code of the user's."""
         plain = not self.wrappers and self.pool is None
         return isinstance(self.env, str) and ":" not in self.env and plain
+
+
+def spec_of(declared: Any) -> EnvSpec:
+    """Return the environment of a declaration, fully specified; the same one as long as it is."""
+    if isinstance(declared.env, EnvSpec):
+        return declared.env
+    known: EnvSpec | None = vars(declared).get("_spec")
+    if known is None or known.env is not declared.env:
+        known = vars(declared)["_spec"] = EnvSpec(declared.env)
+    return known
 
 
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0) -> Engine:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -13,7 +12,7 @@ from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
 from skillweave.arguments import checked_names
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
-from skillweave.envs.make import EnvSpec
+from skillweave.envs.make import EnvSpec, Spaces, spec_of
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.budgets import budgets_of, scale_budgets
 from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
@@ -30,7 +29,6 @@ from skillweave.hierarchy.nesting import (
 from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
-from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
 from skillweave.settings import AtLeastOne, Check, check_fields, fitted
@@ -127,7 +125,7 @@ class Declaration(Nestable):
     @property
     def spec(self) -> EnvSpec:
         """The environment, fully specified."""
-        return self.env if isinstance(self.env, EnvSpec) else EnvSpec(self.env)
+        return spec_of(self)
 
     @property
     def is_data(self) -> bool:
@@ -237,41 +235,34 @@ class Declaration(Nestable):
             greedy_selector=self.selection.greedy_selector is not False,
         )
 
-    def check_spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
-        """Make the environment once; its observation space and action space.
+    def check_spaces(self) -> Spaces:
+        """Make the environment once, and return its spaces.
 
         Raises:
             DeclarationError: something does not fit it.
         """
-        env = self.spec.make()
-        try:
-            obs_codec(env.observation_space)
-            action_codec(env.action_space)
-            check_settings(self, env)
-            fitted_policies(self, env)
-            fitted_selectors(self, env.observation_space)
-            return env.observation_space, env.action_space
-        finally:
-            env.close()
+        spaces = self.spec.read_spaces()
+        obs_codec(spaces.observation)
+        action_codec(spaces.action)
+        check_settings(self, spaces)
+        fitted_policies(self, spaces)
+        fitted_selectors(self, spaces.observation)
+        return spaces
 
     @property
     def ready_selector(self) -> ReadySelector | None:
         """The selector that is not trained; None: it is."""
         return ready_selector(self.selector, tuple(s.name for s in self.skills))
 
-    @global_generators(Seeds(0) / "spaces")
     def ready_selectors(self) -> dict[str, Policy]:
         """By path, the selectors that are not trained, on the environment's observations."""
         hierarchies = (self, *(inner_of(s) for _, s in every_skill(self.skills)))
         if all(h is None or h.ready_selector is None for h in hierarchies):
             return {}
-        with closing(self.spec.make()) as env:
-            return fitted_selectors(self, env.observation_space)
+        return fitted_selectors(self, self.spec.spaces.observation)
 
-    @global_generators(Seeds(0) / "spaces")
     def ready_policies(self) -> dict[str, Policy]:
         """By path, the policies of skills that are not trained, on the environment's spaces."""
         if all(s.policy is None for s in self.skills):
             return {}
-        with closing(self.spec.make()) as env:
-            return fitted_policies(self, env)
+        return fitted_policies(self, self.spec.spaces)

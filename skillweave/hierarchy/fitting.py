@@ -8,6 +8,7 @@ import gymnasium as gym
 
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
+from skillweave.envs.make import Spaces
 from skillweave.hierarchy.guidance import fitted_guide
 from skillweave.hierarchy.nesting import every_skill, inner_hierarchies, inner_of
 from skillweave.skills import path_of, ready_policy
@@ -20,40 +21,39 @@ if TYPE_CHECKING:
     from skillweave.hierarchy.declaration import Declaration
 
 
-def check_settings(declared: Declaration, env: gym.Env[Any, Any], path: str = "") -> None:
+def check_settings(declared: Declaration, spaces: Spaces, path: str = "") -> None:
     """Raise a DeclarationError where algorithms or reflexes do not fit an environment.
 
     Args:
         path: of the hierarchy, ``inner/`` for example.
     """
-    space = env.action_space
+    space = spaces.action
     for skill in declared.skills:
         if skill.policy is None:
             config = skill.algorithm or declared.algorithm
             where = f"skill {path_of(skill)!r}: "
             check_spaces(config, space, where)
-            read_by(config, env.observation_space, where)
+            read_by(config, spaces.observation, where)
     if isinstance(declared.selector, AlgorithmConfig):
         choices = gym.spaces.Discrete(declared.choices)
         check_spaces(declared.selector, choices, f"{path}{SELECTOR}: ")
-        read_by(declared.selector, env.observation_space, f"{path}{SELECTOR}: ")
+        read_by(declared.selector, spaces.observation, f"{path}{SELECTOR}: ")
     if declared.train_defaults.flat is not None:
         check_spaces(declared.train_defaults.flat, space, "flat: ")
-        read_by(declared.train_defaults.flat, env.observation_space, "flat: ")
+        read_by(declared.train_defaults.flat, spaces.observation, "flat: ")
     own = (s.algorithm for s in declared.skills)
     for config in (declared.algorithm, declared.selector, declared.train_defaults.flat, *own):
         if isinstance(config, AlgorithmConfig):
-            check_rollout(config, env.observation_space)
+            check_rollout(config, spaces.observation)
     for reflex in declared.reflexes:
         reflex.check(space)
-    fitted_guide(declared, env.observation_space, path)
+    fitted_guide(declared, spaces.observation, path)
     for skill, inner in inner_hierarchies(declared.skills):
-        check_settings(inner, env, f"{path}{skill.name}/")
+        check_settings(inner, spaces, f"{path}{skill.name}/")
 
 
-def fitted_policies(declared: Declaration, env: gym.Env[Any, Any]) -> dict[str, Policy]:
+def fitted_policies(declared: Declaration, spaces: Spaces) -> dict[str, Policy]:
     """By path, the policies of skills that are not trained, on the environment's spaces."""
-    spaces = env.observation_space, env.action_space
     return {
         path: fitted(policy, *spaces, f"skill {path!r}", declared.spec.name)
         for path, skill in every_skill(declared.skills)

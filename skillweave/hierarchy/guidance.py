@@ -106,11 +106,7 @@ def own_guide(declared: Declaration) -> ActiveGuide | None:
     """The guide of a selector that learns; None: there is none."""
     if declared.guide is None:
         return None
-    env = declared.spec.make()
-    try:
-        return fitted_guide(declared, env.observation_space)
-    finally:
-        env.close()
+    return fitted_guide(declared, declared.spec.spaces.observation)
 
 
 def who_guides(declared: Declaration) -> ActiveGuide | None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import gymnasium as gym
-
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.arguments import checked_names
-from skillweave.envs.make import EnvSpec
+from skillweave.envs.make import EnvSpec, Spaces, spec_of
 from skillweave.runs.directory import RunDirectory
 from skillweave.settings import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
@@ -64,23 +62,20 @@ class PlainAgent:
     @property
     def spec(self) -> EnvSpec:
         """The environment, fully specified."""
-        return self.env if isinstance(self.env, EnvSpec) else EnvSpec(self.env)
+        return spec_of(self)
 
-    def check_spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
-        """Make the environment once; its observation space and action space.
+    def check_spaces(self) -> Spaces:
+        """Make the environment once, and return its spaces.
 
         Raises:
             DeclarationError: the algorithm does not fit it.
         """
-        env = self.spec.make()
-        try:
-            action_codec(env.action_space)
-            check_spaces(self.algorithm, env.action_space, f"{AGENT}: ")
-            read_by(self.algorithm, env.observation_space)
-            check_rollout(self.algorithm, env.observation_space)
-            return env.observation_space, env.action_space
-        finally:
-            env.close()
+        spaces = self.spec.read_spaces()
+        action_codec(spaces.action)
+        check_spaces(self.algorithm, spaces.action, f"{AGENT}: ")
+        read_by(self.algorithm, spaces.observation)
+        check_rollout(self.algorithm, spaces.observation)
+        return spaces
 
     def stages(self) -> list[Stage]:
         """Return its only stage."""

@@ -89,7 +89,7 @@ def skill_scene(
         engine = make_engine(spec, num_envs, first=first)
         return SkillCollector(engine, acting, skill, tuple(reflexes), starters, *search)
 
-    return Scene(spec.name, *_spaces(spec), collector)
+    return Scene(spec.name, *spec.spaces, collector)
 
 
 def selector_scene(
@@ -108,7 +108,7 @@ def selector_scene(
         engine = make_engine(spec, num_envs, first=first)
         return DecisionCollector(engine, acting, skills, shared, guide, as_skill)
 
-    observation_space, _ = _spaces(spec)
+    observation_space = spec.spaces.observation
     choices = gym.spaces.Discrete(skills.choices)
     return Scene(spec.name, observation_space, choices, collector, skills.usual_steps or CALL)
 
@@ -192,11 +192,3 @@ def woven_scene(
         skills.usual_steps or CALL, skills=skills, skill_space=plain.action_space, spec=spec,
         guide=guide, as_skill=as_skill, margins=margins or {}, guide_kl=guide_kl or {},
     )  # fmt: skip
-
-
-def _spaces(spec: EnvSpec) -> tuple[gym.Space[Any], gym.Space[Any]]:
-    env = spec.make()
-    try:
-        return env.observation_space, env.action_space
-    finally:
-        env.close()

@@ -98,7 +98,7 @@ def test_learn_takes_the_log_probabilities_as_they_are_given(kind):
     rollout = rollout_of(
         native.learner, native.member.state, states, actions, given, rewards, ends, after
     )
-    found, _ = native.learner.head.stats(rollout.head, rollout.log_std, None, rollout.action)
+    found, _ = native.learner.head.stats(rollout.dist_params, rollout.log_std, None, rollout.action)
     np.testing.assert_allclose(found.flatten(), np.concatenate(given), atol=1e-4)
 
 
