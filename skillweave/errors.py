@@ -5,6 +5,8 @@ Each message is one sentence for people: what is wrong, where, and what to do ab
 
 from __future__ import annotations
 
+from typing import Any
+
 from skillweave.terminal import printable
 from skillweave.tracebacks import ShortTraceback
 
@@ -29,7 +31,7 @@ class SkillError(SkillweaveError):
 
 
 class PolicyError(SkillweaveError):
-    """A policy from elsewhere cannot be loaded, or does not fit where it is used."""
+    """A policy cannot be loaded or exported, does not fit where it is used, or failed there."""
 
 
 class TrainingError(SkillweaveError):
@@ -37,7 +39,7 @@ class TrainingError(SkillweaveError):
 
 
 class RunError(SkillweaveError):
-    """A run or another file is missing, damaged, in use, or cannot be written."""
+    """A run or another file is missing, damaged, in use, of other settings, or not writable."""
 
 
 class MissingExtra(SkillweaveError, ImportError):
@@ -45,6 +47,10 @@ class MissingExtra(SkillweaveError, ImportError):
 
     def __init__(self, feature: str, extra: str) -> None:
         super().__init__(f"{feature} needs the extra '{extra}': pip install 'skillweave[{extra}]'")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let the error be pickled, although it is made of other arguments than its message."""
+        return make_error, ("MissingExtra", str(self))
 
 
 class Interrupted(ShortTraceback, KeyboardInterrupt):

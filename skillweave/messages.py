@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.tracebacks import place
 from skillweave.types import Array
 
@@ -58,15 +58,15 @@ def whole_number(value: object, name: str, least: int) -> int:
     """``value`` as an int.
 
     Raises:
-        SkillweaveError: it is no whole number, less than ``least``, or more than ``MOST``; the
+        DeclarationError: it is no whole number, less than ``least``, or more than ``MOST``; the
             message begins with ``name``.
     """
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise SkillweaveError(f"{name} is {short(value)}; it must be a whole number")
+        raise DeclarationError(f"{name} is {short(value)}; it must be a whole number")
     if value < least:
-        raise SkillweaveError(f"{name} is {short(value)}; it must be at least {least}")
+        raise DeclarationError(f"{name} is {short(value)}; it must be at least {least}")
     if value > MOST:
-        raise SkillweaveError(f"{name} is {short(value)}; it must be at most {MOST:,}")
+        raise DeclarationError(f"{name} is {short(value)}; it must be at most {MOST:,}")
     return int(value)
 
 
@@ -74,12 +74,12 @@ def absolute(path: str | Path) -> Path:
     """Return the path from the root on, which leads to the same place from everywhere.
 
     Raises:
-        SkillweaveError: the working directory, from which it leads, was deleted.
+        RunError: the working directory, from which it leads, was deleted.
     """
     try:
         return Path(path).absolute()
     except OSError as error:
-        raise SkillweaveError(
+        raise RunError(
             f"{path} leads from the working directory, and that is not there any more: change to "
             "another directory, or give the path from the root on"
         ) from error
@@ -95,5 +95,5 @@ def shown_path(path: Path) -> Path:
 def as_path(path: str | Path, name: str) -> Path:
     """``path`` as one; an error names the argument where it is none."""
     if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
-        raise SkillweaveError(f"{name} is {short(path)}; it must be a path")
+        raise DeclarationError(f"{name} is {short(path)}; it must be a path")
     return Path(path)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 
 _PLAIN = (bool, int, float, str, type(None))
@@ -47,7 +47,7 @@ def named(value: Any, where: str) -> Any:
         where: the setting, for messages: ``Network.encoder``.
 
     Raises:
-        SkillweaveError: the function has no name by which it can be found again.
+        DeclarationError: the function has no name by which it can be found again.
     """
     if isinstance(value, Named):
         return value
@@ -89,7 +89,7 @@ def _name_of(function: Any, where: str) -> str:
     inner = function
     if isinstance(function, functools.partial):
         if function.args:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where} is a partial with positional arguments; name them: "
                 "functools.partial(function, width=64)"
             )
@@ -98,7 +98,7 @@ def _name_of(function: Any, where: str) -> str:
     bound = getattr(inner, "__self__", None)
     of_object = bound is not None and not inspect.isclass(bound) and not inspect.ismodule(bound)
     if not callable(inner) or of_object or not isinstance(name, str) or not isinstance(module, str):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where} is {short(function)}; it must be a function or a class, so that a run can "
             "record its name: wrap it in a function (def)"
         )
@@ -108,7 +108,7 @@ def _name_of(function: Any, where: str) -> str:
             name += f"#{_digest(inner)}"
     if any(not isinstance(value, _PLAIN) for value in values.values()):
         odd = next(k for k, v in values.items() if not isinstance(v, _PLAIN))
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where}: {name} takes {odd} from outside, which is {short(values[odd])}; a run can "
             "record numbers and texts only: make it in the function, or at the top of the module"
         )

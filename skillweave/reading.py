@@ -18,7 +18,7 @@ from typing import Any, NotRequired, get_args, get_origin, is_typeddict
 
 import numpy as np
 
-from skillweave.errors import RunError, SkillweaveError
+from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.messages import short
 from skillweave.settings import Fitting, Unfit, annotations_of
 
@@ -40,21 +40,21 @@ def shown(value: object, most: int = _SHOWN) -> str:
 
 
 def check_file(path: Path, most: int | None = None) -> None:
-    """Raise a SkillweaveError where ``path`` is no plain file, or has more than ``most`` bytes.
+    """Raise a RunError where ``path`` is no plain file, or has more than ``most`` bytes.
 
     A pipe would wait for ever, and a device may never end.
     """
     try:
         found = os.stat(path)
     except FileNotFoundError as error:
-        raise SkillweaveError(f"{path} does not exist") from error
+        raise RunError(f"{path} does not exist") from error
     except (OSError, ValueError) as error:
-        raise SkillweaveError(f"{path} cannot be read: {error}") from error
+        raise RunError(f"{path} cannot be read: {error}") from error
     if not stat.S_ISREG(found.st_mode):
         kind = "a directory" if stat.S_ISDIR(found.st_mode) else "a pipe or a device"
-        raise SkillweaveError(f"{path} is {kind}, not a file")
+        raise RunError(f"{path} is {kind}, not a file")
     if most is not None and found.st_size > most:
-        raise SkillweaveError(
+        raise RunError(
             f"{path} has {found.st_size:,} bytes, but such a file has at most {most:,}: damaged, "
             "or another file"
         )
@@ -64,13 +64,13 @@ def read_file(path: Path, most: int | None = None) -> bytes:
     """The content of a plain file.
 
     Raises:
-        SkillweaveError: it is missing, no plain file, too large, or cannot be read.
+        RunError: it is missing, no plain file, too large, or cannot be read.
     """
     check_file(path, most)
     try:
         return path.read_bytes()
     except OSError as error:
-        raise SkillweaveError(f"{path} cannot be read: {error.strerror or error}") from error
+        raise RunError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
 # JSON
@@ -80,18 +80,18 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
     """What a JSON text says; numbers are finite, and it is nested at most ``DEEPEST`` deep.
 
     Raises:
-        SkillweaveError: it is damaged; the message begins with ``where``.
+        RunError: it is damaged; the message begins with ``where``.
     """
     try:
         data = load_json(text, parse_constant=_finite, parse_float=_finite)
     except RecursionError as error:
-        raise SkillweaveError(f"{where} is damaged: it is nested too deep") from error
+        raise RunError(f"{where} is damaged: it is nested too deep") from error
     except ValueError as error:
-        raise SkillweaveError(f"{where} is damaged: {str(error)[:300]}") from error
+        raise RunError(f"{where} is damaged: {str(error)[:300]}") from error
     layer, depth = [data], 0
     while layer:
         if depth > DEEPEST:
-            raise SkillweaveError(f"{where} is damaged: it is nested too deep")
+            raise RunError(f"{where} is damaged: it is nested too deep")
         layer, depth = [x for part in layer for x in _inside(part)], depth + 1
     return data
 
@@ -104,7 +104,7 @@ def as_json(value: Any, where: str, advice: str) -> Any:
         advice: the end of messages, what to do.
 
     Raises:
-        SkillweaveError: it holds something that is not the same after it was written and read.
+        DeclarationError: it holds something that is not the same after it was written and read.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -117,7 +117,7 @@ def as_json(value: Any, where: str, advice: str) -> Any:
     if isinstance(value, Mapping) and all(isinstance(k, str) for k in value):
         return {k: as_json(x, f"{where}[{k!r}]", advice) for k, x in value.items()}
     keys = " with keys that are no text" if isinstance(value, Mapping) else ""
-    raise SkillweaveError(
+    raise DeclarationError(
         f"{where} is {short(value)}{keys}, but a run records only finite numbers, texts, and lists "
         f"and dicts of them; {advice}"
     )

@@ -14,7 +14,7 @@ import pytest
 
 import skillweave as sw
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import KINDS, SkillweaveError
 
 
 @checked_names
@@ -167,6 +167,7 @@ INSIDE = {
     "ParentSelection", "Policy", "Report",
     "Rollout", "Run", "Sample", "Seeds", "Skill", "Step", "adam_",
     "clip_grad_norm_", "gae", "mask_logits", "masked_mean", "normalise", "tree",
+    "Interrupted", *KINDS,
 }  # fmt: skip
 
 

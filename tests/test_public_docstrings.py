@@ -17,6 +17,7 @@ from pages import BLOCK, train_briefly
 
 import skillweave as sw
 from skillweave import Array, Policy, SkillweaveError
+from skillweave.errors import KINDS
 
 ALIASES = ("Array",)
 """Names of what is another library's: the reference explains them."""
@@ -87,9 +88,8 @@ def raises(thing: Any) -> bool:
     if function is None:
         return False
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    return any(
-        isinstance(n, ast.Raise) and "SkillweaveError" in ast.dump(n) for n in ast.walk(tree)
-    )
+    raised = [ast.dump(n) for n in ast.walk(tree) if isinstance(n, ast.Raise)]
+    return any(f"'{kind}'" in text for text in raised for kind in KINDS)
 
 
 def missing(thing: Any) -> list[str]:
@@ -109,7 +109,7 @@ def missing(thing: Any) -> list[str]:
         kind = str(inspect.signature(thing).return_annotation)
         if ARRAY.search(kind) and not re.search(r"\((\*?[A-Zkn]|\.\.\.|…)[,)]", text):
             lacks.append(f"the shape of {kind}")
-    if raises(thing) and "Raises:" not in text and "Raise a SkillweaveError" not in text:
+    if raises(thing) and not re.search(r"Raises:|Raise an? \w+Error", text):
         lacks.append("its errors")
     return lacks
 

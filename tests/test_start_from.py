@@ -20,6 +20,7 @@ from skillweave import (
     Apart,
     Hierarchy,
     Network,
+    RunError,
     Selection,
     SelfImitationPPO,
     Skill,
@@ -226,7 +227,7 @@ def test_where_nothing_can_be_copied_no_run_is_begun(source, tmp_path, monkeypat
 
     def full(path, *about, **how):
         if "other" in path.name:
-            raise SkillweaveError("No space left on device")
+            raise RunError("No space left on device")
         return write(path, *about, **how)
 
     monkeypatch.setattr(starts, "write_tensors", full)

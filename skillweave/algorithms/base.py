@@ -13,7 +13,7 @@ from torch import Tensor
 from skillweave.algorithms.config import check_spaces
 from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.experience import Report
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -112,14 +112,14 @@ def read_by(config: Any, observation_space: gym.Space[Any], where: str = "") -> 
         where: the start of messages: ``skill 'land': ``.
 
     Raises:
-        SkillweaveError: the channels of an image may be in more than one axis.
+        DeclarationError: the channels of an image may be in more than one axis.
     """
     networks = [getattr(config, name, None) for name in ("network", "critic")]
     codec = obs_codec(observation_space, getattr(networks[0], "planes", None))
     # Cells are read one by one, so the order of their axes makes no difference.
     ordered = any(n is not None and getattr(n, "encoder", None) != "cells" for n in networks)
     if codec.unclear and ordered:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where}{codec.unclear[0]} may have its planes (channels) in the first axis or in the "
             f'last: write {type(config).__name__}(network=Network(planes="first")), or '
             'planes="last", with the other settings of the network'
@@ -136,7 +136,7 @@ class Algorithm:
     of its settings (``config``), ``observation_space`` and ``action_space``.
 
     Raises:
-        SkillweaveError: a setting is one that this algorithm does not support.
+        DeclarationError: a setting is one that this algorithm does not support.
     """
 
     store: ClassVar[Literal["rollout", "replay"]]
@@ -161,7 +161,7 @@ class Algorithm:
     ) -> None:
         check_spaces(config, action_space)
         if is_schedule(config.learning_rate) and not self.follows_schedules:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{type(config).__name__}.learning_rate is a schedule, but {type(self).__name__} "
                 "does not follow schedules: give a number"
             )
@@ -272,7 +272,7 @@ class Algorithm:
         return _scaling(state.obs_mean, state.obs_var)
 
     def check_state(self, state: Any) -> None:
-        """Raise a SkillweaveError where a finite number of a ``state`` is out of its range."""
+        """Raise a RunError where a finite number of a ``state`` is out of its range."""
 
     def layouts(self) -> dict[str, Layout]:
         """The fields of the state that hold parameters, or moments of them, and their columns."""
@@ -352,7 +352,7 @@ class Algorithm:
         return self.codec.to_env(action)
 
     def _missing(self, method: str) -> NoReturn:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{type(self).__name__} has no method {method!r}, which every algorithm needs; "
             "see skillweave.Algorithm"
         )

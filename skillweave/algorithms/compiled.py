@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, TrainingError
 
 PROGRAMS = 64
 """The most programs of one gradient step: by size, rows with gaps, and reference policy."""
@@ -27,8 +27,8 @@ class Compiled:
         sizes_vary: where a size changes it is compiled once more, for any size there.
 
     Raises:
-        SkillweaveError: this torch cannot; or by a call: there is no C++ compiler, or something in
-            it cannot be compiled.
+        DeclarationError: this torch cannot.
+        TrainingError: by a call: there is no C++ compiler, or something in it cannot be compiled.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Compiled:
         if hasattr(dynamo, "trace_autograd_ops"):
             return
         if not self._auto:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._setting}: torch {torch.__version__} cannot compile a gradient step; "
                 "install torch 2.13 or newer, or leave it at False"
             )
@@ -75,7 +75,7 @@ class Compiled:
                 says = f"{self._setting}: the gradient step could not be compiled ({reason})"
                 if not self._auto:
                     advice = f"{_advice(error)}leave it at False"
-                    raise SkillweaveError(f"{says}; {advice}") from error
+                    raise TrainingError(f"{says}; {advice}") from error
         warnings.warn(f"{says}. Gradient steps are not compiled", stacklevel=2)
         self._program = self._function
         return self._function(*args)  # nothing is changed yet: compiling comes before the step

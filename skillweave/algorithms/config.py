@@ -13,7 +13,7 @@ import gymnasium as gym
 
 from skillweave.algorithms.config_off_policy import DQN, SAC, TD3, OffPolicy
 from skillweave.algorithms.config_on_policy import PPO, OnPolicy, SelfImitationPPO, SkillCritic
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.named import Named
 from skillweave.reading import as_json, fit, shown
 from skillweave.settings import Check
@@ -72,13 +72,13 @@ def registration_of(config: Any) -> Registration:
     """The algorithm that settings belong to.
 
     Raises:
-        SkillweaveError: it was never registered.
+        DeclarationError: it was never registered.
     """
     kind = type(config)
     for found in _REGISTERED.values():
         if found.config is kind:
             return found
-    raise SkillweaveError(_not_registered(kind.__name__))
+    raise DeclarationError(_not_registered(kind.__name__))
 
 
 def _not_registered(name: str) -> str:
@@ -91,11 +91,11 @@ def _not_registered(name: str) -> str:
 
 
 def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> None:
-    """Raise a SkillweaveError where an algorithm cannot act in a space; it names those that can."""
+    """Raise a DeclarationError where an algorithm cannot act in a space, with those that can."""
     if not isinstance(action_space, registration_of(config).action_spaces):
         able = [k for k, r in _REGISTERED.items() if r.acts]
         able = [k for k in able if isinstance(action_space, _REGISTERED[k].action_spaces)]
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where}{type(config).__name__} cannot act in {action_space}; "
             + (f"{', '.join(able)} can" if able else "no algorithm here can")
         )
@@ -105,7 +105,7 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
     """An algorithm's or a preset's default settings by name, in any case.
 
     Raises:
-        SkillweaveError: there is none of this name; the message, which begins with ``where``,
+        DeclarationError: there is none of this name; the message, which begins with ``where``,
             lists them.
     """
     kinds = {name: found.config for name, found in _REGISTERED.items() if found.acts}
@@ -114,14 +114,14 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
         if known.lower() == name.lower():
             config: AlgorithmConfig = make()
             return config
-    raise SkillweaveError(f"{where}: no algorithm {name!r}; there are: {', '.join(presets)}")
+    raise DeclarationError(f"{where}: no algorithm {name!r}; there are: {', '.join(presets)}")
 
 
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
     """Settings as plain JSON, with the algorithm's name under ``algorithm``.
 
     Raises:
-        SkillweaveError: a setting, of a user's own algorithm, cannot be recorded.
+        DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
     """
     name = type(config).__name__
     return {"algorithm": name, **_settings(config, name)}
@@ -131,7 +131,7 @@ def _settings(value: Any, where: str) -> Any:
     """Return settings as dicts; functions of the user are the names that are recorded.
 
     Raises:
-        SkillweaveError: a setting, of a user's own algorithm, cannot be recorded.
+        DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
     """
     if is_dataclass(value):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
@@ -155,14 +155,14 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
         path: the field in it: ``stages[0].algorithm``.
 
     Raises:
-        SkillweaveError: an unknown algorithm or field, named, or a value of another type or out
+        RunError: an unknown algorithm or field, named, or a value of another type or out
             of range.
     """
     values: dict[str, Any] = fit(dict[str, Any], data, file, path)
     kind = values.pop("algorithm", None)
     if not isinstance(kind, str) or kind not in _REGISTERED:
         where = f"{file}: {path}: " if file else ""
-        raise SkillweaveError(f"{where}{_not_registered(shown(kind))}")
+        raise RunError(f"{where}{_not_registered(shown(kind))}")
     config: AlgorithmConfig = fit(_REGISTERED[kind].config, values, file, path or kind)
     return config
 

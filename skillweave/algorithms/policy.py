@@ -15,7 +15,7 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.reading import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless
@@ -100,7 +100,7 @@ class AgentPolicy(Memoryless):
         """The inverse of ``to_file``.
 
         Raises:
-            SkillweaveError: the header is damaged; or tensors are missing, have other shapes or
+            RunError: the header is damaged; or tensors are missing, have other shapes or
                 types than the header says, or are not finite.
         """
         fit(AgentHeader, header, where)
@@ -109,14 +109,14 @@ class AgentPolicy(Memoryless):
             config = config_from_json(header["algorithm"], path="algorithm")
             algorithm = make_algorithm(config, *spaces)
         except SkillweaveError as error:
-            raise SkillweaveError(f"{where}: {error}") from error
+            raise RunError(f"{where}: {error}") from error
         weights = {
             name: checked_tensor(tensors, name, shape, torch.float32, where)
             for name, shape in algorithm.weight_shapes().items()
         }
         for name, value in weights.items():
             if not value.isfinite().all():
-                raise SkillweaveError(
+                raise RunError(
                     f"{where}: tensor {name} holds NaN or infinity: what was trained had diverged, "
                     "or the file was altered"
                 )
@@ -145,14 +145,14 @@ def checked_tensor(
     """A tensor by name.
 
     Raises:
-        SkillweaveError: it is missing, or has another shape or type.
+        RunError: it is missing, or has another shape or type.
     """
     found = tensors.get(name)
     if found is None or tuple(found.shape) != shape:
         what = "nothing" if found is None else tuple(found.shape)
-        raise SkillweaveError(f"{where}: tensor {name} should be {shape}, found {what}")
+        raise RunError(f"{where}: tensor {name} should be {shape}, found {what}")
     if found.dtype != dtype:
-        raise SkillweaveError(f"{where}: tensor {name} should hold {dtype}, found {found.dtype}")
+        raise RunError(f"{where}: tensor {name} should hold {dtype}, found {found.dtype}")
     return found
 
 
@@ -171,7 +171,7 @@ def state_from(
         may_diverge: numbers need not be finite, as of a member that trains no more.
 
     Raises:
-        SkillweaveError: it is not, or holds a number that is not finite; the tensor is named.
+        RunError: it is not, or holds a number that is not finite; the tensor is named.
     """
     shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
     for family in groups:  # after growth each parameter has an age of its own
@@ -183,9 +183,7 @@ def state_from(
     }
     for name, value in found.items():
         if not may_diverge and value.is_floating_point() and not bool(value.isfinite().all()):
-            raise SkillweaveError(
-                f"{where}: tensor {name} holds NaN or infinity: the file was altered"
-            )
+            raise RunError(f"{where}: tensor {name} holds NaN or infinity: the file was altered")
     return type(like)(**found)
 
 

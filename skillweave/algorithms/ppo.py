@@ -22,7 +22,7 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.ppo_samples import Terms, epsilon_now, samples_of
 from skillweave.algorithms.rollouts import Samples, minibatches
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.experience import Report, Rollout
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
@@ -70,7 +70,7 @@ class PPOAlgorithm(Algorithm):
         if max(config.epsilon, config.epsilon_final or 0.0) and not isinstance(
             action_space, gym.spaces.Discrete
         ):
-            raise SkillweaveError(f"epsilon needs discrete actions, but they are {action_space}")
+            raise DeclarationError(f"epsilon needs discrete actions, but they are {action_space}")
         self.head = ActionHead(self.codec, config.action_std, config.squash_actions)
         self.actor_net = Net("actor", self.obs, config.network, self.head.width)
         self.critic_net = Net("critic", self.obs, config.critic or config.network, 1)

@@ -17,7 +17,7 @@ from skillweave.algorithms.config import (
     registration_of,
 )
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 
 _SETTINGS: dict[str, type[Any]] = {"rollout": OnPolicy, "replay": OffPolicy}
 
@@ -36,35 +36,35 @@ def register_algorithm(config_type: type[Any], algorithm_type: type[Algorithm]) 
             ``(config, observation_space, action_space)``.
 
     Raises:
-        SkillweaveError: a method or a class attribute is missing, it is named; or the name is one
+        DeclarationError: a method or a class attribute is missing, it is named; or the name is one
             of this library's own.
     """
     name = config_type.__name__
     where = f"register_algorithm({name}, {algorithm_type.__name__})"
     if not issubclass(algorithm_type, Algorithm):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where}: {algorithm_type.__name__} is no subclass of skillweave.Algorithm"
         )
     lacks = [k for k in REQUIRED if getattr(algorithm_type, k) is getattr(Algorithm, k)]
     lacks += [k for k in ("store", "action_spaces") if not hasattr(algorithm_type, k)]
     if lacks:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where}: {algorithm_type.__name__} lacks {', '.join(lacks)}; see skillweave.Algorithm"
         )
     settings = _SETTINGS.get(algorithm_type.store)
     if settings is None:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where}: {algorithm_type.__name__}.store is {algorithm_type.store!r}; it must be "
             "'rollout' or 'replay'"
         )
     frozen = is_dataclass(config_type) and cast(Any, config_type).__dataclass_params__.frozen
     if not (frozen and issubclass(config_type, settings)):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where}: {name} must be a frozen dataclass on {settings.__name__}, because "
             f"{algorithm_type.__name__}.store is {algorithm_type.store!r}"
         )
     if name in BUILT_IN:
-        raise SkillweaveError(f"{where}: {name} is an algorithm of this library; use another name")
+        raise DeclarationError(f"{where}: {name} is an algorithm of this library; use another name")
     add_registration(Registration(config_type, algorithm_type, algorithm_type.action_spaces))
 
 
@@ -72,7 +72,7 @@ def make_algorithm(config: AlgorithmConfig, observation_space: Any, action_space
     """The algorithm that these settings belong to, on one pair of spaces.
 
     Raises:
-        SkillweaveError: nobody registered it, or it cannot act in these spaces; the message names
+        DeclarationError: nobody registered it, or it cannot act in these spaces; the message names
             those that can.
     """
     kind = registration_of(config).algorithm

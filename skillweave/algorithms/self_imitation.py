@@ -20,7 +20,7 @@ from skillweave.algorithms.ppo import PPOAlgorithm
 from skillweave.algorithms.ppo import State as PPOState
 from skillweave.algorithms.ppo_samples import Terms
 from skillweave.algorithms.rollouts import Cells, first_true
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.experience import Report, Rollout
 from skillweave.networks.stacked import Views, take_rows
 from skillweave.ops.device import BOOL, FLOAT, all_false
@@ -83,12 +83,12 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         )
 
     def check_state(self, state: Any) -> None:
-        """Raise a SkillweaveError where a row that is kept is none of these spaces."""
+        """Raise a RunError where a row that is kept is none of these spaces."""
         try:
             self.obs.check(state.kept_obs)
             self.codec.check(state.kept_action)
         except ValueError as error:
-            raise SkillweaveError(
+            raise RunError(
                 f"what SelfImitationPPO has kept to learn from again is damaged: {error}. The file "
                 "that it was read from was altered"
             ) from error

@@ -21,7 +21,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -143,12 +143,12 @@ class Agent(PlainAgent):
         """A plain agent with its environment, from the file that ``Run.save_weights`` wrote.
 
         Raises:
-            SkillweaveError: ``path`` is no such file, or the environment needs code.
+            RunError: ``path`` is no such file, or the environment needs code.
         """
         path = as_path(path, "path")
         tensors, header = open_weights(path)
         if header["kind"] != "agent" or "env" not in header:
-            raise SkillweaveError(f"{path} does not say which environment its agent is for")
+            raise RunError(f"{path} does not say which environment its agent is for")
         agent = cls(spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
 
@@ -247,8 +247,12 @@ class Hierarchy(Declaration):
             The finished run.
 
         Raises:
-            SkillweaveError: the declaration does not fit the environment, training diverged,
-                ``run_dir`` holds something else, or no learner can start from ``start_from``.
+            DeclarationError: a setting is wrong, or the declaration does not fit the environment.
+            EnvError: the environment cannot be made, or breaks Gymnasium's contract.
+            SkillError: a skill's code failed, or returned something unusable.
+            TrainingError: training diverged, or cannot continue.
+            RunError: ``run_dir`` holds something else, or no learner can start from
+                ``start_from``.
         """
         self.validate()
         seed = whole_number(seed, "seed", 0)
@@ -407,7 +411,7 @@ def train_agent(
         The finished run.
 
     Raises:
-        SkillweaveError: the algorithm cannot act in the environment; the message says which can.
+        DeclarationError: the algorithm cannot act in the environment; the message says which can.
     """
     agent = Agent(
         env,

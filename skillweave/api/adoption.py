@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import adopt_guide
 from skillweave.hierarchy.nesting import copied, every_hierarchy, every_skill, inner_of
@@ -30,7 +30,7 @@ def adopted(declared: D, run: RunDirectory) -> D:
     """A copy that calls its skills as a run does, here and in hierarchies below, if it fits.
 
     Raises:
-        SkillweaveError: the run is not one of this declaration.
+        RunError: the run is not one of this declaration.
     """
     check_run(declared, run)
     if run.manifest["kind"] != "hierarchy":
@@ -99,15 +99,15 @@ def _adopt(declared: Declaration, told: dict[str, Any], where: str) -> None:
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
-    """Raise a SkillweaveError where a run is not one of this declaration."""
+    """Raise a RunError where a run is not one of this declaration."""
     if run.manifest["kind"] == "hierarchy":
         if isinstance(declared, PlainAgent):
-            raise SkillweaveError(f"{run.path} is the run of a hierarchy, not of a plain agent")
+            raise RunError(f"{run.path} is the run of a hierarchy, not of a plain agent")
         found = dict(every_skill(declared.skills))
         mine = list(found)
         theirs = [s["name"] for s in run.manifest["skills"]]
         if mine != theirs:
-            raise SkillweaveError(
+            raise RunError(
                 f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
                 f"has {', '.join(mine)}"
             )
@@ -116,7 +116,7 @@ def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
         for entry in run.manifest["skills"]:
             inner = inner_of(found[entry["name"]])
             if (inner is not None) != ("hierarchy" in entry):
-                raise SkillweaveError(
+                raise RunError(
                     f"{run.path}: of skill {entry['name']!r} the run and this declaration do not "
                     "say the same: to one it is a hierarchy"
                 )
@@ -129,11 +129,11 @@ def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
 
 
 def _check_reflexes(declared: Declaration, told: dict[str, Any], where: str) -> None:
-    """Raise a SkillweaveError where others are in force than those that were trained with."""
+    """Raise a RunError where others are in force than those that were trained with."""
     theirs: list[str] = told["reflexes"]
     mine = [str(r.name) for r in declared.reflexes]
     if mine != theirs:
-        raise SkillweaveError(
+        raise RunError(
             f"{where} was trained with {_reflexes(theirs)}, but this hierarchy has "
             f"{_reflexes(mine)}: declare them as they were, or train anew"
         )
@@ -144,7 +144,7 @@ def _reflexes(names: list[str]) -> str:
 
 
 def _check_place(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
-    """Raise a SkillweaveError where a run was trained in another environment."""
+    """Raise a RunError where a run was trained in another environment."""
     theirs, kwargs = run.manifest["env"], run.manifest["env_kwargs"]
     mine, own = declared.spec.name, declared.spec.json_kwargs
     if (theirs, kwargs) == (mine, own):
@@ -152,7 +152,7 @@ def _check_place(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
     if theirs == mine:
         theirs, mine = f"{theirs} made with {kwargs}", f"one made with {own}"
     what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
-    raise SkillweaveError(
+    raise RunError(
         f"{run.path} was trained on {theirs}, but this {what} is on {mine}. Load it where it was "
         "trained; to try its policy elsewhere then: evaluate(run.policy, env)"
     )
@@ -162,9 +162,9 @@ def spec_of(told: dict[str, Any]) -> EnvSpec:
     """The environment that a manifest or a header names.
 
     Raises:
-        SkillweaveError: it is one that needs code.
+        RunError: it is one that needs code.
     """
     spec = EnvSpec(told["env"], kwargs=told.get("env_kwargs", {}))
     if not spec.is_data:
-        raise SkillweaveError(f"the environment {spec.name!r} names code; give the recipe")
+        raise RunError(f"the environment {spec.name!r} names code; give the recipe")
     return spec

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skillweave.api.adoption import adopted, check_run, differences
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -46,7 +46,7 @@ def prepared(
         content: the manifest of the declaration, as a new run would have it.
 
     Raises:
-        SkillweaveError: the run is one of another declaration, or a stage cannot continue.
+        RunError: the run is one of another declaration, or a stage cannot continue.
     """
     _check_same(declared, content, run)
     own = adopted(declared, run) if isinstance(declared, Declaration) else declared
@@ -71,7 +71,7 @@ def prepared(
 
 
 def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: RunDirectory) -> None:
-    """Raise a SkillweaveError where a run is one of another declaration."""
+    """Raise a RunError where a run is one of another declaration."""
     check_run(declared, run)
     manifest = run.manifest
     if content["kind"] != manifest["kind"]:
@@ -79,17 +79,17 @@ def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: Ru
         one, other = f"a flat agent ({flat})", "a hierarchy"
         if manifest["kind"] == "hierarchy":
             one, other = other, one
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path} is the run of {one}, but it was to continue as {other}; choose another "
             "directory"
         )
     mine, theirs = declared.recipe, manifest.get("recipe")
     if mine and theirs and Path(mine).name != Path(theirs).name:
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path} is a run of the recipe {theirs}, not of {mine}; choose another directory"
         )
     if content["seed"] != manifest["seed"]:
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path} was trained with seed {manifest['seed']}, not {content['seed']}; give "
             "that seed, or choose another directory"
         )
@@ -190,18 +190,18 @@ def _heir(stages: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> Mapp
 
 
 def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None:
-    """Raise a SkillweaveError where a stage cannot be given more steps."""
+    """Raise a RunError where a stage cannot be given more steps."""
     name = entry["name"]
     new = f"Begin a new run with what it has learnt: {start_words(run)}"
     if entry.get("evolution"):
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path}: stage {name!r} is a population, which cannot be given more steps, as "
             f"only its best member is kept. {new}"
         )
     if entry["status"] != "done":
         return
     if is_copy_of_hub(run.path) or not run.final_path(name).exists():
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path} cannot be given more steps: it does not hold the final state of stage "
             f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"
         )
@@ -210,7 +210,7 @@ def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None
         waits = config.get("learning_starts", 0)
         place = "extra.learner." + (f"{learner}." if "together" in entry else "") + "store."
         if left <= waits and not any(tensor.startswith(place) for tensor in tensors):
-            raise SkillweaveError(
+            raise RunError(
                 f"{run.path}: {learner!r} would learn nothing in {left:,} more steps, as its "
                 f"replay buffer is not kept and the first {waits:,} (learning_starts) fill a new "
                 "one; give more steps"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from skillweave.api import Agent, Hierarchy
 from skillweave.api.recipe_file import hierarchy_in
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.runs.directory import RunDirectory
 from skillweave.shipped import names
 
@@ -22,7 +22,7 @@ def declared_by(
         ask: what to do where it was not given, as a sentence.
 
     Raises:
-        SkillweaveError: it needs code that was not given.
+        RunError: it needs code that was not given.
     """
     manifest = run.manifest
     if recipe is None and not manifest.get(needs, True):
@@ -35,9 +35,9 @@ def declared_in(recipe: str | None, given: str | None, where: str, ask: str = AS
     """The hierarchy of a recipe: a shipped one, or the one that was ``given``.
 
     Raises:
-        SkillweaveError: it is neither; the message begins with ``where``.
+        RunError: it is neither; the message begins with ``where``.
     """
     if recipe is not None and (given is not None or recipe in names()):
         return hierarchy_in(recipe, Hierarchy)
     made = f"in {recipe}" if recipe else "in Python"
-    raise SkillweaveError(f"{where} was declared {made}, and needs that code. {ask}")
+    raise RunError(f"{where} was declared {made}, and needs that code. {ask}")

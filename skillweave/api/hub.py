@@ -11,7 +11,7 @@ from typing import Any
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.loading import check_declared, load_from
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import as_path
 from skillweave.reporting.card import write_card
 from skillweave.reporting.plots import plot_run
@@ -73,7 +73,7 @@ def from_hub(
         The finished run.
 
     Raises:
-        SkillweaveError: there is no such run, it holds a file that is not data, it is damaged, it
+        RunError: there is no such run, it holds a file that is not data, it is damaged, it
             needs code that was not given, or the hub does not answer.
         MissingExtra: the extra 'hub' is not installed.
     """
@@ -85,7 +85,7 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
     """Copy a run from the hub into a new folder; errors are those of ``from_hub``."""
     path = as_path(path, "path")
     if path.exists():
-        raise SkillweaveError(f"{path} is there already; choose another folder")
+        raise RunError(f"{path} is there already; choose another folder")
     found = hub.download(hub.check_name(name), revision)
     manifest = hub.public(RunDirectory.open(found).manifest)  # others may have pushed all of it
     # A name that cannot be guessed: a link that waits there would lead elsewhere.
@@ -99,7 +99,7 @@ def pull_run(name: str, path: str | Path, revision: str | None = None) -> Path:
         RunDirectory(part, manifest).save()
         part.rename(path)
     except OSError as error:
-        raise SkillweaveError(f"could not write {path}: {error.strerror or error}") from error
+        raise RunError(f"could not write {path}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return path

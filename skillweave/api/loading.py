@@ -9,7 +9,7 @@ from skillweave.api.adoption import adopted, check_run
 from skillweave.api.run import Run
 from skillweave.api.running import caller_of, declared_of
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, short
@@ -37,7 +37,7 @@ def load(run_dir: str | Path, hierarchy: Hierarchy | Agent | None = None) -> Run
         The run.
 
     Raises:
-        SkillweaveError: there is no run, it is not finished or damaged, it is one of another
+        RunError: there is no run, it is not finished or damaged, it is one of another
             declaration, or it needs code that was not given.
     """
     path = as_path(run_dir, "run_dir")
@@ -75,8 +75,8 @@ def load_from(
 
 
 def check_declared(declared: object) -> None:
-    """Raise a SkillweaveError where something else is given as what was trained."""
+    """Raise a DeclarationError where something else is given as what was trained."""
     if declared is not None and not isinstance(declared, Declaration | PlainAgent):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"hierarchy is {short(declared)}; it must be the Hierarchy or Agent that was trained"
         )

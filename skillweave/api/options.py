@@ -5,7 +5,7 @@ from __future__ import annotations
 from skillweave.api import Hierarchy, Run
 from skillweave.arguments import checked_names
 from skillweave.envs.make import make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short, whole_number
@@ -29,21 +29,21 @@ def make_options_env(
         ``OptionsEnv``; its ``skills`` go into ``HierarchyPolicy`` with the selector once trained.
 
     Raises:
-        SkillweaveError: a skill has no policy; the message names it.
+        DeclarationError: a skill has no policy; the message names it.
     """
     num_envs = whole_number(num_envs, "num_envs", 1)
     real = isinstance(gamma, int | float) and not isinstance(gamma, bool)
     if not real or not 0.0 < gamma <= 1.0:
-        raise SkillweaveError(f"gamma is {short(gamma)}; it must be over 0 and at most 1")
+        raise DeclarationError(f"gamma is {short(gamma)}; it must be over 0 and at most 1")
     if isinstance(hierarchy, Run):
         if not isinstance(hierarchy.policy, HierarchyPolicy):
-            raise SkillweaveError("this is the run of a plain agent: it has no skills to call")
+            raise DeclarationError("this is the run of a plain agent: it has no skills to call")
         skills, spec = hierarchy.policy.skills, hierarchy.hierarchy.spec
     else:
         ready, spec = hierarchy.ready_policies(), hierarchy.spec
         lacking = [s.name for s in hierarchy.skills if s.name not in ready]
         if lacking:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"skill {lacking[0]!r} has no policy: train the hierarchy and give its run, or "
                 "declare the skill with a policy"
             )

@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Memory, Policy, Step
 
@@ -75,7 +75,7 @@ class Player:
                 None: what ``info`` says, or the part ``action_mask`` of the observation; else all.
 
         Raises:
-            SkillweaveError: the observation is none of the policy's, or the mask none of its
+            DeclarationError: the observation is none of the policy's, or the mask none of its
                 actions'; the message says what is.
         """
         seen = self._seen(obs)
@@ -101,9 +101,9 @@ class Player:
         try:
             allowed = checked_mask(mask, self.policy.action_space)
         except ValueError as error:
-            raise SkillweaveError(f"act(): {error}") from error
+            raise DeclarationError(f"act(): {error}") from error
         if not allowed.any():
-            raise SkillweaveError("act(): its action_mask allows no action")
+            raise DeclarationError("act(): its action_mask allows no action")
         return allowed[None]
 
     def _step(self, seen: Array, reward: float, info: Mapping[str, Any]) -> Step:
@@ -123,7 +123,7 @@ class Player:
         try:
             put_observation(self._space, found, 0, obs)
         except (TypeError, ValueError, KeyError, IndexError) as error:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"act() was given an observation that is none of {self._space}: {error}"
             ) from error
         return found

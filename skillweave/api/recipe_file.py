@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from skillweave.api.running import READING
 from skillweave.collecting.shipping import add_folder
-from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError, reworded
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import told
 from skillweave.shipped import FOLDER, file_of, names
@@ -64,7 +64,7 @@ def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> Modul
         shipped: it is one of this library's, which imports nothing beside it by its bare name.
 
     Raises:
-        SkillweaveError: the file raises an error (the message has its file and line), or imports
+        DeclarationError: the file raises an error (the message has its file and line), or imports
             a file beside it whose name another module has.
     """
     if not shipped:
@@ -82,7 +82,10 @@ def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> Modul
         del sys.modules[spec.name]
         if isinstance(error, KeyboardInterrupt):
             raise
-        raise SkillweaveError(_sentence(error, recipe)) from error
+        text = _sentence(error, recipe)
+        if isinstance(error, SkillweaveError):
+            raise reworded(error, text) from error
+        raise DeclarationError(text) from error
     finally:
         READING.reset(outer)
     return module
@@ -113,7 +116,7 @@ def _free_name(path: Path) -> str:
 
 
 def _check_names(path: Path, recipe: str) -> None:
-    """Raise a SkillweaveError where a file beside a recipe would not be what it imports.
+    """Raise a DeclarationError where a file beside a recipe would not be what it imports.
 
     Python keeps one module of each name. Without this check, a recipe could get the file of another
     recipe, or a package, and nobody would notice.
@@ -127,7 +130,7 @@ def _check_names(path: Path, recipe: str) -> None:
             found = _file_of(module)
         if found != beside:
             where = "in Python itself" if found is None else str(found)
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{recipe} imports {name!r}: beside it lies {beside.name}, but Python finds "
                 f"another module of this name ({where}). Rename {beside.name}"
             )

@@ -12,7 +12,7 @@ from skillweave.api.notebook_tables import run_html
 from skillweave.api.player import Player
 from skillweave.arguments import checked_names
 from skillweave.envs.make import EngineName
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.schedule import stages_of
@@ -61,10 +61,10 @@ class Run:
         """The hierarchy that was trained.
 
         Raises:
-            SkillweaveError: this is the run of a plain agent.
+            DeclarationError: this is the run of a plain agent.
         """
         if isinstance(self.declaration, PlainAgent):
-            raise SkillweaveError("this is the run of a plain agent: it has no hierarchy")
+            raise DeclarationError("this is the run of a plain agent: it has no hierarchy")
         return self.declaration
 
     @checked_names
@@ -105,10 +105,10 @@ class Run:
             Returns, lengths, and what each skill did.
 
         Raises:
-            SkillweaveError: no such skill or engine; or ``save`` where it cannot be.
+            DeclarationError: no such skill or engine; or ``save`` where it cannot be.
         """
         if save and (skill is not None or engine != "sync"):
-            raise SkillweaveError("save keeps a whole policy's score: leave out skill and engine")
+            raise DeclarationError("save keeps a whole policy's score: leave out skill and engine")
         if save:
             must_be_own(self.path)  # said before anything is played
         policy = self._policy(skill)
@@ -237,7 +237,7 @@ class Run:
             The folder, its files, and what is code.
 
         Raises:
-            SkillweaveError: a part cannot be exported; the message says which, and what to do.
+            PolicyError: a part cannot be exported; the message says which, and what to do.
         """
         path = as_path(path, "path")
         must_be_own(path)
@@ -269,7 +269,7 @@ class Run:
             ``missing``: sentences on what is not in it.
 
         Raises:
-            SkillweaveError: this is no run but a weights file, or the file cannot be written.
+            RunError: this is no run but a weights file, or the file cannot be written.
         """
         run = RunDirectory.open(self.path)
         return write_report(
@@ -315,7 +315,7 @@ class Run:
             ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
 
         Raises:
-            SkillweaveError: the run is not finished or damaged, ``name`` may not be written or
+            RunError: the run is not finished or damaged, ``name`` may not be written or
                 holds something else, or the hub does not answer.
         """
         from skillweave.api.hub import push_run
@@ -363,7 +363,7 @@ class Run:
             return self.policy
         policy = self.policy
         if not isinstance(policy, HierarchyPolicy):
-            raise SkillweaveError("this is a plain agent: it has no skills")
+            raise DeclarationError("this is a plain agent: it has no skills")
         self.hierarchy.skill(skill)
         *nodes, name = skill.split("/")
         for node in nodes:

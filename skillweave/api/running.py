@@ -18,7 +18,7 @@ from skillweave.collecting.cluster import Ray
 from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.collecting.where import HERE, Where
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import Interrupted, SkillweaveError
+from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.evolution.plan import Evolve, check_several, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
@@ -49,9 +49,9 @@ READING: ContextVar[str | None] = ContextVar("READING", default=None)
 
 
 def _may_train() -> None:
-    """Raise a SkillweaveError while a Python file is only read for what it declares."""
+    """Raise a DeclarationError while a Python file is only read for what it declares."""
     if (file := READING.get()) is not None:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{file} trains as soon as it is read, and here it is only asked what it declares. Put "
             "what trains inside a block that begins with: if __name__ == '__main__':\nIf a skill "
             "is made of what it trains, train that once in another file, and load it here: "
@@ -83,13 +83,13 @@ def begin(
     place = absolute("." if run_dir is None else as_path(run_dir, "run_dir"))
     run_dir = None if run_dir is None else place
     if not isinstance(resume, bool):
-        raise SkillweaveError(f"resume is {short(resume)}; it must be True or False")
+        raise DeclarationError(f"resume is {short(resume)}; it must be True or False")
     if resume and run_dir is None:
-        raise SkillweaveError(
+        raise DeclarationError(
             'resume=True continues a run, so name its directory: train("runs/a", resume=True)'
         )
     if isinstance(track, str) or not isinstance(track, Sequence):
-        raise SkillweaveError(f"track is {short(track)}; it must be a list: track=['wandb']")
+        raise DeclarationError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
     with _surroundings(), called_by(caller_of(declared)), ExitStack() as stack:
         stack.enter_context(collected_notices())  # they are told by the progress, later
@@ -144,7 +144,7 @@ def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
     """The finished run of this manifest in ``run_dir``: begun, or gone on with, where it is not.
 
     Raises:
-        SkillweaveError: there is a run, but of another manifest.
+        RunError: there is a run, but of another manifest.
     """
     run = begun(declared, content, run_dir)
     if run is None:
@@ -156,7 +156,7 @@ def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDir
     """The run of this manifest in ``run_dir``; None: it is not begun.
 
     Raises:
-        SkillweaveError: there is a run, but of another manifest.
+        RunError: there is a run, but of another manifest.
     """
     if not (run_dir / "run.json").exists():
         return None
@@ -164,7 +164,7 @@ def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDir
     _plan(declared, content, None, None)
     grown = any(stage.get("continued") for stage in run.manifest["stages"])
     if grown or run.manifest.get("id") != identity(content):
-        raise SkillweaveError(
+        raise RunError(
             f"{run_dir} holds a run of other settings (or of another recipe, budget or version); "
             "choose another directory"
         )
@@ -208,9 +208,9 @@ def _surroundings() -> Iterator[None]:
 
 
 def _must_not_run_again(spec: EnvSpec) -> None:
-    """Raise a SkillweaveError where processes would run the program again that starts them."""
+    """Raise a DeclarationError where processes would run the program again that starts them."""
     if not why_no_processes() and (why := runs_again()):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{spec.name} is to be stepped in {spec.workers} processes, but {why}\n"
             "Or have one process: EnvSpec(workers=1)"
         )
@@ -297,7 +297,7 @@ def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: Ex
     A cluster is left when ``stack`` is closed.
 
     Raises:
-        SkillweaveError: the run was begun with another number of collectors.
+        RunError: the run was begun with another number of collectors.
     """
     _check(cluster)
     if cluster is None or run.finished:
@@ -306,7 +306,7 @@ def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: Ex
     counts = [s.get("workers", 1) for s in left]
     asked = cluster.collectors
     if asked is not None and any(s.get("workers", 1) != workers_of(s, asked) for s in left):
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path} was begun with {', '.join(map(str, sorted(set(counts))))} collectors, and "
             f"goes on with as many, as results depend on it; leave out collectors={asked}"
         )
@@ -321,4 +321,4 @@ def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: Ex
 
 def _check(cluster: Any) -> None:
     if not isinstance(cluster, Ray | None):
-        raise SkillweaveError(f"cluster is {short(cluster)}; write cluster=Ray(collectors=8)")
+        raise DeclarationError(f"cluster is {short(cluster)}; write cluster=Ray(collectors=8)")

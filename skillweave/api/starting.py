@@ -12,7 +12,7 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.run import Run
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, close_matches, short
 from skillweave.runs.starts import Chooses, Learnt, begin_with, chosen_from, learnt_in, same_shapes
@@ -64,14 +64,14 @@ def _place(run: OneRun, argument: str) -> Path:
     """Return the directory of a run.
 
     Raises:
-        SkillweaveError: it is a policy, or a file with one; the message says what can be done with
+        DeclarationError: it is a policy, or a file with one; the message says what can be done with
             it.
     """
     if isinstance(run, Run):
         run = run.path
     if (use := _use_of(run)) is not None:
         what, way = use
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{argument} is {what}, and a training starts only from what a run of Skillweave has "
             f"learnt: its directory; {way}"
         )
@@ -123,18 +123,19 @@ def _learnt_by_name(
     """Return what each named learner begins with, and in which run that is.
 
     Raises:
-        SkillweaveError: a name does not learn here, or has not learnt in its run.
+        DeclarationError: a name does not learn here.
+        RunError: a name has not learnt in its run.
     """
     here = sorted({name for entry in content["stages"] for name in entry["learns"]})
     learnt: dict[str, Learnt] = {}
     places: dict[str, Path] = {}
     known: dict[Path, dict[str, Learnt]] = {}
     if not start_from:
-        raise SkillweaveError('start_from is {}; name who begins with which run: {"left": run}')
+        raise DeclarationError('start_from is {}; name who begins with which run: {"left": run}')
     for name, run in start_from.items():
         if name not in here:
             near = close_matches(str(name), here)
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"start_from names {short(name)}, which does not learn here; here learn "
                 f"{', '.join(here)}.{near}"
             )
@@ -145,7 +146,7 @@ def _learnt_by_name(
         # A plain agent's run has one learner, whatever it is to be here.
         found = there.get(name) or (there.get(AGENT) if set(there) == {AGENT} else None)
         if found is None:
-            raise SkillweaveError(
+            raise RunError(
                 f"start_from[{name!r}]: {name!r} has not learnt in {place}; there learnt "
                 f"{', '.join(there) or 'nobody: no stage was finished'}"
             )
@@ -156,7 +157,7 @@ def _learnt_by_name(
 def _check_start(
     name: str, algorithm: Algorithm, chooses: Chooses, learnt: Learnt, where: Path
 ) -> None:
-    """Raise a SkillweaveError where one cannot begin with what it has learnt in another run."""
+    """Raise a RunError where one cannot begin with what it has learnt in another run."""
     before = learnt.policy.algorithm
     kinds = [type(a.config).__name__ for a in (before, algorithm)]
     what = ""
@@ -171,9 +172,7 @@ def _check_start(
     elif _networks(before) != _networks(algorithm) or not same_shapes(before, algorithm):
         what = "it has other networks here (network, critic, normalize_obs, or kinds of cells)"
     if what:
-        raise SkillweaveError(
-            f"start_from: {name!r} cannot begin with what it learnt in {where}: {what}"
-        )
+        raise RunError(f"start_from: {name!r} cannot begin with what it learnt in {where}: {what}")
 
 
 def _told(chooses: Chooses) -> str:

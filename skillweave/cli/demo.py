@@ -16,7 +16,7 @@ from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
 from skillweave.cli.telling import put, save_score, tell
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, RunError
 from skillweave.messages import shown_path
 from skillweave.recipes import lander_missions as missions
 from skillweave.training.evaluation import Evaluation
@@ -164,12 +164,11 @@ def demo(command: commands.Demo) -> None:
     """Run the demonstration.
 
     Raises:
-        SkillweaveError: the output folder exists already, or the scale is not positive.
+        RunError: the output folder exists already.
+        DeclarationError: the scale is not positive.
     """
     if command.out.exists():
-        raise SkillweaveError(
-            f"{command.out} exists already: choose another folder (--out), or remove it"
-        )
+        raise RunError(f"{command.out} exists already: choose another folder (--out), or remove it")
     started, shown = time.perf_counter(), Demo(command)
     shown.lander()
     shown.mission()

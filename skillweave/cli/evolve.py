@@ -8,7 +8,7 @@ from typing import Any
 
 from skillweave.api.running import apart_to_evolve
 from skillweave.cli.overrides import replaced
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.schedule import stages_of
@@ -25,7 +25,7 @@ def parse_evolve(
     takes that selection, ``ranges.gamma=0.9,0.999,complement`` lets a setting mutate.
 
     Raises:
-        SkillweaveError: no such setting (with close matches), or a value out of range.
+        DeclarationError: no such setting (with close matches), or a value out of range.
     """
     if not settings:
         return None
@@ -38,7 +38,7 @@ def parse_evolve(
     for setting in settings:
         name, sign, text = (part.strip() for part in setting.partition("="))
         if not sign:
-            raise SkillweaveError(f"--evolve {setting!r}: write name=value, such as population=8")
+            raise DeclarationError(f"--evolve {setting!r}: write name=value, such as population=8")
         head, _, rest = name.partition(".")
         if head in names and rest:
             own[head].append((rest, name, text))
@@ -60,7 +60,7 @@ def _evolution(settings: list[tuple[str, str, str]]) -> Evolution:
         if path == ("selection",):
             if text.lower() not in SELECTIONS:
                 known = ", ".join(SELECTIONS)
-                raise SkillweaveError(f"--evolve {written}={text}: expected one of {known}")
+                raise DeclarationError(f"--evolve {written}={text}: expected one of {known}")
             start = replace(start, selection=SELECTIONS[text.lower()]())
         elif path[:-1] in (("ranges",), ("mutations", "ranges")):
             ranges[path[-1]] = _range(written, text)
@@ -77,6 +77,6 @@ def _range(written: str, text: str) -> Range:
         low, high, *scale = (part.strip() for part in text.split(","))
         return Range(float(low), float(high), *scale)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"--evolve {written}={text}: write low,high or low,high,scale ({error})"
         ) from error

@@ -16,7 +16,7 @@ from skillweave.cli.targets import load_run, target
 from skillweave.cli.telling import save_score, tell
 from skillweave.cli.training import resume, train
 from skillweave.compat.agilerl_files import convert
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -206,7 +206,7 @@ def _weights(command: commands.Weights) -> None:
 
 def _export(command: commands.Export) -> None:
     if not command.onnx:
-        raise SkillweaveError("say as what to export: --onnx")
+        raise DeclarationError("say as what to export: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
     found = target(command).export(command.out or Path(f"{name}-onnx"))
     told = {"path": str(found.path), "files": list(found.files), "code": found.code}
@@ -215,7 +215,7 @@ def _export(command: commands.Export) -> None:
 
 def _import_agilerl(command: commands.ImportAgilerl) -> None:
     if not command.trust:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{command.file} would be read as a pickle, and pickles can run code. This one is read "
             "by an unpickler that admits only tensors, numbers and plain containers; if you trust "
             "where it comes from nevertheless, say so: --trust"
@@ -229,7 +229,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
 def _run_line(path: Path) -> dict[str, Any]:
     try:
         found = RunDirectory.open(path)
-    except SkillweaveError as error:
+    except RunError as error:
         return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
     status = "finished" if found.finished else "unfinished"
     return {"path": str(path), "status": status} | {

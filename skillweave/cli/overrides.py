@@ -13,7 +13,7 @@ from typing import Any
 from skillweave.algorithms.config import named_config
 from skillweave.algorithms.schedules import Linear
 from skillweave.collecting.lengths import Lengths
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.settings import annotations_of, described, options_of
 from skillweave.skills import Skill
@@ -40,14 +40,16 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
     The name of an agent alone sets its algorithm: ``selector=DQN``, ``skills.center=SAC``.
 
     Raises:
-        SkillweaveError: no such setting (with close matches), or a value out of range.
+        DeclarationError: no such setting (with close matches), or a value out of range.
     """
     configs: dict[tuple[str, ...], dict[str, str]] = {}
     kinds: dict[tuple[str, ...], str] = {}
     for setting in overrides:
         name, sign, text = (part.strip() for part in setting.partition("="))
         if not sign:
-            raise SkillweaveError(f"--set {setting!r}: write name=value, for example call_steps=20")
+            raise DeclarationError(
+                f"--set {setting!r}: write name=value, for example call_steps=20"
+            )
         head, *rest = name.split(".")
         if head in PLAIN and not rest:
             hint = annotations_of(Declaration)[head]
@@ -74,7 +76,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         if owner in kinds:
             config = named_config(kinds[owner], f"--set {'.'.join(owner)}={kinds[owner]}")
         if not is_dataclass(config):
-            raise SkillweaveError(_without_settings(next(iter(changes)), owner))
+            raise DeclarationError(_without_settings(next(iter(changes)), owner))
         _set_config(declaration, owner, replaced(config, by_path))
     declaration.__post_init__()
 
@@ -149,7 +151,7 @@ def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> An
             inner = parts[0]() if parts else None
         if not is_dataclass(inner):
             name = next(iter(inner_changes.values()))[0]
-            raise SkillweaveError(f"{name}: {field} has no parts")
+            raise DeclarationError(f"{name}: {field} has no parts")
         values[field] = replaced(inner, inner_changes)
     return replace(config, **values)
 
@@ -190,7 +192,7 @@ def _parse(name: str, text: str, hint: Any) -> Any:
     wanted = described(hint)
     if typing.get_origin(options[0]) is Sequence:
         wanted = "names with commas between them"
-    raise SkillweaveError(f"{name}={text}: expected {wanted}")
+    raise DeclarationError(f"{name}={text}: expected {wanted}")
 
 
 def _flatten(prefix: str, config: Any) -> dict[str, Any]:
@@ -205,7 +207,7 @@ def _flatten(prefix: str, config: Any) -> dict[str, Any]:
     return found
 
 
-def _unknown(name: str, known: Sequence[str]) -> SkillweaveError:
+def _unknown(name: str, known: Sequence[str]) -> DeclarationError:
     near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     hint = f"; did you mean {', '.join(near)}?" if near else ""
-    return SkillweaveError(f"no setting {name!r}{hint} (skillweave info RECIPE lists them)")
+    return DeclarationError(f"no setting {name!r}{hint} (skillweave info RECIPE lists them)")

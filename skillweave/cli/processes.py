@@ -16,14 +16,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, TrainingError, reworded
 
 PATIENCE = 1.0
 """Seconds between looks whether a job's process is still there."""
 _START = multiprocessing.get_context("spawn")
 
 
-class ProcessEnded(SkillweaveError):
+class ProcessEnded(TrainingError):
     """A job's process was ended before it answered."""
 
 
@@ -107,7 +107,7 @@ def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) ->
     try:
         result = job(*arguments)
     except SkillweaveError as error:
-        problem = SkillweaveError(str(error))
+        problem = reworded(error, str(error))
     except KeyboardInterrupt:
         os._exit(128 + signal.SIGTERM)  # its run has saved; the parent knows why it ended it
     except Exception:  # any, as it comes from what a user wrote; not all errors can be sent

@@ -27,7 +27,7 @@ from skillweave.cli.sweep_table import summary
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.messages import short, told, whole_number
 from skillweave.terminal import say
@@ -56,7 +56,7 @@ class Job:
         """Train it, or what is left of it, and evaluate it: its mean return, or what went wrong."""
         try:
             if not (self.path.parent / MARK).exists():
-                raise SkillweaveError(
+                raise RunError(
                     f"{self.path.parent} is not seen from the machine {platform.node()}: with "
                     "--ray on several machines, --out must be in a directory that all share"
                 )
@@ -97,7 +97,7 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
         whole_number(command.jobs, "jobs", 1)
     seeds, choices = parse_seeds(command.seeds), parse_choices(command.set_each)
     if len(seeds) * len(choices) > MOST:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{len(seeds)} seeds of {len(choices)} settings are {len(seeds) * len(choices):,} "
             f"runs; at most {MOST:,} are made"
         )
@@ -106,7 +106,7 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SkillweaveError(f"could not write {out}: {error.strerror}") from error
+        raise RunError(f"could not write {out}: {error.strerror}") from error
     found: dict[Job, float | str] = {}
     jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
     for settings, hierarchy in _hierarchies(command, choices):
@@ -146,7 +146,7 @@ def parse_seeds(text: str) -> list[int]:
     except ValueError:
         seeds = []
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"--seeds {short(text)}: write 0:20 for 0 to 19, or 0,3,7: whole numbers, each once"
         )
     return seeds
@@ -159,12 +159,12 @@ def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
         name, sign, text = (part.strip() for part in setting.partition("="))
         values = [v.strip() for v in re.split(r",(?![^(\[]*[)\]])", text)]
         if not sign or not all(values) or len(set(values)) < len(values):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"--set-each {short(setting)}: write name=value,value, each value once, for "
                 "example selector.gamma=0.99,0.995"
             )
         if name in names:
-            raise SkillweaveError(f"--set-each {name} is given twice; write all values at once")
+            raise DeclarationError(f"--set-each {name} is given twice; write all values at once")
         names.add(name)
         options.append([f"{name}={value}" for value in values])
     return list(itertools.product(*options))

@@ -19,7 +19,7 @@ from typing import TypedDict
 
 from skillweave import recipes
 from skillweave.collecting.shipping import is_own_code
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.reading import fit, shown
 from skillweave.runs.files import read_json, write_json
 
@@ -43,7 +43,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
     no run has learnt yet, for example where it failed at its first step.
 
     Raises:
-        SkillweaveError: the runs there are trained by other code; or the directory cannot be
+        RunError: the runs there are trained by other code; or the directory cannot be
             written.
     """
     file, code = out / MARK, _checksum(code_files(recipes.file_of(recipe)))
@@ -53,7 +53,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
         return
     told: Mark = fit(Mark, read_json(file), str(file))
     if told["code"] != code:
-        raise SkillweaveError(
+        raise RunError(
             f"{out} holds runs of the recipe {shown(told['recipe'], 500)}, which were not trained "
             f"by the code of {recipe} as it is now: it is another recipe, or it was edited since, "
             "or a module of yours that it imports was. One table would mix both. Choose another "

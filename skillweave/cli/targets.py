@@ -9,7 +9,7 @@ from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.declared import ASK, declared_in
 from skillweave.api.loading import load_from
 from skillweave.cli import commands
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.hierarchy.weights import open_weights
 
 
@@ -17,7 +17,7 @@ def target(command: commands.Watched | commands.Export) -> Run:
     """The trained policy that a command names.
 
     Raises:
-        SkillweaveError: there is none, or it needs code that was not given.
+        RunError: there is none, or it needs code that was not given.
     """
     path = Path(command.target)
     if command.pretrained:
@@ -33,7 +33,7 @@ def target(command: commands.Watched | commands.Export) -> Run:
     hint = (
         " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
     )
-    raise SkillweaveError(f"{command.target} is neither a run nor a weights file{hint}")
+    raise RunError(f"{command.target} is neither a run nor a weights file{hint}")
 
 
 def load_run(path: Path, recipe: str | None) -> Run:

@@ -7,7 +7,7 @@ from typing import Any
 
 from skillweave.api import Run
 from skillweave.cli import commands
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.messages import shown_path
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
@@ -30,19 +30,19 @@ def put(text: str = "") -> None:
     """Print a line of results.
 
     Raises:
-        SkillweaveError: standard output cannot be written.
+        RunError: standard output cannot be written.
     """
     try:
         put_result(text)
     except OSError as error:
-        raise SkillweaveError(f"could not write to standard output: {error.strerror}") from error
+        raise RunError(f"could not write to standard output: {error.strerror}") from error
 
 
 def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = True) -> None:
     """Keep a score in its run for ``info``; one that cannot be written is told all the same."""
     try:
         save_evaluation(RunDirectory.open(trained.path), score, seed, deterministic)
-    except SkillweaveError as error:
+    except RunError as error:
         say(f"the evaluation is not kept in the run: {error}")
 
 

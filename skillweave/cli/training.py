@@ -15,7 +15,7 @@ from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.telling import put, run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
 from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
@@ -24,16 +24,16 @@ from skillweave.runs.directory import RunDirectory
 def train(command: commands.Train) -> None:
     """Train a recipe, and perhaps the flat baseline after it."""
     if command.evaluate < 0:
-        raise SkillweaveError(f"evaluate is {command.evaluate}; it must be at least 0")
+        raise DeclarationError(f"evaluate is {command.evaluate}; it must be at least 0")
     if command.versus_flat and command.flat:
-        raise SkillweaveError("--flat trains the baseline alone: leave out --versus-flat")
+        raise DeclarationError("--flat trains the baseline alone: leave out --versus-flat")
     if command.versus_flat and not command.evaluate:
-        raise SkillweaveError("--versus-flat compares scores: let --evaluate be at least 1")
+        raise DeclarationError("--versus-flat compares scores: let --evaluate be at least 1")
     flat_out = command.out and command.out.with_name(f"{command.out.name}-flat")
     if command.versus_flat and flat_out and flat_out.exists() and not command.resume:
-        raise SkillweaveError(f"{flat_out} is there already: the flat agent would be written there")
+        raise RunError(f"{flat_out} is there already: the flat agent would be written there")
     if command.resume and command.out is None:
-        raise SkillweaveError("--resume continues a run: name its directory, --out DIR")
+        raise DeclarationError("--resume continues a run: name its directory, --out DIR")
     hierarchy = recipes.load(command.recipe)
     apply_overrides(hierarchy, command.set)
     hierarchy.scale(command.scale)
@@ -97,7 +97,7 @@ def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
     """Return the run that ``--start-from`` means, or several by name.
 
     Raises:
-        SkillweaveError: there are several, and one of them has no name, or a name has two.
+        DeclarationError: there are several, and one of them has no name, or a name has two.
     """
     if not words:
         return None
@@ -107,12 +107,12 @@ def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
     for word in words:
         name, sign, run = word.partition("=")
         if not sign or not name or not run:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"--start-from {word}: with several runs, write who begins with each: "
                 "--start-from left=RUN --start-from right=RUN"
             )
         if name in found:
-            raise SkillweaveError(f"--start-from names {name} twice; give it one run")
+            raise DeclarationError(f"--start-from names {name} twice; give it one run")
         found[name] = run
     return found
 

@@ -15,7 +15,7 @@ from skillweave.collecting.group import Collectors, MakeCollector, share_of
 from skillweave.collecting.where import Where
 from skillweave.collecting.workers import MakeStanding, Workers
 from skillweave.envs.make import cores
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, MissingExtra, TrainingError
 from skillweave.messages import short, told
 from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
 
@@ -54,7 +54,13 @@ class Ray:
     """Seconds to wait while the cluster has no room for all collectors, or lost some of it."""
 
     def check(self) -> None:
-        """Raise a SkillweaveError where Ray is not installed, or nobody listens at the address."""
+        """Raise an error where Ray is not installed, or nothing listens at the address.
+
+        Raises:
+            MissingExtra: the extra 'ray' is not installed.
+            DeclarationError: the address is none.
+            TrainingError: nothing listens there.
+        """
         if not imported().is_initialized() and self._where not in ("local", "auto"):
             _must_listen(self._where)
 
@@ -71,7 +77,8 @@ class Ray:
 
         Raises:
             MissingExtra: the extra 'ray' is not installed.
-            SkillweaveError: nobody listens at the address, or another version of Ray or Python.
+            DeclarationError: the address is none, or the process is joined to another cluster.
+            TrainingError: nothing listens at the address, or another version of Ray or Python.
         """
         self.check()
         ray = imported()
@@ -95,7 +102,7 @@ class Ray:
             tell: is told what people should know.
 
         Raises:
-            SkillweaveError: as of ``joined``.
+            SkillweaveError: the kinds of ``joined``.
         """
         with self.joined(most):
             from skillweave.collecting.actors import Actors, RayCollectors, ray_workers
@@ -126,18 +133,18 @@ class Ray:
             ray.init(address, **how)
         except ConnectionError as error:
             if address == "auto":
-                raise SkillweaveError(
+                raise TrainingError(
                     "this machine is part of no Ray cluster that runs. Begin one with: ray start "
                     "--head; or leave 'auto' out, for this machine alone"
                 ) from error
-            raise SkillweaveError(
+            raise TrainingError(
                 f"somebody listens at {short(address)}, but Ray could not connect "
                 f"({told(error)}). Perhaps it is no Ray cluster, or one that asks for a token, as "
                 "those of `ray start` do: then RAY_AUTH_MODE=token is needed here, too (see Ray's "
                 "page on token authentication)"
             ) from error
         except (RuntimeError, ValueError) as error:  # another version of Ray or Python
-            raise SkillweaveError(
+            raise TrainingError(
                 f"the Ray cluster at {short(address)} cannot be used: {told(error)}"
             ) from error
 
@@ -160,14 +167,14 @@ def imported() -> Any:
 
 
 def _must_be_joined(ray: Any, address: str) -> None:
-    """Raise a SkillweaveError where this process is joined to a cluster at another address."""
+    """Raise a DeclarationError where this process is joined to a cluster at another address."""
     joined = ray.get_runtime_context().gcs_address
     if address in ("local", "auto") or address.startswith("ray://"):  # a client's port is another
         return
     (mine, _, port), (theirs, _, joined_port) = address.rpartition(":"), joined.rpartition(":")
     # One machine has many names, so hosts are compared only where both are numbers.
     if port != joined_port or (_is_outside(mine) and _is_outside(theirs) and mine != theirs):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"Ray: address is {short(address)}, but this process is joined to the cluster at "
             f"{joined} already. Leave the address out, or call ray.shutdown() before"
         )
@@ -182,10 +189,10 @@ def _is_outside(host: str) -> bool:
 
 
 def _must_listen(address: str) -> None:
-    """Raise a SkillweaveError where nobody does: Ray itself would try for minutes."""
+    """Raise a TrainingError where nothing listens: Ray itself would try for minutes."""
     host, sign, port = address.removeprefix("ray://").rpartition(":")
     if not sign or not host or not port.isdigit() or not 0 < int(port) < 65_536:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"Ray: address is {short(address)}; write host:port (that of the head, usually with "
             "6379), ray://host:port, or auto"
         )
@@ -193,7 +200,7 @@ def _must_listen(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
     except OSError as error:
         why = error.strerror or str(error)
-        raise SkillweaveError(
+        raise TrainingError(
             f"nobody listens at {address} ({why}), so there is no Ray cluster. Begin one with: ray "
             "start --head; or leave the address out, for this machine alone"
         ) from error

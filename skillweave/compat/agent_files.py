@@ -8,7 +8,7 @@ from typing import Any
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy, state_from
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.reading import check_file
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
@@ -27,11 +27,11 @@ def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str
     A file that holds a policy alone gives the weights; everything else begins anew.
 
     Raises:
-        SkillweaveError: the file is missing, damaged, a pickle, or holds no agent.
+        RunError: the file is missing, damaged, a pickle, or holds no agent.
     """
     check_file(Path(path))
     if zipfile.is_zipfile(path):
-        raise SkillweaveError(
+        raise RunError(
             f"{path} is a pickle of torch.save's, and a pickle can run code. If it is a checkpoint "
             "of AgileRL's and you trust where it comes from, convert it: skillweave "
             f"import-agilerl {path} --trust"

@@ -18,7 +18,7 @@ from skillweave.algorithms.config import DQN, PPO, TD3
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.compat.agent_files import save_agent
 from skillweave.compat.pickles import read_torch_pickle
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
 from skillweave.reading import fit, shown
@@ -37,14 +37,14 @@ def convert(path: Path, out: Path) -> str:
     The pickle is read without running code from it (see ``pickles``). The optimiser begins anew.
 
     Raises:
-        SkillweaveError: the file is missing, names what is refused, is no checkpoint of
+        RunError: the file is missing, names what is refused, is no checkpoint of
             AgileRL's, or holds what no native policy computes; the message says what.
     """
     data = read_torch_pickle(path)
     algo: Any = data.get("algo") if isinstance(data, dict) else None
     known = isinstance(algo, str) and algo in _KINDS
     if not known or "actor_state_dict" not in data or "actor_init_dict" not in data:
-        raise SkillweaveError(
+        raise RunError(
             f"{path} holds no agent that can be converted (algorithm {shown(algo)}): it must be a "
             f"checkpoint of AgileRL 0.1 or 1.0 of {', '.join(_KINDS)}"
         )
@@ -53,7 +53,7 @@ def convert(path: Path, out: Path) -> str:
     output = init.get("mlp_output_activation")
     if "num_inputs" not in init or output != _OUTPUTS[algo]:
         kind = f"an MLP that ends in {output}" if "num_inputs" in init else "a CNN, or its own"
-        raise SkillweaveError(
+        raise RunError(
             f"{path}: the actor is {kind}; of {algo} only MLPs that end in {_OUTPUTS[algo]} can "
             "be converted: no native policy computes the same as others"
         )
@@ -62,10 +62,10 @@ def convert(path: Path, out: Path) -> str:
         past = {k: [float(x) for x in data.get(k, ())] for k in ("scores", "fitness")}
         steps = [int(x) for x in data.get("steps", (0,))]
     except SkillweaveError as error:
-        raise SkillweaveError(f"{path}: {error}") from error
+        raise RunError(f"{path}: {error}") from error
     except (LookupError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         told = f"{type(error).__name__}: {str(error)[:300]}"
-        raise SkillweaveError(f"{path}: its networks are not as it describes: {told}") from error
+        raise RunError(f"{path}: its networks are not as it describes: {told}") from error
     about = {"algo": algo, **past, "steps": steps, "index": data.get("index", 0), "mut": None}
     save_agent(out, algorithm, state, about)
     return str(algo)
@@ -182,12 +182,12 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
     """The network that a ``net_config`` of AgileRL describes.
 
     Raises:
-        SkillweaveError: a part is missing or unknown.
+        RunError: a part is missing or unknown.
     """
     name = described.get("mlp_activation") or described.get("activation") or usual
     known = described.get("arch") in ("mlp", "cnn") and name in ACTIVATIONS
     if not known or "hidden_size" not in described:
-        raise SkillweaveError(
+        raise RunError(
             f"a network is described by {shown(dict(described), 500)}; it must have a hidden_size, "
             f"arch be 'mlp' or 'cnn', and its activation be one of {', '.join(ACTIVATIONS)}"
         )
@@ -205,7 +205,7 @@ def _named(
     """A state dict with the names and shapes of one of our networks, complete.
 
     Raises:
-        SkillweaveError: a weight is missing, unknown, of another shape, or not finite.
+        RunError: a weight is missing, unknown, of another shape, or not finite.
     """
     wanted = {k: shape for k, shape in shapes.items() if k.startswith(f"{prefix}.")}
     depth = max(int(k.split(".")[1]) for k in wanted)
@@ -213,25 +213,23 @@ def _named(
     for key, value in weights.items():
         told = f"{prefix}_state_dict: {key[:100]}"
         if (found := _LAYER.search(key)) is None or not isinstance(value, Tensor):
-            raise SkillweaveError(f"{told} is no weights of an MLP: unknown weights {key[:100]}")
+            raise RunError(f"{told} is no weights of an MLP: unknown weights {key[:100]}")
         layer, number, what = found.groups()
         matrix = layer == "linear_layer" and what == "weight"
         name = f"norm_{what}" if layer == "layer_norm" else what
         name = f"{prefix}.{depth if number == 'output' else int(number)}.{name}"
         if name not in wanted or name in named:
-            raise SkillweaveError(f"{told} belongs to no layer that is described")
+            raise RunError(f"{told} belongs to no layer that is described")
         # Stored as torch has it: (out, in), where ours is (in, out).
         asked = wanted[name][::-1] if matrix else wanted[name][-1:]
         if tuple(value.shape) != asked:
-            raise SkillweaveError(
-                f"{told} has the shape {tuple(value.shape)}, but {asked} is described"
-            )
+            raise RunError(f"{told} has the shape {tuple(value.shape)}, but {asked} is described")
         value = value.to(torch.float32) if value.is_floating_point() else value
         if value.dtype != torch.float32 or not value.isfinite().all():
-            raise SkillweaveError(f"{told} holds NaN, infinity, or no real numbers")
+            raise RunError(f"{told} holds NaN, infinity, or no real numbers")
         named[name] = (value.t() if matrix else value).reshape(wanted[name])
     if left := sorted(set(wanted) - set(named)):
-        raise SkillweaveError(f"there are no weights for {', '.join(left)}")
+        raise RunError(f"there are no weights for {', '.join(left)}")
     return named
 
 

@@ -6,7 +6,7 @@ import pickletools
 import zipfile
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 
 DEEPEST = 100
 """How deep a pickle may nest what it builds: hashing a deeper tuple overflows Python's stack."""
@@ -25,17 +25,15 @@ def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
     """Raise where reading a zip of ``size`` bytes would take far more memory than that."""
     total = sum(member.file_size for member in file.infolist())
     if total > LARGEST:
-        raise SkillweaveError(f"it declares {total:,} bytes; at most {LARGEST:,} are read")
+        raise RunError(f"it declares {total:,} bytes; at most {LARGEST:,} are read")
     if total > size:
-        raise SkillweaveError(
+        raise RunError(
             f"refused: it declares {total:,} bytes in a file of {size:,}; what torch.save writes "
             "is not compressed"
         )
     own = file.getinfo(program).file_size
     if own > LARGEST_PROGRAM:
-        raise SkillweaveError(
-            f"its pickle declares {own:,} bytes; at most {LARGEST_PROGRAM:,} are read"
-        )
+        raise RunError(f"its pickle declares {own:,} bytes; at most {LARGEST_PROGRAM:,} are read")
 
 
 def check_program(program: bytes) -> None:
@@ -48,7 +46,7 @@ def check_program(program: bytes) -> None:
     for step, (operation, argument, _) in enumerate(pickletools.genops(program)):
         name, taken = operation.name, operation.stack_before
         if step >= MOST_STEPS:
-            raise SkillweaveError(f"its pickle has more than {MOST_STEPS:,} operations")
+            raise RunError(f"its pickle has more than {MOST_STEPS:,} operations")
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
             memo[len(memo) if name == "MEMOIZE" else argument] = stack[-1]
             continue
@@ -67,5 +65,5 @@ def check_program(program: bytes) -> None:
         outer = inner.pop() if name in _INTO else 0
         depth = max(outer, max(inner, default=-1) + 1)
         if depth > DEEPEST:
-            raise SkillweaveError(f"its pickle nests objects more than {DEEPEST} deep")
+            raise RunError(f"its pickle nests objects more than {DEEPEST} deep")
         stack += [depth] * len(operation.stack_after)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from skillweave.compat.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.reading import check_file, shown
 
@@ -54,7 +54,7 @@ class _Held:
         self.tensor = tensor
 
     def __setstate__(self, state: Any) -> None:
-        raise SkillweaveError("refused: the pickle sets the attributes of a tensor")
+        raise RunError("refused: the pickle sets the attributes of a tensor")
 
 
 class _Maker:
@@ -69,14 +69,14 @@ class _Maker:
         return self._function(*arguments)
 
     def __setstate__(self, state: Any) -> None:
-        raise SkillweaveError("refused: the pickle sets the attributes of a function")
+        raise RunError("refused: the pickle sets the attributes of a function")
 
 
 def read_torch_pickle(path: Path) -> Any:
     """What ``torch.save`` wrote, if it is tensors, numbers, arrays and plain containers.
 
     Raises:
-        SkillweaveError: the file is missing, damaged, too large or nested too deep, or names
+        RunError: the file is missing, damaged, too large or nested too deep, or names
             anything else; it is named.
     """
     check_file(path)
@@ -84,7 +84,7 @@ def read_torch_pickle(path: Path) -> Any:
         with zipfile.ZipFile(path) as file:
             name = next((n for n in file.namelist() if n.endswith("/data.pkl")), None)
             if name is None:
-                raise SkillweaveError("it is a zip, but not one of torch.save's")
+                raise RunError("it is a zip, but not one of torch.save's")
             check_sizes(file, path.stat().st_size, name)
             program = file.read(name)
             check_program(program)
@@ -92,14 +92,14 @@ def read_torch_pickle(path: Path) -> Any:
             return _Plain()(_Reader(io.BytesIO(program), file, prefix).load())[0]
     except zipfile.BadZipFile as error:
         told = shortened(str(error))  # it may quote much of the file
-        raise SkillweaveError(
+        raise RunError(
             f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {told}"
         ) from error
     except SkillweaveError as error:
-        raise SkillweaveError(f"{path}: {error}") from error
+        raise RunError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle can fail in any way
         told = f"{type(error).__name__}: {shortened(str(error))}"
-        raise SkillweaveError(f"{path} is damaged: {told}") from error
+        raise RunError(f"{path} is damaged: {told}") from error
 
 
 class _Plain:
@@ -113,7 +113,7 @@ class _Plain:
         if id(data) in self._results:
             return self._results[id(data)]
         if depth > DEEPEST:  # lists and dicts can be put into one another later, even in a circle
-            raise SkillweaveError(f"its pickle nests objects more than {DEEPEST} deep")
+            raise RunError(f"its pickle nests objects more than {DEEPEST} deep")
         inner: list[Any] = []
         if isinstance(data, dict):
             inner = [part for item in data.items() for part in item]
@@ -122,7 +122,7 @@ class _Plain:
         found = [self(part, depth + 1) for part in inner]
         size = 1 + sum(n for _, n in found)
         if size > MOST_STEPS:
-            raise SkillweaveError(f"its pickle holds more than {MOST_STEPS:,} objects")
+            raise RunError(f"its pickle holds more than {MOST_STEPS:,} objects")
         self._results[id(data)] = _rebuilt(data, [value for value, _ in found]), size
         return self._results[id(data)]
 
@@ -153,7 +153,7 @@ class _Reader(pickle.Unpickler):
             return _STORAGES[name]
         found = _ALLOWED.get((module, name))
         if found is None:
-            raise SkillweaveError(
+            raise RunError(
                 f"refused: the pickle names {module[:60]}.{name[:60]}, which is neither a tensor, "
                 "a number, an array, a device nor a plain container"
             )
@@ -162,14 +162,14 @@ class _Reader(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> _Held:
         kind, dtype, key, _, size = pid
         if kind != "storage" or not isinstance(dtype, torch.dtype) or not isinstance(key, str):
-            raise SkillweaveError(f"refused: the pickle refers to {shown(pid)}")
+            raise RunError(f"refused: the pickle refers to {shown(pid)}")
         if (key, dtype) not in self._storages:
             data = bytearray(self._file.read(f"{self._prefix}data/{key}"))
             empty = torch.empty(0, dtype=dtype, device="cpu")
             self._storages[key, dtype] = torch.frombuffer(data, dtype=dtype) if data else empty
         found = self._storages[key, dtype]
         if len(found) != size:
-            raise SkillweaveError(f"is damaged: storage {shown(key)} does not hold {shown(size)}")
+            raise RunError(f"is damaged: storage {shown(key)} does not hold {shown(size)}")
         return _Held(found)
 
 
@@ -188,7 +188,7 @@ class _DType:
     def __init__(self, kind: Any, *_: Any) -> None:
         self.real = np.dtype(kind)
         if self.real.kind not in "biufcSU":
-            raise SkillweaveError(f"refused: the pickle holds an array of {short(self.real)}")
+            raise RunError(f"refused: the pickle holds an array of {short(self.real)}")
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self.real = self.real.newbyteorder(state[1])
@@ -211,7 +211,7 @@ class _Array(np.ndarray[Any, Any]):
 
 def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
     if not isinstance(make, _Maker) or make._function is not _Array:  # dill writes arrays so
-        raise SkillweaveError(f"refused: the pickle makes an array by {shown(make)}")
+        raise RunError(f"refused: the pickle makes an array by {shown(make)}")
     found = _Array(*arguments)
     found.__setstate__(state)
     return found
@@ -224,7 +224,7 @@ def _encode(text: str, encoding: str) -> bytes:
 def _load_type(name: str) -> type:
     kinds: dict[str, type] = {k.__name__: k for k in (set, frozenset, dict, list, tuple)}
     if name not in kinds:  # dill's function knows all types, that of code too
-        raise SkillweaveError(f"refused: the pickle names the type {shown(name)}")
+        raise RunError(f"refused: the pickle names the type {shown(name)}")
     return kinds[name]
 
 

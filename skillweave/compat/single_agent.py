@@ -55,7 +55,7 @@ class SingleAgent:
         """Mutate in at most one way; returns which one.
 
         Raises:
-            SkillweaveError: ``by`` cannot change this architecture.
+            DeclarationError: ``by`` cannot change this architecture.
         """
         check_architecture(self.member.config, by, "Mutations: ")
         self.become(mutate(self.member, by, self.spaces, rng))

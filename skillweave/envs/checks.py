@@ -15,7 +15,7 @@ import numpy as np
 
 from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import short, told
 from skillweave.notices import notice
 from skillweave.spaces import obs_shape
@@ -54,9 +54,9 @@ def is_batched(env: object) -> bool:
     )
 
 
-def refuse_batched(name: str) -> SkillweaveError:
+def refuse_batched(name: str) -> EnvError:
     """Return the error for an environment that ``is_batched``."""
-    return SkillweaveError(
+    return EnvError(
         f"{name} steps many environments at once (a VectorEnv), and Skillweave steps each by "
         "itself, as some stand still while others act; write a gymnasium.Env around a simulator of "
         "one environment (num_envs=1), and give that: the documentation has its lines, under "
@@ -73,22 +73,20 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         number: which one of several it is.
 
     Raises:
-        SkillweaveError: it has no spaces; later, whatever it does or returns that is wrong.
+        EnvError: it has no spaces; later, whatever it does or returns that is wrong.
     """
 
     def __init__(self, env: gym.Env[Any, Any], name: str, number: int | None = None) -> None:
         if is_batched(env):
             raise refuse_batched(name)
         if not isinstance(env, gym.Env):
-            raise SkillweaveError(
-                f"{name} made {short(env)}, which is no environment (no gymnasium.Env)"
-            )
+            raise EnvError(f"{name} made {short(env)}, which is no environment (no gymnasium.Env)")
         super().__init__(env)
         self._name, self._number, self._elapsed = name, number, 0
         for kind in ("observation_space", "action_space"):
             found = getattr(env, kind, None)
             if not isinstance(found, gym.Space):
-                raise SkillweaveError(
+                raise EnvError(
                     f"{name}: {kind} is {short(found)}; it must be a space of Gymnasium's"
                 )
         self._fits = _fits(env.observation_space)
@@ -226,15 +224,15 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if not isinstance(info, dict):
             raise self._wrong(f"its info is {short(info)}; it must be a dict")
 
-    def _misfit(self, obs: Any) -> SkillweaveError:
+    def _misfit(self, obs: Any) -> EnvError:
         space = short(self.env.observation_space, 200)
         return self._wrong(
             f"its observation is {_described(obs)}, which is not in its observation_space {space}"
         )
 
-    def _wrong(self, what: str) -> SkillweaveError:
+    def _wrong(self, what: str) -> EnvError:
         where = f"environment {self._number}, " if self._number is not None else ""
-        return SkillweaveError(f"{self._name}: {where}step {self._elapsed} of its episode: {what}")
+        return EnvError(f"{self._name}: {where}step {self._elapsed} of its episode: {what}")
 
 
 def _attribute(env: gym.Env[Any, Any], name: str) -> Any:
@@ -276,11 +274,11 @@ _INSTEAD = {
 
 
 def _refuse_changing(wrapper: gym.Wrapper[Any, Any, Any, Any], name: str) -> None:
-    """Raise a SkillweaveError where a wrapper has statistics that go on changing."""
+    """Raise an EnvError where a wrapper has statistics that go on changing."""
     for kind, instead in _INSTEAD.items():
         changing = getattr(wrapper, "update_running_mean", True)
         if isinstance(wrapper, getattr(gym.wrappers, kind)) and changing:
-            raise SkillweaveError(
+            raise EnvError(
                 f"{name}: the wrapper {type(wrapper).__name__} changes while it is used, "
                 "differently in each environment, and what it has learnt is not saved with a "
                 f"policy. Leave it out: {instead}. (With statistics of your own, set its "
@@ -324,7 +322,7 @@ class Watch:
         """The first observations of environments ``ids`` (None: all), unchanged.
 
         Raises:
-            SkillweaveError: one is not finite; the message names the environment.
+            EnvError: one is not finite; the message names the environment.
         """
         self._elapsed[slice(None) if ids is None else ids] = 0
         self._check(obs, ids)
@@ -334,7 +332,7 @@ class Watch:
         """The answer (a ``RawStep``) of environments ``ids`` to a step, unchanged.
 
         Raises:
-            SkillweaveError: an observation or a reward is not finite; the message names the
+            EnvError: an observation or a reward is not finite; the message names the
                 environment and the step.
         """
         if ids is None:
@@ -370,9 +368,7 @@ class Watch:
         if self._bounds is not None and not self._bounds.see(obs):
             self._bounds = None
 
-    def _out_of_range(
-        self, part: Array, place: tuple[str, ...], ids: Array | None
-    ) -> SkillweaveError:
+    def _out_of_range(self, part: Array, place: tuple[str, ...], ids: Array | None) -> EnvError:
         bad = ~(np.abs(part) <= LARGEST_SEEN).reshape(len(part), -1)
         row = int(np.flatnonzero(bad.any(axis=1))[0])
         wrong = part[row].reshape(-1)[bad[row]]
@@ -397,10 +393,10 @@ class Watch:
             "there, or give it in other units"
         )
 
-    def _wrong(self, row: int, ids: Array | None, what: str) -> SkillweaveError:
+    def _wrong(self, row: int, ids: Array | None, what: str) -> EnvError:
         number = row if ids is None else int(ids[row])
         step = int(self._elapsed[number])
-        return SkillweaveError(
+        return EnvError(
             f"{self._name}: environment {number + self._first}, step {step} of its episode: {what}"
         )
 

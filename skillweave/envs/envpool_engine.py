@@ -13,7 +13,7 @@ from skillweave.envs.engine import RawStep
 from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
 from skillweave.envs.pool import MakePool, installed, no_precision_warnings
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import EnvError, MissingExtra
 from skillweave.types import Array
 
 RENEW_AFTER = 100_000
@@ -99,7 +99,7 @@ class EnvPoolEngine:
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
         """Start some anew; observations (n, *obs_shape)."""
         if seeds is not None:
-            raise SkillweaveError("EnvPool cannot reset single environments to a seed")
+            raise EnvError("EnvPool cannot reset single environments to a seed")
         if len(self._pools) == 1 and self._history.total >= RENEW_AFTER:
             self._add_pool()
         newest = len(self._pools) - 1

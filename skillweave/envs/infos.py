@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, info_keys
 from skillweave.spaces import action_codec
@@ -228,7 +228,7 @@ class ActionMasks:
             obs: (n, *obs_shape), what they show.
 
         Raises:
-            SkillweaveError: a mask has another shape, or allows nothing; the message names the
+            EnvError: a mask has another shape, or allows nothing; the message names the
                 environment.
         """
         told = info.get("action_mask")
@@ -246,7 +246,7 @@ class ActionMasks:
         free = np.logical_or.reduceat(mask, starts, axis=1).all(axis=1)
         over = np.zeros(len(ids), bool) if ended is None else ended
         if not (free | over).all():
-            raise SkillweaveError(
+            raise EnvError(
                 f"environment {ids[np.flatnonzero(~free & ~over)[0]]} allows no action, though its "
                 "episode goes on: its action_mask is 0 everywhere; allow at least one action"
             )
@@ -258,7 +258,7 @@ class ActionMasks:
     def _checked(self, told: Any, shape: tuple[int, int]) -> Array:
         mask = np.asarray(told)
         if mask.shape != shape or mask.dtype.kind not in "iubf":
-            raise SkillweaveError(
+            raise EnvError(
                 f"the action_mask of the environments is of {mask.dtype} and shape "
                 f"{mask.shape}, but numbers of shape {shape} were expected: one for each choice of "
                 f"{self._space}, 0 where it is forbidden"
@@ -293,7 +293,7 @@ def info_numbers(info: Mapping[str, Any], key: str, ids: Array, n: int) -> Array
         environment gives any.
 
     Raises:
-        SkillweaveError: something else than a number lies there; the message names its type.
+        EnvError: something else than a number lies there; the message names its type.
     """
     if key not in info:
         return None
@@ -317,8 +317,8 @@ def info_numbers(info: Mapping[str, Any], key: str, ids: Array, n: int) -> Array
     return found
 
 
-def _no_number(key: str, what: str) -> SkillweaveError:
-    return SkillweaveError(
+def _no_number(key: str, what: str) -> EnvError:
+    return EnvError(
         f"log_info names {short(key)}, but info[{short(key)}] is {what} at the end of an episode; "
         "let the environment give a number there, or leave the key out of log_info"
     )

@@ -21,7 +21,7 @@ from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, batched_infos, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, short, shortened, told
 from skillweave.reading import as_json
 from skillweave.seeding import Seeds, global_generators
@@ -154,7 +154,8 @@ class EnvSpec:
             The environment, whose steps are checked.
 
         Raises:
-            SkillweaveError: no such environment (with close matches), or a missing dependency.
+            EnvError: there is no such environment (with close matches), or it cannot be made.
+            MissingExtra: a dependency of it is not installed.
         """
         try:
             env = self._made(render_mode)
@@ -164,7 +165,7 @@ class EnvSpec:
             raise
         except (Exception, SystemExit) as error:
             which = "" if number is None else f" (environment {number})"
-            raise SkillweaveError(f"{self.name}{which} could not be made: {told(error)}") from error
+            raise EnvError(f"{self.name}{which} could not be made: {told(error)}") from error
         return CheckedEnv(env, self.name, number)
 
     def _made(self, render_mode: str | None) -> gym.Env[Any, Any]:
@@ -177,7 +178,7 @@ class EnvSpec:
         except TypeError as error:
             if self.kwargs and "render_mode" not in str(error):
                 raise  # it is about kwargs
-            raise SkillweaveError(
+            raise EnvError(
                 f"{self.name} cannot be rendered: the function that makes it must take "
                 f"render_mode ({error})"
             ) from error
@@ -194,7 +195,7 @@ class EnvSpec:
         except gym.error.DependencyNotInstalled as error:
             if "box2d" in str(error).lower():
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error
-            raise SkillweaveError(f"the environment {env_id} needs more: {error}") from error
+            raise EnvError(f"the environment {env_id} needs more: {error}") from error
         except (gym.error.Error, ImportError) as error:
             entry = gym.registry.get(env_id)
             if entry is not None and entry.entry_point is None and entry.vector_entry_point:
@@ -207,7 +208,7 @@ class EnvSpec:
                     f"its module first: 'module:{env_id}'."
                 )
             why += "" if why.endswith("?") else "."
-            raise SkillweaveError(f"no environment {short(env_id)}: {why}{advice}") from error
+            raise EnvError(f"no environment {short(env_id)}: {why}{advice}") from error
 
     def observation_names(self) -> ObsNames | None:
         """Return the names of an observation's numbers; None: they have none.
@@ -236,7 +237,7 @@ class EnvSpec:
         """``kwargs`` as a run records them.
 
         Raises:
-            SkillweaveError: one of them cannot be recorded; the message names it and proposes a
+            DeclarationError: one of them cannot be recorded; the message names it and proposes a
                 function.
         """
         found = {}
@@ -281,9 +282,7 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first:
         first: the number of the first environment, for messages.
     """
     if num_envs > MOST:
-        raise SkillweaveError(
-            f"{num_envs:,} environments of {spec.name}: at most {MOST:,} are made"
-        )
+        raise EnvError(f"{num_envs:,} environments of {spec.name}: at most {MOST:,} are made")
     if spec.engine in ("auto", "envpool"):
         reference = spec.make()
         try:
@@ -292,7 +291,7 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first:
         finally:
             reference.close()
         if spec.engine == "envpool":
-            raise SkillweaveError(
+            raise EnvError(
                 f"EnvPool cannot run {spec.name}: it is not installed (extra 'envpool'), or "
                 "lacks the environment with these spaces, settings and wrappers; use engine='auto'"
             )
@@ -342,14 +341,14 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
     """Whether the user's pool can be made here.
 
     Raises:
-        SkillweaveError: it can, but is of another environment.
+        EnvError: it can, but is of another environment.
     """
     try:
         pool = make(num_envs=1, threads=1, seed=0)
     except MissingExtra:
         return False
     if isinstance(pool, gym.vector.VectorEnv):
-        raise SkillweaveError(
+        raise EnvError(
             f"{spec.name}: pool made {short(pool)}, a VectorEnv, which steps all its environments "
             "at once; a pool must step some while the others stand still, as EnvPool does: leave "
             "out pool, and each environment is stepped by itself"
@@ -358,7 +357,7 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
         theirs, ours = getattr(pool, what), getattr(reference, what)
         alike = isinstance(theirs, type(ours)) and theirs.shape == ours.shape
         if not alike or theirs.dtype != ours.dtype:
-            raise SkillweaveError(
+            raise EnvError(
                 f"{spec.name}: its pool's {what} is {short(theirs)}, but the environment's is "
                 f"{short(ours)}; give the pool a PoolWrapper that makes them alike"
             )

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import gymnasium as gym
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 
 ObsNames: TypeAlias = Sequence[str] | Mapping[str, Sequence[str]]
@@ -33,7 +33,7 @@ def checked_obs_names(names: object, where: str) -> ObsNames | None:
     """Return the names, if they are texts in a list, or such lists by key.
 
     Raises:
-        SkillweaveError: they are something else; the message begins with ``where``.
+        DeclarationError: they are something else; the message begins with ``where``.
     """
     if names is None:
         return None
@@ -41,12 +41,12 @@ def checked_obs_names(names: object, where: str) -> ObsNames | None:
     for part in parts:
         listed = isinstance(part, Sequence) and not isinstance(part, str)
         if not listed or not all(isinstance(name, str) and name for name in part):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: obs_names is {short(names)}; it must be a list with a name for each "
                 'number of an observation, or for a Dict such lists by key: {"place": ["x", "y"]}'
             )
         if len(set(part)) < len(part):
-            raise SkillweaveError(f"{where}: obs_names has a name twice: {short(part)}")
+            raise DeclarationError(f"{where}: obs_names has a name twice: {short(part)}")
     return names  # type: ignore[return-value]
 
 

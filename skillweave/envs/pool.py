@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import gymnasium as gym
 
 from skillweave.arguments import checked_names
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import EnvError, MissingExtra
 from skillweave.messages import close_matches, short
 from skillweave.types import Array
 
@@ -124,12 +124,12 @@ def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) 
 
     Raises:
         MissingExtra: EnvPool is not installed.
-        SkillweaveError: it has no such environment (with close matches).
+        EnvError: it has no such environment (with close matches).
     """
     package = installed()
     if env_id not in (known := package.list_all_envs()):
         near = close_matches(env_id, known)
-        raise SkillweaveError(f"EnvPool has no environment {short(env_id)}.{near}")
+        raise EnvError(f"EnvPool has no environment {short(env_id)}.{near}")
     with no_precision_warnings():
         pool = package.make_gymnasium(
             env_id, num_envs=num_envs, num_threads=min(threads, num_envs), seed=seed, **kwargs

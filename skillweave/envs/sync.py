@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.infos import batched_infos
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array
 
@@ -22,7 +22,7 @@ class SyncEnvs:
         name: what messages call them.
 
     Raises:
-        SkillweaveError: they have different spaces, or are one and the same.
+        EnvError: they have different spaces, or are one and the same.
     """
 
     def __init__(self, makers: Sequence[Callable[[], gym.Env[Any, Any]]], name: str) -> None:
@@ -96,9 +96,10 @@ class SyncEnvs:
         except SkillweaveError as error:
             if not (made := len(self.envs)):
                 raise
-            raise SkillweaveError(
+            raise reworded(
+                error,
                 f"{error}. {made} could be made: if there can be no more at once, set "
-                f"num_envs={made} in each algorithm, the selector's too"
+                f"num_envs={made} in each algorithm, the selector's too",
             ) from error
 
     def _empty(self, n: int) -> Array:
@@ -110,11 +111,11 @@ class SyncEnvs:
         for number, env in enumerate(self.envs):
             for kind in ("observation_space", "action_space"):
                 if getattr(env, kind) != getattr(first, kind):
-                    raise SkillweaveError(
+                    raise EnvError(
                         f"{name}: its environments differ: the {kind} of environment {number} is "
                         f"{getattr(env, kind)}, that of environment 0 {getattr(first, kind)}"
                     )
         if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
-            raise SkillweaveError(
+            raise EnvError(
                 f"{name} gives the same environment each time; the function must make a new one"
             )

@@ -18,7 +18,7 @@ from torch import Tensor
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.evolution import growth
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.stacks import Member, copy, even_count, networks_of, spread_count
@@ -44,24 +44,24 @@ class Change:
 
 
 def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str) -> None:
-    """Raise a SkillweaveError where networks cannot be changed as asked for."""
+    """Raise a DeclarationError where networks cannot be changed as asked for."""
     if mutations.architecture == 0.0:
         return
     for name, network in networks_of(config).items():
         if isinstance(network.encoder, Named):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has an "
                 f"encoder of your own ({network.encoder}), whose architecture is its code: set it "
                 "to 0"
             )
         if network.layer_norm:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has "
                 "layer_norm, with which no unit can be added without changing the function: set "
                 "it to 0, or layer_norm=False"
             )
         if not network.hidden:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}Mutations.architecture is {mutations.architecture:g}, but {name} has no "
                 "hidden layers to change: set it to 0, or give it some"
             )
@@ -103,7 +103,7 @@ def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> lis
                     [ImageEncoder(obs, i, c, "relu").sizes for c in (cnn, other)]
                     for i in range(len(obs.images))
                 ]
-            except SkillweaveError:
+            except DeclarationError:
                 continue  # larger than what is left of the image
             if all(old == new for old, new in sizes):
                 found.append(change)

@@ -10,7 +10,7 @@ import torch
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.parameters import setting_number
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
 from skillweave.evolution.stacks import Member, Origin, copy, networks_of
@@ -82,7 +82,7 @@ def random_config(
             return replace(config, **drawn)
         except SkillweaveError:
             continue  # they do not fit together: a batch larger than a rollout
-    raise SkillweaveError("Mutations.ranges: 100 settings drawn from them did not fit together")
+    raise DeclarationError("Mutations.ranges: 100 settings drawn from them did not fit together")
 
 
 def _random_network(network: Network, by: Mutations, rng: np.random.Generator) -> Network:
@@ -99,14 +99,14 @@ def _random_network(network: Network, by: Mutations, rng: np.random.Generator) -
 
 
 def check_mutations(config: AlgorithmConfig, evolution: Evolution, where: str) -> None:
-    """Raise a SkillweaveError where a mutation does not fit the algorithm or its network."""
+    """Raise a DeclarationError where a mutation does not fit the algorithm or its network."""
     mutations = evolution.mutations
     try:
         ranges = mutations.ranges_of(config, start=evolution.start == "config")
     except SkillweaveError as error:
-        raise SkillweaveError(f"{where}{error}") from error
+        raise DeclarationError(f"{where}{error}") from error
     if mutations.hyperparameters > 0.0 and not ranges:
-        raise SkillweaveError(f"{where}Mutations.hyperparameters is positive, but ranges is empty")
+        raise DeclarationError(f"{where}Mutations.hyperparameters is positive, but ranges is empty")
     check_architecture(config, mutations, where)
 
 

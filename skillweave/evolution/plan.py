@@ -9,7 +9,7 @@ from typing import Any
 from skillweave.algorithms.config import config_from_json
 from skillweave.collecting.where import HERE, Where
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.part import too_many
@@ -26,17 +26,17 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
     """Say in a manifest's stages which are to evolve, and count all members' steps.
 
     Raises:
-        SkillweaveError: no such stage, or a mutation does not fit an agent.
+        DeclarationError: no such stage, or a mutation does not fit an agent.
     """
     for name, how in _by_stage([p["name"] for p in stages], evolve).items():
         entry = next(p for p in stages if p["name"] == name)
         if "together" in entry:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"stage {name!r}: {' and '.join(entry['learns'])} learn together there, so it "
                 "cannot evolve; name the stages that are to: evolve={'a_skill': Evolution(...)}"
             )
         if "guide_kl" in entry:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"stage {name!r}: the guide has a target_kl, and populations are not kept near a "
                 "guide; leave it out (restrict=True works), or name other stages: evolve={...}"
             )
@@ -70,7 +70,7 @@ def make_learner(stages: list[dict[str, Any]], evolve: Evolve, where: Where = HE
     ``where`` collectors run, and parts of populations.
 
     Raises:
-        SkillweaveError: ``evolve`` names a stage that is not among ``stages``.
+        DeclarationError: ``evolve`` names a stage that is not among ``stages``.
     """
     asked = _by_stage([s["name"] for s in stages], evolve)
 
@@ -90,15 +90,15 @@ def _by_stage(stages: list[str], evolve: Evolve) -> dict[str, Evolution]:
     if isinstance(evolve, Evolution):
         return dict.fromkeys(stages, evolve)
     if not isinstance(evolve, Mapping):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"evolve is {short(evolve)}; it must be an Evolution(), or one for each stage by name"
         )
     for name, how in evolve.items():
         if name not in stages:
             known = ", ".join(stages)
-            raise SkillweaveError(f"evolve: no stage {short(name)} is trained; there are: {known}")
+            raise DeclarationError(f"evolve: no stage {short(name)} is trained; there are: {known}")
         if not isinstance(how, Evolution | None):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"evolve[{name!r}] is {short(how)}; it must be an Evolution() or None"
             )
     return {name: how for name, how in evolve.items() if how is not None}

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import TrainingError
 from skillweave.evolution.config import Evolution, Tournament, Truncation
 from skillweave.types import Array
 
@@ -42,10 +42,10 @@ def select(evolution: Evolution, fitness: Array, rng: np.random.Generator) -> li
     """The next generation, by the selection asked for; nobody is heir to a diverged member.
 
     Raises:
-        SkillweaveError: all members have diverged, or a selection of the user's own is wrong.
+        TrainingError: all members have diverged, or a selection of the user's own is wrong.
     """
     if not np.isfinite(fitness).any():
-        raise SkillweaveError(
+        raise TrainingError(
             "every member has diverged: lower the learning rate, or its range; the last complete "
             "generation is saved"
         )
@@ -57,7 +57,7 @@ def select(evolution: Evolution, fitness: Array, rng: np.random.Generator) -> li
     heirs: list[Heir] = chosen.select(fitness.copy(), rng)
     right = len(heirs) == len(fitness) and all(0 <= h.parent < len(fitness) for h in heirs)
     if not right or not all(np.isfinite(fitness[h.parent]) for h in heirs):
-        raise SkillweaveError(
+        raise TrainingError(
             f"{type(chosen).__name__}.select() must return an Heir for each of the "
             f"{len(fitness)} members, none of a parent with fitness -inf; it returned {heirs}"
         )

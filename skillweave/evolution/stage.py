@@ -54,7 +54,7 @@ class EvolvingPopulation:
         where: parts of the population train, if the stage's entry says that there are several.
 
     Raises:
-        SkillweaveError: the selection is missing or wrong.
+        DeclarationError: the selection is missing or wrong.
     """
 
     schema: Any = Generation
@@ -108,7 +108,7 @@ class EvolvingPopulation:
         """Train generation after generation; the best policy, by the stage's name.
 
         Raises:
-            SkillweaveError: every member diverged.
+            TrainingError: every member diverged.
         """
         while not self.over:
             self.generation()

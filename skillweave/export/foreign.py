@@ -70,7 +70,7 @@ def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
     """A user's module; inputs and outputs as of ``agent_graph``.
 
     Raises:
-        SkillweaveError: it cannot be written as ONNX; the message begins with ``where``.
+        PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
     space, choices, noise = policy.observation_space, _choices(policy), _noise(policy, sampled)
     given = {leaf.name: leaf.example() for leaf in leaves_of(space)}

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, PolicyError
 from skillweave.ops.device import BOOL, FLOAT
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts
@@ -110,7 +110,7 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
         sampled: it draws its actions, from noise that it is given; else it is greedy.
 
     Raises:
-        SkillweaveError: it cannot be written as ONNX; the message begins with ``where``.
+        PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
     algorithm, leaves = policy.algorithm, leaves_of(policy.observation_space)
     choices = algorithm.codec.size if algorithm.codec.discrete else 0
@@ -175,7 +175,7 @@ def traced(
     """A module as an ONNX file's content.
 
     Raises:
-        SkillweaveError: an operation of it has no counterpart; the message begins with ``where``.
+        PolicyError: an operation of it has no counterpart; the message begins with ``where``.
         MissingExtra: the packages that write ONNX are not installed.
     """
     try:
@@ -190,7 +190,7 @@ def traced(
                 opset_version=OPSET, input_names=list(given), output_names=list(outputs),
             )  # fmt: skip
     except Exception as error:  # torch's own errors have no common class
-        raise SkillweaveError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
+        raise PolicyError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
     assert program is not None
     model = program.model_proto
     model.ClearField("metadata_props")

@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.calls import SkillSet
-from skillweave.errors import SkillweaveError
+from skillweave.errors import PolicyError
 from skillweave.export.foreign import file_graph, module_graph
 from skillweave.export.graphs import Graph, agent_graph, worth_graph
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -46,7 +46,7 @@ class States:
             sampled: it samples; else it is greedy.
 
         Raises:
-            SkillweaveError: it cannot be exported; the message says why, and what to do.
+            PolicyError: it cannot be exported; the message says why, and what to do.
         """
         where = f"the policy of {name!r}" if name else "the policy"
         match policy:
@@ -63,7 +63,7 @@ class States:
             case _:
                 acts = policy
         if policy.start(1):
-            raise SkillweaveError(
+            raise PolicyError(
                 f"{where} is a {type(policy).__name__}, which has a memory that nothing here can "
                 "write as ONNX: train the skill, or give it an ONNX file"
             )
@@ -90,7 +90,7 @@ class States:
         }
         if cuts is not None:
             if not isinstance(cuts.critic, AgentPolicy):
-                raise SkillweaveError(f"the critic of {prefix or 'the selector'} is not trained")
+                raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
             graph = worth_graph(cuts.critic, "the skill critic")
             told |= {"critic": self._network(graph, f"{prefix}critic"), "margin": cuts.margin}
         return told
@@ -139,7 +139,7 @@ class States:
         match selector:
             case Automaton():
                 if sampled:
-                    raise SkillweaveError(
+                    raise PolicyError(
                         f"{name} is an automaton that draws among the skills of a state, which the "
                         "runner does not: train with greedy_skills=True for the skills around it"
                     )
@@ -155,7 +155,7 @@ class States:
                 }
             case AgentPolicy():
                 return self._network(agent_graph(selector, sampled, name), name)
-        raise SkillweaveError(
+        raise PolicyError(
             f"{name} is a {getattr(selector, 'kind', type(selector).__name__)}, which the runner "
             "does not know: select by an Automaton, by a function, or train the selector"
         )

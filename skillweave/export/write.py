@@ -52,7 +52,7 @@ def write_export(path: Path, policy: Policy, env: str) -> Export:
         env: the environment's name, for who reads ``policy.json``.
 
     Raises:
-        SkillweaveError: a part of it cannot be exported; the message says which, and what to do.
+        PolicyError: a part of it cannot be exported; the message says which, and what to do.
         MissingExtra: the packages that write ONNX are not installed.
     """
     states = States(policy.action_space)

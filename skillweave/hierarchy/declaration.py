@@ -13,7 +13,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import EnvSpec, Spaces, spec_of
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.hierarchy.budgets import budgets_of, scale_budgets
 from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
 from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted_selectors
@@ -146,11 +146,11 @@ class Declaration(Nestable):
         """The skill of this ``name``, or path.
 
         Raises:
-            SkillweaveError: there is none; the message lists them.
+            DeclarationError: there is none; the message lists them.
         """
         found = dict(every_skill(self.skills))
         if not isinstance(name, str) or name not in found:
-            raise SkillweaveError(f"no skill {short(name)}; there are: {', '.join(found)}")
+            raise DeclarationError(f"no skill {short(name)}; there are: {', '.join(found)}")
         return found[name]
 
     def budgets(self) -> dict[str, int]:
@@ -199,10 +199,10 @@ class Declaration(Nestable):
         """Multiply every training budget by ``factor``, in place.
 
         Raises:
-            SkillweaveError: the factor is not positive and finite.
+            DeclarationError: the factor is not positive and finite.
         """
         if not 0.0 < factor < float("inf"):
-            raise SkillweaveError(f"scale is {factor}; it must be positive and finite")
+            raise DeclarationError(f"scale is {factor}; it must be positive and finite")
         scale_budgets(self, factor)
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> PlainAgent:
@@ -214,7 +214,7 @@ class Declaration(Nestable):
         algorithm = fitted(AlgorithmSettings | None, algorithm, "flat")
         steps = self.total_steps or self.steps
         if not steps:
-            raise SkillweaveError(
+            raise DeclarationError(
                 "nothing of this hierarchy is trained, so the flat baseline has no budget: set "
                 "steps"
             )
@@ -239,7 +239,7 @@ class Declaration(Nestable):
         """Make the environment once, and return its spaces.
 
         Raises:
-            SkillweaveError: something does not fit it.
+            DeclarationError: something does not fit it.
         """
         spaces = self.spec.read_spaces()
         obs_codec(spaces.observation)

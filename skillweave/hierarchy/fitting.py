@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def check_settings(declared: Declaration, spaces: Spaces, path: str = "") -> None:
-    """Raise a SkillweaveError where algorithms or reflexes do not fit an environment.
+    """Raise a DeclarationError where algorithms or reflexes do not fit an environment.
 
     Args:
         path: of the hierarchy, ``inner/`` for example.

@@ -11,7 +11,7 @@ import gymnasium as gym
 from skillweave.algorithms.config import PPO
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.selectors import Automaton, ReadySelector, ready_selector
 from skillweave.skills.foreign_policy import fitted, source_of
 from skillweave.training.stage import SELECTOR
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_selection(declared: Declaration) -> None:
-    """Raise a SkillweaveError where selector, guide and how they learn do not fit together."""
+    """Raise a DeclarationError where selector, guide and how they learn do not fit together."""
     if declared.ready_selector is None:
         if declared.guide is not None:
             _check_guide(declared)
@@ -34,34 +34,34 @@ def check_selection(declared: Declaration) -> None:
     }
     for what, asked in refused.items():
         if asked:
-            raise SkillweaveError(f"{what}, but the selector is ready: it does not learn")
+            raise DeclarationError(f"{what}, but the selector is ready: it does not learn")
 
 
 def _check_guide(declared: Declaration) -> None:
-    """Raise a SkillweaveError where a guide could not guide."""
+    """Raise a DeclarationError where a guide could not guide."""
     guide = declared.guide
     assert guide is not None
     ready_guide(declared)  # says which of its skills does not exist
     if guide.target_kl is not None and not isinstance(declared.selector, PPO):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"the guide's target_kl is {guide.target_kl:g}, but the selector learns by "
             f"{type(declared.selector).__name__}: only PPO can be kept near a guide"
         )
     if not guide.restrict or isinstance(guide.selector, Automaton):
         pass
     elif not isinstance(declared.call_steps, Lengths):
-        raise SkillweaveError(
+        raise DeclarationError(
             "the guide names one skill at each decision, so a selector that it restricts has "
             "nothing to choose: write Guide(..., restrict=False, target_kl=0.1), or let the "
             "selector choose lengths, or give an Automaton whose states have several skills"
         )
     elif not isinstance(declared.selector, PPO):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"a selector that learns by {type(declared.selector).__name__} asks what may be called "
             "next, which a function or a tree says only at decisions: give an Automaton, or PPO"
         )
     if guide.restrict and declared.together.interrupt:
-        raise SkillweaveError(
+        raise DeclarationError(
             "together.interrupt is True, but the guide restricts which skill may be called "
             "instead: give one of them"
         )
@@ -83,7 +83,7 @@ def fitted_guide(
         path: of the hierarchy, ``inner/`` for example.
 
     Raises:
-        SkillweaveError: it fails on them.
+        SkillError: it fails on them.
     """
     if (found := ready_guide(declared)) is None:
         return None
@@ -132,7 +132,7 @@ def adopt_guide(declared: Declaration, told: Mapping[str, Any], where: str) -> N
     """Take over from a run how a selector keeps to its guide; ``told`` is its ``guide_entry``.
 
     Raises:
-        SkillweaveError: of the run and the hierarchy one has a guide, and the other has none.
+        RunError: of the run and the hierarchy one has a guide, and the other has none.
     """
     check_guided(declared.guide is not None, "guide" in told, where)
     if declared.guide is not None:
@@ -142,10 +142,10 @@ def adopt_guide(declared: Declaration, told: Mapping[str, Any], where: str) -> N
 
 
 def check_guided(mine: bool, theirs: bool, where: str) -> None:
-    """Raise a SkillweaveError where of two selectors one has a guide and the other has none."""
+    """Raise a RunError where of two selectors one has a guide and the other has none."""
     if mine != theirs:
         has = ("no guide", "a guide")
-        raise SkillweaveError(
+        raise RunError(
             f"{where}: the selector has {has[theirs]}, but that of this hierarchy has {has[mine]}: "
             "declare guide= as it was, or train anew"
         )

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.skills import Skill
 
@@ -47,11 +47,11 @@ class Nestable:
                 with ``policy = inner`` may have methods, too: a reward, an end.
 
         Raises:
-            SkillweaveError: a skill has no such attribute.
+            DeclarationError: a skill has no such attribute.
         """
         for field in attributes:
             if field not in _ATTRIBUTES:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{self.name}.as_skill(): a skill that is a hierarchy takes no {short(field)}; "
                     f"it takes {', '.join(_ATTRIBUTES)}"
                 )
@@ -104,7 +104,7 @@ def below(found: Mapping[str, T], name: str) -> dict[str, T]:
 
 
 def check_nested(declared: Declaration) -> None:
-    """Raise a SkillweaveError where a hierarchy cannot be a skill of this one.
+    """Raise a DeclarationError where a hierarchy cannot be a skill of this one.
 
     Afterwards messages call every skill by its path.
     """
@@ -112,7 +112,7 @@ def check_nested(declared: Declaration) -> None:
     for skill, inner in inner_hierarchies(declared.skills):
         # How many processes step it is said by the outermost one, for all.
         if replace(inner.spec, workers=None) != replace(declared.spec, workers=None):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{skill.name}: this hierarchy is a skill of another one, so both act in the same "
                 f"environment; but it is declared on {_shown(inner, declared)}, and the other on "
                 f"{_shown(declared, inner)}"
@@ -122,13 +122,13 @@ def check_nested(declared: Declaration) -> None:
         if inner_of(skill) is None:
             continue
         if isinstance(getattr(type(skill), "policy", None), property):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"skill {path!r} is a hierarchy, but its policy is a property: make it a class "
                 "attribute"
             )
         for field, where in _ELSEWHERE.items():
             if getattr(skill, field) is not None:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"skill {path!r} is a hierarchy, so it has no {field} of its own: give the "
                     f"hierarchy {where}"
                 )
@@ -140,7 +140,7 @@ def _shown(one: Declaration, other: Declaration) -> str:
 
 
 def check_ends(declared: Declaration) -> None:
-    """Raise a SkillweaveError where a hierarchy contains itself."""
+    """Raise a DeclarationError where a hierarchy contains itself."""
     _check_ends((declared,), "")
 
 
@@ -148,7 +148,7 @@ def _check_ends(above: tuple[Any, ...], path: str) -> None:
     for skill, inner in inner_hierarchies(above[-1].skills):
         here = f"{path}{skill.name}"
         if any(inner is other for other in above):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{here} is a hierarchy that contains itself: it is among its own skills"
             )
         _check_ends((*above, inner), f"{here}/")

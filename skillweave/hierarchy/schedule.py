@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, SkillCritic
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
 from skillweave.hierarchy.checks import check_target
 from skillweave.hierarchy.declaration import Declaration
@@ -182,7 +182,7 @@ def _with_epsilon(config: Any, how: Together) -> Any:
     usual, falls = PPO(), ("epsilon_final", "epsilon_fraction")
     for name in falls:
         if getattr(config, name) != getattr(usual, name):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"selector.{name} is {getattr(config, name)}, but selector.epsilon is 0, and "
                 f"a selector that learns together then uses Together's: set together.{name}, or "
                 "selector.epsilon, too"

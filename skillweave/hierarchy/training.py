@@ -6,7 +6,7 @@ from typing import Any
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.collecting.lengths import calls_to_json
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.hierarchy.assembly import assembled, can_act
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import guide_entry, ready_guide
@@ -136,13 +136,13 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
     ready = _ready(declaration, run)
     found = ready | _learnt(run)
     if run.unjudged:
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path}: all is learnt, but which of the hierarchies that it could end with is "
             f"the best was not judged yet; {resume_words(run)}"
         )
     absent = [s.name for s in declaration.skills if not can_act(s, found)]
     if absent:
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path}: {', '.join(map(repr, absent))} did not learn there: declare the skills "
             "with the policies that they had when it was trained"
         )

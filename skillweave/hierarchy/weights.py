@@ -16,7 +16,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import check_guided, ready_guide
@@ -149,19 +149,19 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and header of a file of a hierarchy's weights, or of a plain agent's.
 
     Raises:
-        SkillweaveError: the file is damaged, or holds something else.
+        RunError: the file is damaged, or holds something else.
     """
     tensors, header = read_tensors(path)
     if header.get("kind") == "agent" and "algorithm" in header:
         fit(AgentHeader, header, str(path))
         if (stage := header.get("stage", AGENT)) != AGENT:
-            raise SkillweaveError(
+            raise RunError(
                 f"{path} holds the policy of stage {shown(stage)} alone; write the whole "
                 "hierarchy's weights: skillweave weights RUN"
             )
         return tensors, header
     if header.get("kind") != "hierarchy":
-        raise SkillweaveError(
+        raise RunError(
             f"{path} holds something of kind {short(header.get('kind'))}, not a hierarchy"
         )
     fit(HierarchyHeader, header, str(path))
@@ -174,14 +174,12 @@ def read_agent(
     """A plain agent from what ``open_weights`` found in ``path``.
 
     Raises:
-        SkillweaveError: the file is damaged, or belongs to another environment.
+        RunError: the file is damaged, or belongs to another environment.
     """
     if header["kind"] != "agent":
-        raise SkillweaveError(
-            f"{path} holds something of kind {short(header['kind'])}, not a plain agent"
-        )
+        raise RunError(f"{path} holds something of kind {short(header['kind'])}, not a plain agent")
     if (env := header.get("env", spec.name)) != spec.name:
-        raise SkillweaveError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
+        raise RunError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
     return AgentPolicy.from_file(tensors, header, str(path))
 
 
@@ -189,7 +187,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     """The inverse of ``write_weights``; the declaration takes over the file's call length.
 
     Raises:
-        SkillweaveError: the file is damaged, or belongs to other skills or another environment.
+        RunError: the file is damaged, or belongs to other skills or another environment.
     """
     tensors, header = open_weights(path)
     if header["kind"] == "agent":
@@ -199,7 +197,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     told = header["hierarchies"]
     if header["skills"] != names or header["env"] != declaration.spec.name or set(told) != inner:
         theirs = ", ".join(header["skills"])
-        raise SkillweaveError(
+        raise RunError(
             f"{path} is of skills {theirs[:300]} on {header['env'][:100]}, but the "
             f"hierarchy has {', '.join(names)} on {declaration.spec.name}"
         )
@@ -207,7 +205,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     def part(name: str) -> AgentPolicy:
         own = {k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(f"{name}/")}
         if name not in header["parts"]:
-            raise SkillweaveError(f"{path} holds no weights of {name!r}")
+            raise RunError(f"{path} holds no weights of {name!r}")
         return AgentPolicy.from_file(own, header["parts"][name], f"{path} ({name})")
 
     def copied(name: str) -> bytes | None:
@@ -239,7 +237,7 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
 
 
 def _check_guide(declaration: Declaration, told: dict[str, Any] | None, where: str) -> None:
-    """Raise a SkillweaveError where the selector was trained under another guide."""
+    """Raise a RunError where the selector was trained under another guide."""
     guide = _restricting(declaration)
     check_guided(guide is not None, told is not None, where)
     if guide is not None:
@@ -258,17 +256,17 @@ def adopt_calls(declaration: Declaration, told: Mapping[str, Any]) -> None:
 
 
 def check_selector(mine: bool, theirs: bool, where: str) -> None:
-    """Raise a SkillweaveError where of two selectors one is ready and the other is trained."""
+    """Raise a RunError where of two selectors one is ready and the other is trained."""
     if mine != theirs:
         kinds = ("a trained selector", "a ready one (a function, an automaton or a tree)")
-        raise SkillweaveError(
+        raise RunError(
             f"{where} has {kinds[theirs]}, but this hierarchy has {kinds[mine]}: declare the "
             "selector as it was, or train anew"
         )
 
 
 def check_parts(declaration: Declaration, policy: HierarchyPolicy, where: str) -> None:
-    """Raise a SkillweaveError where a policy is not of the spaces that its place asks for.
+    """Raise a RunError where a policy is not of the spaces that its place asks for.
 
     Selectors choose among their skills; skills all see and do what the first of them does.
     """
@@ -295,7 +293,7 @@ def _check_parts(
         for kind, space in spaces.items():
             found = getattr(own, kind)
             if not same_space(found, space):
-                raise SkillweaveError(
+                raise RunError(
                     f"{where}: the policy in the place of {path + name!r} has {kind} "
                     f"{shown(found)}, but {shown(space)} belongs there"
                 )

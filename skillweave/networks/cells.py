@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.networks.encoders import Inputs
 from skillweave.networks.stacked import Views, orthogonal_
 from skillweave.ops.device import FLOAT, Constant
@@ -85,7 +85,7 @@ class CellsEncoder:
 
     def __init__(self, obs: ObsCodec) -> None:
         if not obs.images:
-            raise SkillweaveError(
+            raise DeclarationError(
                 'Network(encoder="cells") reads images of whole numbers, but the observations have '
                 "none"
             )

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.named import Named, known_names
 from skillweave.networks.config import CNN, Activation
 from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
@@ -67,7 +67,7 @@ def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
     """A registered encoder, or one of a module of the user, on one observation space.
 
     Raises:
-        SkillweaveError: it was not registered, or is a function that was not given.
+        DeclarationError: it was not registered, or is a function that was not given.
     """
     if isinstance(name, Named):
         from skillweave.networks.own import ModuleEncoder
@@ -78,13 +78,13 @@ def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
 
         return CellsEncoder(obs)
     if name not in _REGISTERED and ":" in name:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"Network.encoder is {name!r}, a function of your own, and its code is not loaded: "
             "load it by the declaration that has it, hierarchy.load(run), or on the command line "
             f"by --recipe FILE.py (functions that are loaded: {known_names()})"
         )
     if name not in _REGISTERED:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"Network.encoder is {name!r}, which is not registered: call "
             f"skillweave.register_encoder({name!r}, ...) before (registered: "
             f"{', '.join(_REGISTERED) or 'none'})"
@@ -113,7 +113,7 @@ class ImageEncoder:
             layers = zip(self.cnn.channels, self.cnn.kernels, self.cnn.strides, strict=True)
             for i, (out, kernel, stride) in enumerate(layers):
                 if min(height, width) < kernel:
-                    raise SkillweaveError(
+                    raise DeclarationError(
                         f"Network.cnn does not fit images of {obs.images[index]} (channels, "
                         f"height, width): layer {i} has a kernel of {kernel} pixels, but only "
                         f"{height}×{width} are left; leave out cnn, which is then CNN.small() or "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
 from skillweave.networks.recurrent import (
@@ -150,11 +150,11 @@ def _places(sees: tuple[int, ...], size: int) -> Tensor:
     """Places of an observation of so many numbers.
 
     Raises:
-        SkillweaveError: there are fewer numbers.
+        DeclarationError: there are fewer numbers.
     """
     if max(sees) >= size:
         there = "has no number beside its images" if not size else f"has {size} (0 to {size - 1})"
-        raise SkillweaveError(
+        raise DeclarationError(
             f"Network.sees names the number {max(sees)} of an observation, but it {there}"
         )
     return torch.tensor(sees, **INT)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.messages import short, told
 from skillweave.named import Named
 from skillweave.networks.encoders import Inputs
@@ -44,7 +44,7 @@ class ModuleEncoder:
         factory: makes the module, given the space of what ``forward`` gets.
 
     Raises:
-        SkillweaveError: the factory or the module raised, or the module does not return finite
+        DeclarationError: the factory or the module raised, or the module does not return finite
             features (B, F), or it changes its buffers, or its output is not a function of one
             observation.
     """
@@ -61,7 +61,7 @@ class ModuleEncoder:
             if not value.requires_grad:
                 continue
             if value.dtype != torch.float32:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{self._who}: its parameter {name} holds {value.dtype}; it must hold "
                     "torch.float32"
                 )
@@ -114,12 +114,12 @@ class ModuleEncoder:
             except SkillweaveError:
                 raise
             except (Exception, SystemExit) as error:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{self._who} raised {told(error)} when it was called with the observation "
                     f"space {short(self.space, 200)}"
                 ) from error
             if not isinstance(module, nn.Module):
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{self._who} returned {short(module)}; it must return a torch.nn.Module whose "
                     "forward turns observations into features"
                 )
@@ -137,7 +137,7 @@ class ModuleEncoder:
                 return module(_nested(self._obs.space, iter(examples)))
         except (Exception, SystemExit) as error:
             shapes = ", ".join(str(tuple(leaf.shape)) for leaf in examples)
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: forward raised {told(error)} for observations of shape {shapes}"
             ) from error
 
@@ -146,7 +146,7 @@ class ModuleEncoder:
         other = _constants(self._made(1))
         for name, value in _constants(self._template).items():
             if name not in other or not torch.equal(value, other[name]):
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{self._who}: {name} is another one each time the module is made, and only "
                     "trainable parameters are saved: make it trainable, or set it to fixed values"
                 )
@@ -157,40 +157,40 @@ class ModuleEncoder:
         before = {k: v.clone() for k, v in _constants(module).items()}
         found = self._run(module, ROWS)
         if not isinstance(found, Tensor):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: forward returned {short(found)}; it must return one tensor of "
                 "features (B, F)"
             )
         if found.ndim != 2 or len(found) != ROWS or not found.shape[1]:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: forward returned shape {tuple(found.shape)} for {ROWS} "
                 f"observations; it must return features (B, F), here ({ROWS}, F)"
             )
         if found.dtype != torch.float32:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: forward returned {found.dtype}; it must return torch.float32"
             )
         if not bool(found.isfinite().all()):
-            raise SkillweaveError(f"{self._who}: forward returned NaN or infinity")
+            raise DeclarationError(f"{self._who}: forward returned NaN or infinity")
         after = _constants(module)
         if changed := [k for k in before if not torch.equal(before[k], after[k])]:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: forward changes the buffer {changed[0]}, which is not saved "
                 "(BatchNorm does that); use LayerNorm or GroupNorm"
             )
         again = self._run(module, ROWS)
         if not torch.allclose(found, again, **_CLOSE):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: forward returned other features for the same observations (Dropout "
                 "does that); the same observation must have the same features"
             )
         if not torch.allclose(found, self._run(module.eval(), ROWS), **_CLOSE):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: forward returns other features in evaluation mode (Dropout and "
                 "BatchNorm do that); it must be the same function while it learns and acts"
             )
         if not torch.allclose(found[:1], self._run(module, 1), **_CLOSE):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{self._who}: the features of an observation depend on the other observations of "
                 "the batch (BatchNorm does that); use LayerNorm or GroupNorm"
             )

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 
 FLOAT: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
 INT: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
@@ -26,13 +26,13 @@ def resolve_device(name: str) -> torch.device:
     """The device of this name; "auto" is a GPU where there is one, else the CPU.
 
     Raises:
-        SkillweaveError: the name is unknown, or PyTorch finds no such device here.
+        DeclarationError: the name is unknown, or PyTorch finds no such device here.
     """
     if name not in DEVICES:
-        raise SkillweaveError(f"device is {name!r}; it must be one of {', '.join(DEVICES)}")
+        raise DeclarationError(f"device is {name!r}; it must be one of {', '.join(DEVICES)}")
     there = torch.cuda.is_available()
     if name == "cuda" and not there:
-        raise SkillweaveError(
+        raise DeclarationError(
             f"device is 'cuda', but torch {torch.__version__} finds no CUDA device here; "
             "use 'cpu', or 'auto', which takes a GPU only where there is one"
         )

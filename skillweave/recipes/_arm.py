@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, EnvSpec, SkillweaveError
+from skillweave import Array, EnvSpec, MissingExtra
 
 NEAR = 0.05
 """Metres from the goal at which the block is there, as Gymnasium-Robotics has it."""
@@ -141,15 +141,13 @@ def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> g
     """The arm, with or without disturbances.
 
     Raises:
-        SkillweaveError: gymnasium-robotics is missing.
+        MissingExtra: gymnasium-robotics is missing.
     """
     try:
         import gymnasium_robotics
         import mujoco  # noqa: F401
     except ImportError as error:
-        raise SkillweaveError(
-            "the robot's arm needs the extra 'robotics': pip install 'skillweave[robotics]'"
-        ) from error
+        raise MissingExtra("the robot's arm", "robotics") from error
     gym.register_envs(gymnasium_robotics)
     arm = gym.make(
         "FetchPickAndPlace-v4",

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
+from skillweave import Array, DeclarationError, EnvSpec, MissingExtra, PoolWrapper, envpool
 
 ROUND = 1000.0
 """What a finished round pays."""
@@ -28,14 +28,14 @@ class Route:
         points: two or three, in metres; each differs from the one before.
 
     Raises:
-        SkillweaveError: there are too few or too many points, or one is followed by itself.
+        DeclarationError: there are too few or too many points, or one is followed by itself.
     """
 
     def __init__(self, points: tuple[float, ...]) -> None:
         self.points = np.array(points)
         self.ways = np.sign(np.subtract(points, np.roll(points, 1)))
         if not 2 <= len(points) <= LEGS or not self.ways.all():
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"a patrol has 2 to {LEGS} points, each other than the one before, not {points}"
             )
 
@@ -143,14 +143,12 @@ def make(
     """The half-cheetah with this patrol.
 
     Raises:
-        SkillweaveError: mujoco is missing.
+        MissingExtra: mujoco is missing.
     """
     try:
         import mujoco  # noqa: F401
     except ImportError as error:
-        raise SkillweaveError(
-            "the half-cheetah needs the extra 'mujoco': pip install 'skillweave[mujoco]'"
-        ) from error
+        raise MissingExtra("the half-cheetah", "mujoco") from error
     cheetah = gym.make(
         "HalfCheetah-v5",
         **WITH_X,

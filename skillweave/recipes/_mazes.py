@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
+from skillweave import Array, DeclarationError, EnvSpec, MissingExtra, PoolWrapper, envpool
 
 MAZES = {
     "large": "PointMaze_Large-v3",
@@ -97,15 +97,13 @@ def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, An
     """One ball in a maze; 1 is paid where it reaches its goal, and the episode ends.
 
     Raises:
-        SkillweaveError: gymnasium-robotics is missing.
+        MissingExtra: gymnasium-robotics is missing.
     """
     try:
         import gymnasium_robotics
         import mujoco  # noqa: F401
     except ImportError as error:
-        raise SkillweaveError(
-            "PointMaze needs the extra 'robotics': pip install 'skillweave[robotics]'"
-        ) from error
+        raise MissingExtra("PointMaze", "robotics") from error
     gym.register_envs(gymnasium_robotics)
     return Maze(gym.make(MAZES[maze], disable_env_checker=True, **ENDS), render_mode)
 
@@ -119,10 +117,10 @@ def spec(maze: str = "large") -> EnvSpec:
     """The maze of this name, for ``Hierarchy(env=...)``.
 
     Raises:
-        SkillweaveError: there is none of this name.
+        DeclarationError: there is none of this name.
     """
     if maze not in MAZES:
-        raise SkillweaveError(f"no maze {maze!r}; there are: {', '.join(MAZES)}")
+        raise DeclarationError(f"no maze {maze!r}; there are: {', '.join(MAZES)}")
 
     def ball(render_mode: str | None = None) -> gym.Env[Any, Any]:
         return make(maze, render_mode)
@@ -144,7 +142,7 @@ class ShortestPath:
         maze: its name.
 
     Raises:
-        SkillweaveError: gymnasium-robotics is missing.
+        MissingExtra: gymnasium-robotics is missing.
     """
 
     def __init__(self, maze: str) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, EnvSpec, PoolWrapper, SkillweaveError, envpool
+from skillweave import Array, DeclarationError, EnvSpec, PoolWrapper, envpool
 
 LANDER = "LunarLander-v3"
 EPISODE = 1000
@@ -47,14 +47,14 @@ class Progress:
         gusts: in a gust the engine on one side fires, whatever the pilot wants.
 
     Raises:
-        SkillweaveError: a mission has too few or too many legs, or one that there is not.
+        DeclarationError: a mission has too few or too many legs, or one that there is not.
     """
 
     def __init__(self, num_envs: int, missions: Sequence[Sequence[str]], gusts: bool) -> None:
         for mission in missions:
             unknown = [leg for leg in mission if leg not in KINDS]
             if unknown or not 1 <= len(mission) <= LEGS:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"a mission has 1 to {LEGS} legs of {', '.join(KINDS)}, not {tuple(mission)}"
                 )
         rows = [[KINDS.index(leg) for leg in m] + [-1] * (LEGS - len(m)) for m in missions]

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, EnvSpec, SkillweaveError, envpool
+from skillweave import Array, DeclarationError, EnvSpec, MissingExtra, envpool
 
 SMALL = (
     "DoorKey-8x8",
@@ -132,16 +132,14 @@ class Rooms(gym.Env[Any, Any]):
         render_mode: of MiniGrid.
 
     Raises:
-        SkillweaveError: MiniGrid is missing.
+        MissingExtra: MiniGrid is missing.
     """
 
     def __init__(self, rooms: Sequence[str], render_mode: str | None = None) -> None:
         try:
             import minigrid  # noqa: F401, it registers the environments
         except ImportError as error:
-            raise SkillweaveError(
-                "keys-and-doors needs MiniGrid: pip install 'skillweave[minigrid]'"
-            ) from error
+            raise MissingExtra("keys-and-doors", "minigrid") from error
         with warnings.catch_warnings():
             # Of some rooms there is a later version, but not in EnvPool.
             warnings.filterwarnings("ignore", message=".*is out of date.*")
@@ -223,10 +221,10 @@ def spec(name: str = "small") -> EnvSpec:
     """The rooms of this name, for ``Hierarchy(env=...)``.
 
     Raises:
-        SkillweaveError: there are none of this name.
+        DeclarationError: there are none of this name.
     """
     if name not in ROOMS:
-        raise SkillweaveError(f"no rooms {name!r}; there are: {', '.join(ROOMS)}")
+        raise DeclarationError(f"no rooms {name!r}; there are: {', '.join(ROOMS)}")
     rooms = ROOMS[name]
 
     def one(render_mode: str | None = None) -> gym.Env[Any, Any]:

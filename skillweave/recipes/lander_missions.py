@@ -25,11 +25,11 @@ from skillweave import (
     PPO,
     Apart,
     Array,
+    DeclarationError,
     Hierarchy,
     Network,
     Selection,
     Skill,
-    SkillweaveError,
     Step,
     TrainDefaults,
 )
@@ -200,10 +200,10 @@ def environment(mission: str = "any", gusts: bool = False) -> Any:
     """The landers with a mission, by its name.
 
     Raises:
-        SkillweaveError: there is none of this name.
+        DeclarationError: there is none of this name.
     """
     if mission not in MISSIONS:
-        raise SkillweaveError(f"no mission {mission!r}; there are: {', '.join(MISSIONS)}")
+        raise DeclarationError(f"no mission {mission!r}; there are: {', '.join(MISSIONS)}")
     return spec(mission + (" in gusts" if gusts else ""), MISSIONS[mission], gusts)
 
 

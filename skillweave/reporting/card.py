@@ -29,7 +29,7 @@ def write_card(
         films, figures: files that lie there beside the card.
 
     Raises:
-        SkillweaveError: a file of the run is damaged.
+        RunError: a file of the run is damaged.
     """
     run, saved = RunDirectory(run.path, public(run.manifest)), load_evaluation(run)
     parts = [

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.groups import grouped
@@ -104,16 +104,16 @@ def plot_curves(
         The files, the lines that are in them, and a sentence for the caption.
 
     Raises:
-        SkillweaveError: there is no such metric, the runs have no steps in common, or the files
-            cannot be written.
+        DeclarationError: there is no such metric, or an argument is out of its range.
+        RunError: the runs have no steps in common, or the files cannot be written.
         MissingExtra: the extra 'plot' is not installed.
     """
     out = as_path(out, "out")
     if band not in get_args(Band):
-        raise SkillweaveError(f"band is {short(band)}; it must be one of {', '.join(BANDS)}")
+        raise DeclarationError(f"band is {short(band)}; it must be one of {', '.join(BANDS)}")
     for name, size in (("width", width), ("height", height)):
         if size is not None and not (isinstance(size, int | float) and 1 <= size <= 40):
-            raise SkillweaveError(f"{name} is {short(size)}; it must be from 1 to 40 inches")
+            raise DeclarationError(f"{name} is {short(size)}; it must be from 1 to 40 inches")
     must_be_own(out.parent)
     groups = _groups(runs)
     groups = _renamed(groups, labels) if labels is not None else groups
@@ -142,7 +142,7 @@ def _renamed(
 ) -> dict[str, list[RunDirectory]]:
     names = [labels] if isinstance(labels, str) else list(labels)
     if len(names) != len(groups) or len(set(names)) < len(names):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{len(names)} labels for {len(groups)} lines; give each line a name of its own, in "
             f"this order: {'; '.join(groups)}"
         )
@@ -160,10 +160,10 @@ def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None)
             whose = "the whole policy" if agent is None else repr(agent)
             if not own:
                 agents = ", ".join(dict.fromkeys(c.agent for c in read_curves(run))) or "none yet"
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{run.path} has no metrics of {whose}; there are metrics of: {agents}"
                 )
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{run.path} has no metric {short(metric)} of {whose}."
                 f"{close_matches(metric, own) or ' There are: ' + ', '.join(sorted(own))}"
             )
@@ -200,7 +200,7 @@ def _line(
     curves = [_curves_of(run, agent)[metric] for run in runs]
     gridded = on_one_grid(curves)
     if gridded is None:
-        raise SkillweaveError(f"the runs of {label!r} have no steps in common: train them as long")
+        raise RunError(f"the runs of {label!r} have no steps in common: train them as long")
     steps, values = gridded
     low = high = None
     if len(runs) > 1 and band != "none":
@@ -281,7 +281,7 @@ def _save(figure: Any, out: Path) -> tuple[Path, ...]:
         figure.savefig(paths[0], dpi=DPI)
         figure.savefig(paths[1], metadata={"Date": None})
     except OSError as error:
-        raise SkillweaveError(f"could not write {stem}: {error.strerror}") from error
+        raise RunError(f"could not write {stem}: {error.strerror}") from error
     return paths
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.runs.directory import RunDirectory
 
 
@@ -57,7 +57,7 @@ def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
     """The lineage of a stage, or None where nothing evolved in it.
 
     Raises:
-        SkillweaveError: the file is damaged.
+        RunError: the file is damaged.
     """
     names, born = [f.name for f in fields(Born)], {}
     sorts: dict[str, str] = {}
@@ -67,7 +67,7 @@ def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
             own = {k: _sort(v) for k, v in each.settings.items()}
             sorts = sorts or own
             if own != sorts:
-                raise SkillweaveError(
+                raise RunError(
                     f"{run.lineage.path} is damaged: the settings of member {each.member} in "
                     f"generation {each.generation} are not of the sorts of those before"
                 )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, RunError
 from skillweave.reporting.lineage import Born, Lineage, read_lineage
 from skillweave.reporting.palette import color_of
 from skillweave.runs.directory import RunDirectory, file_name
@@ -27,7 +27,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
         out: a directory; None: ``plots`` in the run.
 
     Raises:
-        SkillweaveError: nothing was trained yet, or matplotlib is missing.
+        RunError: nothing was trained yet, or matplotlib is missing.
     """
     try:
         from matplotlib.figure import Figure
@@ -52,7 +52,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     if not written:
         lines = run.path / "metrics.jsonl"
         why = "no episode has ended" if lines.exists() else f"there is no {lines}"
-        raise SkillweaveError(f"{run.path} holds nothing to draw: {why}")
+        raise RunError(f"{run.path} holds nothing to draw: {why}")
     return written
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.messages import told, whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
@@ -63,7 +63,7 @@ def render_policy(
         was ``cut`` before its end and, as ``skills``, how many steps each acted.
 
     Raises:
-        SkillweaveError: the environment gives no frames; see VideoWriter for more.
+        EnvError: the environment gives no frames; see VideoWriter for more.
         MissingExtra: the extra 'video' is not installed.
     """
     episodes, every = whole_number(episodes, "episodes", 1), whole_number(every, "every", 1)
@@ -136,10 +136,10 @@ def frame_of(env: gym.Env[Any, Any]) -> Array:
     try:
         frame: Any = env.render()
     except (Exception, SystemExit) as error:
-        raise SkillweaveError(
+        raise EnvError(
             f"{name} cannot be filmed: its render() raised {told(error)}.{hint(error)}"
         ) from error
     if not isinstance(frame, np.ndarray):
-        raise SkillweaveError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")
+        raise EnvError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")
     factor = -(-frame.shape[1] // MAX_WIDTH)
     return frame if factor == 1 else np.asarray(extra("PIL.Image").fromarray(frame).reduce(factor))

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, EnvError, MissingExtra, RunError
 from skillweave.reporting.palette import OWN_COLORS
 from skillweave.types import Array
 
@@ -29,7 +29,9 @@ class VideoWriter:
         most_bits: of an MP4, at most so many bits per second; None: as many as it takes.
 
     Raises:
-        SkillweaveError: another suffix, frames of unlike sizes, or no frame at all.
+        DeclarationError: the path has another suffix.
+        EnvError: frames are of unlike sizes.
+        RunError: there is no frame at all, or the file cannot be written.
         MissingExtra: the library for this kind of file is not installed.
     """
 
@@ -39,7 +41,7 @@ class VideoWriter:
         kinds = {".gif": _Gif, ".mp4": partial(_Mp4, most_bits=most_bits)}
         kind = kinds.get(self.path.suffix.lower())
         if kind is None:
-            raise SkillweaveError(f"cannot write a video to {path}: it must end in .gif or .mp4")
+            raise DeclarationError(f"cannot write a video to {path}: it must end in .gif or .mp4")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder, since renaming works only within a file system, and with the suffix
         # last, since ffmpeg goes by it.
@@ -50,9 +52,9 @@ class VideoWriter:
     def add(self, frame: Array, seconds: float | None = None) -> None:
         """Append a frame (H, W, 3) uint8 that stands for ``seconds``, by default 1 / fps."""
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
-            raise SkillweaveError(f"a frame is (H, W, 3) uint8, not {frame.shape} {frame.dtype}")
+            raise EnvError(f"a frame is (H, W, 3) uint8, not {frame.shape} {frame.dtype}")
         if frame.shape != (self._shape or frame.shape):
-            raise SkillweaveError(f"the frames' size changed from {self._shape} to {frame.shape}")
+            raise EnvError(f"the frames' size changed from {self._shape} to {frame.shape}")
         self._shape = frame.shape
         self._sink.add(frame, seconds)
         self.frames += 1
@@ -64,7 +66,7 @@ class VideoWriter:
         try:
             self._sink.close(complete=kind is None)
             if kind is None and not self.frames:
-                raise SkillweaveError(f"no frames were given for {self.path}")
+                raise RunError(f"no frames were given for {self.path}")
             if kind is None:
                 os.replace(self._part, self.path)
         finally:
@@ -101,7 +103,7 @@ class _Mp4:
         process, self._process = self._process, None
         complaint = process.communicate()[1] if process else b""
         if complete and process and process.returncode:
-            raise SkillweaveError(f"ffmpeg could not write {self._path}: {complaint.decode()}")
+            raise RunError(f"ffmpeg could not write {self._path}: {complaint.decode()}")
 
 
 class _Gif:

@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.reading import fit
 from skillweave.runs.files import move, read_header, read_tensors, remove, write_tensors
 
@@ -26,7 +26,7 @@ class Checkpoints:
         """Write the latest; the one that was becomes the one before.
 
         Raises:
-            SkillweaveError: the disk is full or cannot be written; there still is a whole one.
+            RunError: the disk is full or cannot be written; there still is a whole one.
         """
         fresh, latest, before = self._files
         write_tensors(fresh, tensors, header, make_directories=False)
@@ -49,7 +49,7 @@ class Checkpoints:
             check: given a header and its file, raises where they do not belong here.
 
         Raises:
-            SkillweaveError: there are some of this stage, but none is good.
+            RunError: there are some of this stage, but none is good.
         """
         problems = []
         for path in self._files[1:]:
@@ -64,7 +64,7 @@ class Checkpoints:
             except SkillweaveError as error:
                 problems.append(str(error))
         if problems:
-            raise SkillweaveError(
+            raise RunError(
                 "; ".join(problems) + f". Delete it to train the stage {stage!r} from its start"
             )
         return None
@@ -73,7 +73,7 @@ class Checkpoints:
         """The header of the one that a resumed run goes on from; empty where there is none."""
         fresh, latest, before = self._files
         for path in (latest, fresh, before):  # as ``clear`` and ``load`` take them
-            with suppress(SkillweaveError):
+            with suppress(RunError):
                 return read_header(path)
         return {}
 
@@ -85,7 +85,7 @@ class Checkpoints:
         """Move the latest to ``path``, if there is one, and remove the others.
 
         Raises:
-            SkillweaveError: it cannot be moved, or the others cannot be removed.
+            RunError: it cannot be moved, or the others cannot be removed.
         """
         if self._files[1].exists():
             move(self._files[1], path)
@@ -111,7 +111,7 @@ class Checkpoints:
             move(fresh, latest)
         remove(fresh)
         for path in self._files:
-            with suppress(SkillweaveError):  # a damaged one is told when it is needed
+            with suppress(RunError):  # a damaged one is told when it is needed
                 if path.exists() and read_header(path).get("stage") in done:
                     read_tensors(path)  # not on the word of a damaged header
                     remove(path)

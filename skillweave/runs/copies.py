@@ -26,7 +26,7 @@ def recorded_policy(run: RunDirectory, skill: str, policy: Policy) -> Policy:
     """A skill's ready policy as it was when the run began.
 
     Raises:
-        SkillweaveError: the policy is another one, and the run holds no copy of its own.
+        RunError: the policy is another one, and the run holds no copy of its own.
     """
     entry: dict[str, Any] = next((s for s in run.manifest["skills"] if s["name"] == skill), {})
 

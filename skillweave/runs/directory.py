@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy, state_from
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import absolute
 from skillweave.reading import fit, shown
 from skillweave.runs.checkpoints import Checkpoints
@@ -71,12 +71,12 @@ MORE = 14
 
 
 def _check_file_names(manifest: Mapping[str, Any]) -> None:
-    """Raise a SkillweaveError where the name of a policy's file would be too long."""
+    """Raise a DeclarationError where the name of a policy's file would be too long."""
     for entry in manifest["stages"]:
         for name in (entry["name"], *entry["learns"]):
             file = _policy_file(entry["name"], name)
             if len(file) + MORE > LONGEST_NAME:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"the weights of {shown(name, 100)} would be in a file whose name has "
                     f"{len(file)} letters, and file systems take {LONGEST_NAME - MORE}; give "
                     "skills on the way to it shorter names"
@@ -134,18 +134,18 @@ class RunDirectory:
             hold: keep the run locked, to train it; ``close`` releases it.
 
         Raises:
-            SkillweaveError: the directory holds a run that has learnt something or that another
+            RunError: the directory holds a run that has learnt something or that another
                 process trains, or other files.
         """
         path = absolute(path)
         _check_file_names(manifest)
         if path.is_file():
-            raise SkillweaveError(f"{path} exists and is not an empty directory; choose another")
+            raise RunError(f"{path} exists and is not an empty directory; choose another")
         made = not path.exists()
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise SkillweaveError(f"could not make {path}: {error.strerror}") from error
+            raise RunError(f"could not make {path}: {error.strerror}") from error
         before = cls.open(path) if os.path.lexists(path / "run.json") else None
         if before is not None:
             check_no_links(path)
@@ -178,7 +178,7 @@ class RunDirectory:
     def _clear_dead(cls, path: Path, lock: Lock) -> None:
         """Remove a run that has not learnt anything; it is locked."""
         if not lock.exclusive:
-            raise SkillweaveError(
+            raise RunError(
                 f"{path} holds a run that has not learnt anything yet, and this system cannot say "
                 "whether a process uses it. Delete it if none does, or choose another directory"
             )
@@ -192,11 +192,11 @@ class RunDirectory:
         """An existing run, to read or to train.
 
         Raises:
-            SkillweaveError: there is none, or it is damaged or newer than this Skillweave.
+            RunError: there is none, or it is damaged or newer than this Skillweave.
         """
         path = Path(path)
         if not os.path.lexists(path / "run.json"):
-            raise SkillweaveError(f"{path} holds no run: there is no {path / 'run.json'}")
+            raise RunError(f"{path} holds no run: there is no {path / 'run.json'}")
         return cls(path, read_manifest(path))
 
     def begin(self, *, finished: bool = False) -> None:
@@ -206,7 +206,7 @@ class RunDirectory:
             finished: also if it is finished, to train it for longer.
 
         Raises:
-            SkillweaveError: another process trains it, it cannot be written, or it holds links.
+            RunError: another process trains it, it cannot be written, or it holds links.
         """
         if self._lock is not None or (self.finished and not finished):
             return
@@ -247,7 +247,7 @@ class RunDirectory:
             if entry["name"] == name:
                 return entry
         names = ", ".join(entry["name"] for entry in entries)
-        raise SkillweaveError(f"{self.path} has no stage {shown(name)}; it has: {names}")
+        raise RunError(f"{self.path} has no stage {shown(name)}; it has: {names}")
 
     @property
     def finished(self) -> bool:
@@ -337,7 +337,7 @@ class RunDirectory:
             schema: of the header.
 
         Raises:
-            SkillweaveError: checkpoints of this stage exist, but none is good.
+            RunError: checkpoints of this stage exist, but none is good.
         """
         found = self._checkpoints.load(stage, schema, self.must_be_ours)
         if found is None and (final := self._final(stage, schema)) is not None:
@@ -352,7 +352,7 @@ class RunDirectory:
         names = set() if kind is None else {f.name for f in fields(kind)}  # type: ignore[arg-type]
         if names != set(tensors):
             what = "finish the run with the version that began it, or delete the file to begin anew"
-            raise SkillweaveError(f"{path} does not hold what this Skillweave resumes from: {what}")
+            raise RunError(f"{path} does not hold what this Skillweave resumes from: {what}")
         if like is not None:
             return state_from(tensors, like, str(path)), header, extra
         return None if kind is None else kind(**tensors), header, extra
@@ -367,7 +367,7 @@ class RunDirectory:
         tensors, header = read_tensors(path)
         fit(schema, header, str(path))
         if header["stage"] != stage:
-            raise SkillweaveError(f"{path} holds the state of stage {shown(header['stage'])}")
+            raise RunError(f"{path} holds the state of stage {shown(header['stage'])}")
         self.must_be_ours(header, path)
         entry = self.stage(stage)
         if header["steps"] == (entry.get("continued") or [None])[-1]:
@@ -380,7 +380,7 @@ class RunDirectory:
         """Return the names of the tensors of a stage's final state; none if there is no such state.
 
         Raises:
-            SkillweaveError: the file is damaged, or belongs elsewhere.
+            RunError: the file is damaged, or belongs elsewhere.
         """
         found = self._final(stage, Checkpoint)
         return [] if found is None else list(found[0])
@@ -406,10 +406,10 @@ class RunDirectory:
         return {"stage": stage} | ({} if run is None else {"run": run})
 
     def must_be_ours(self, header: Mapping[str, Any], path: Path) -> None:
-        """Raise a SkillweaveError where a file's header names another run."""
+        """Raise a RunError where a file's header names another run."""
         run = self.manifest.get("id")
         if header.get("run", run) != run:
-            raise SkillweaveError(f"{path} belongs to another run")
+            raise RunError(f"{path} belongs to another run")
 
     def load_policies(self, stage: str) -> dict[str, AgentPolicy]:
         """By name, who learnt in a finished stage; errors are those of ``load_policy``."""
@@ -421,20 +421,20 @@ class RunDirectory:
         """The policy of a finished stage, or of one who learnt in it.
 
         Raises:
-            SkillweaveError: the stage is not finished, or its file is damaged.
+            RunError: the stage is not finished, or its file is damaged.
         """
         entry = self.stage(stage)
         if entry["status"] != "done":
-            raise SkillweaveError(
+            raise RunError(
                 f"{self.path} is not finished: its stage {stage!r} is not done "
                 f"({saved_words(self)}). Continue it: {resume_words(self)}"
             )
         path = self.policy_path(stage, name)
         tensors, header, sha256 = read_signed(path)
         if header.get("kind") != "agent":
-            raise SkillweaveError(f"{path} holds no agent's policy")
+            raise RunError(f"{path} holds no agent's policy")
         if header.get("stage", stage) != stage:
-            raise SkillweaveError(f"{path} holds the policy of stage {shown(header['stage'])}")
+            raise RunError(f"{path} holds the policy of stage {shown(header['stage'])}")
         self.must_be_ours(header, path)
         known = entry.get("policies", {}).get(name, entry.get("sha256", sha256))
         check_unchanged(path, sha256, known)

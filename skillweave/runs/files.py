@@ -16,7 +16,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.reading import check_file, parse_json, read_file, shown
 
 SCHEMA = 1
@@ -32,7 +32,7 @@ def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> No
     """Replace ``path`` by ``data``, or leave it exactly as it was.
 
     Raises:
-        SkillweaveError: the disk is full or cannot be written; what was there is intact.
+        RunError: the disk is full or cannot be written; what was there is intact.
     """
     temporary = ""
     try:
@@ -60,7 +60,7 @@ def move(source: Path, target: Path) -> None:
     """Give a file another name, in place of what has that name.
 
     Raises:
-        SkillweaveError: the disk is full or cannot be written; both are as they were.
+        RunError: the disk is full or cannot be written; both are as they were.
     """
     try:
         os.replace(source, target)
@@ -73,32 +73,32 @@ def make_directory(path: Path) -> None:
     """Make a directory in one that is there.
 
     Raises:
-        SkillweaveError: it cannot be made.
+        RunError: it cannot be made.
     """
     try:
         path.mkdir(exist_ok=True)
     except OSError as error:
-        raise SkillweaveError(f"could not make {path}: {error.strerror}") from error
+        raise RunError(f"could not make {path}: {error.strerror}") from error
 
 
 def remove(path: Path) -> None:
     """Delete a file, if it is there.
 
     Raises:
-        SkillweaveError: it cannot be deleted.
+        RunError: it cannot be deleted.
     """
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
-        raise SkillweaveError(f"could not delete {path}: {error.strerror or error}") from error
+        raise RunError(f"could not delete {path}: {error.strerror or error}") from error
 
 
-def _unwritten(path: Path, error: OSError) -> SkillweaveError:
+def _unwritten(path: Path, error: OSError) -> RunError:
     if isinstance(error, FileNotFoundError):
-        return SkillweaveError(
+        return RunError(
             f"could not write {path}: its directory is not there any more; was it deleted or moved?"
         )
-    return SkillweaveError(
+    return RunError(
         f"could not write {path}: {error.strerror or error}. What was saved before is intact"
     )
 
@@ -153,17 +153,17 @@ def read_json(
         check: looks at the content before the checksum does, for an error that says more.
 
     Raises:
-        SkillweaveError: missing, damaged, altered, no plain file, or of a newer schema.
+        RunError: missing, damaged, altered, no plain file, or of a newer schema.
     """
     data = parse_json(read_file(path, LARGEST_JSON), path)
     if not isinstance(data, dict):
-        raise SkillweaveError(f"{path} is damaged: not a JSON object")
+        raise RunError(f"{path} is damaged: not a JSON object")
     check_schema(data, path)
     if check is not None:
         check(data)
     found = data.pop("sha256", None)
     if found != _json_digest(data):
-        raise SkillweaveError(
+        raise RunError(
             f"{path} is damaged: its contents do not match its checksum (edited by hand?)"
         )
     return data
@@ -174,12 +174,12 @@ def _json_digest(data: Mapping[str, Any]) -> str:
 
 
 def check_schema(data: Mapping[str, Any], where: Path | str) -> None:
-    """Raise a SkillweaveError where ``data`` comes from a newer Skillweave."""
+    """Raise a RunError where ``data`` comes from a newer Skillweave."""
     found = data.get("schema")
     if type(found) is not int:
-        raise SkillweaveError(f"{where} was not written by Skillweave: it has no schema number")
+        raise RunError(f"{where} was not written by Skillweave: it has no schema number")
     if found > SCHEMA:
-        raise SkillweaveError(
+        raise RunError(
             f"{where} has schema {shown(found)}; this Skillweave reads up to {SCHEMA}. Upgrade "
             "skillweave"
         )
@@ -207,7 +207,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and header written by ``write_tensors``.
 
     Raises:
-        SkillweaveError: missing, truncated, altered, no plain file, not Skillweave's, or of a
+        RunError: missing, truncated, altered, no plain file, not Skillweave's, or of a
             newer schema.
     """
     return read_signed(path)[:2]
@@ -219,16 +219,16 @@ def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     told = header.pop("sha256", None)
     sha256 = _digest(json.dumps(header, sort_keys=True), tensors)
     if told != sha256:
-        raise SkillweaveError(f"{path} is damaged: its contents do not match its checksum")
+        raise RunError(f"{path} is damaged: its contents do not match its checksum")
     # Copies: in the file tensors are aligned to 4 bytes only, and matrix products of such differ in
     # the last bit, so that a resumed run would drift.
     return {k: v.clone() for k, v in tensors.items()}, header, sha256
 
 
 def check_unchanged(path: Path, found: str, written: str) -> None:
-    """Raise a SkillweaveError where a file's checksum is not that of what the run wrote there."""
+    """Raise a RunError where a file's checksum is not that of what the run wrote there."""
     if found != written:
-        raise SkillweaveError(
+        raise RunError(
             f"{path} is not the file that the run wrote there: another checksum. Put it back, or "
             "train anew"
         )
@@ -238,7 +238,7 @@ def read_header(path: Path) -> dict[str, Any]:
     """The header alone, quickly: its checksum is not compared.
 
     Raises:
-        SkillweaveError: as ``read_tensors``.
+        RunError: as ``read_tensors``.
     """
     return _opened(path, with_tensors=False)[0]
 
@@ -255,14 +255,14 @@ def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, T
             names = file.keys() if with_tensors else ()
             tensors = {k: file.get_tensor(k) for k in names}
     except (OSError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise SkillweaveError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
+        raise RunError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
     except safetensors.SafetensorError as error:
-        raise SkillweaveError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
+        raise RunError(f"{path} is damaged (truncated?): {str(error)[:300]}") from error
     if "skillweave" not in metadata:
-        raise SkillweaveError(f"{path} was not written by Skillweave")
+        raise RunError(f"{path} was not written by Skillweave")
     header = parse_json(metadata["skillweave"], path)
     if not isinstance(header, dict):
-        raise SkillweaveError(f"{path} was not written by Skillweave: its header is no object")
+        raise RunError(f"{path} was not written by Skillweave: its header is no object")
     check_schema(header, path)
     return header, tensors
 
@@ -271,7 +271,7 @@ def _json(path: Path, data: Mapping[str, Any], **how: Any) -> str:
     try:
         return json.dumps(data, allow_nan=False, **how)
     except (TypeError, ValueError, RecursionError) as error:
-        raise SkillweaveError(f"could not write {path}: {error}") from error
+        raise RunError(f"could not write {path}: {error}") from error
 
 
 def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:

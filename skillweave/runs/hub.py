@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import short, shortened
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory
@@ -57,11 +57,11 @@ def check_name(name: object) -> str:
     """``name`` as one of a repository on the hub.
 
     Raises:
-        SkillweaveError: it is no name like ``owner/name``.
+        DeclarationError: it is no name like ``owner/name``.
     """
     part = r"\w([\w.-]{0,94}\w)?"
     if not isinstance(name, str) or not re.fullmatch(f"{part}/{part}", name, re.ASCII):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{short(name)} is no name on the hub; write owner/name: letters, digits, '-', '_', '.'"
         )
     return name
@@ -74,12 +74,12 @@ def check_whole(run: RunDirectory) -> None:
     """Read all that a run holds, so that nothing unfinished or damaged goes up.
 
     Raises:
-        SkillweaveError: the run is not finished, or a file is damaged.
+        RunError: the run is not finished, or a file is damaged.
     """
     if not run.finished:
         waiting = [s["name"] for s in run.manifest["stages"] if s["status"] != "done"]
         what = f"the stage {waiting[0]!r} is not done" if waiting else "it is not judged yet"
-        raise SkillweaveError(
+        raise RunError(
             f"{run.path} is not finished ({what}), and only finished runs can be shared. Go on "
             f"with it: {resume_words(run)}"
         )
@@ -141,7 +141,7 @@ def upload(name: str, files: Mapping[str, Path | bytes], private: bool = False) 
         ``url`` and ``commit``.
 
     Raises:
-        SkillweaveError: it may not be written, it holds something else, or the hub does not answer.
+        RunError: it may not be written, it holds something else, or the hub does not answer.
         MissingExtra: the extra 'hub' is not installed.
     """
     library, api = hub(), hub_api()
@@ -151,7 +151,7 @@ def upload(name: str, files: Mapping[str, Path | bytes], private: bool = False) 
         there = [file.rfilename for file in info.siblings or ()]
         _may_be_replaced(name, there)
         if private and info.private is False:
-            raise SkillweaveError(
+            raise RunError(
                 f"{name} is public already: make it private on its page, or choose another name"
             )
         changes = [library.CommitOperationAdd(path, content) for path, content in files.items()]
@@ -166,13 +166,13 @@ def upload(name: str, files: Mapping[str, Path | bytes], private: bool = False) 
 def _may_be_replaced(name: str, there: Sequence[str]) -> None:
     """Raise where a repository holds something that is no run, or that loading would refuse."""
     if others := _refused(there):
-        raise SkillweaveError(
+        raise RunError(
             f"{name} holds {others}, which is no part of a run, so nobody could load one from "
             "there. Delete it on the hub, or choose another name; nothing was pushed"
         )
     found = [f for f in there if f not in ("README.md", MADE_BY_THE_HUB)]
     if found and "run.json" not in there:
-        raise SkillweaveError(
+        raise RunError(
             f"{name} holds something else ({shortened(', '.join(found), 200)}); choose another "
             "name. Nothing was pushed"
         )
@@ -190,13 +190,13 @@ def _of_a_run(path: str) -> bool:
 
 
 def must_be_own(folder: Path) -> None:
-    """Raise a SkillweaveError where a folder is in the cache of the hub's library.
+    """Raise a RunError where a folder is in the cache of the hub's library.
 
     What is written there would be loaded the next time as if its owner had pushed it. A folder in a
     run that holds links is refused, too.
     """
     if (name := _copied_from(folder)) is not None:
-        raise SkillweaveError(
+        raise RunError(
             f"{folder} is the copy of {name} that huggingface_hub keeps: nothing is written there "
             "or pushed from there, as it would be taken for its owner's. Take a copy of your own, "
             f"and use that: skillweave pull {name}"
@@ -229,13 +229,14 @@ def download(name: str, revision: str | None = None) -> Path:
         revision: a branch, a tag or a commit; None: the latest.
 
     Raises:
-        SkillweaveError: there is no such run, it holds files that are not data, or the hub does
-            not answer.
+        RunError: there is no such run, it holds files that are not data, or the hub does not
+            answer.
+        DeclarationError: ``revision`` is no text.
         MissingExtra: the extra 'hub' is not installed.
     """
     api = hub_api()
     if revision is not None and not (isinstance(revision, str) and revision):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"revision is {short(revision)}; it must be a branch, a tag or a commit"
         )
     with asking(api, name, revision=revision):
@@ -247,7 +248,7 @@ def download(name: str, revision: str | None = None) -> Path:
             _check_kinds(name, [file.rfilename for file in info.siblings or ()])
             path = Path(api.snapshot_download(name, **how))
             if path.name != info.sha:
-                raise SkillweaveError(f"{name} was changed while it was downloaded; try again")
+                raise RunError(f"{name} was changed while it was downloaded; try again")
     return path
 
 
@@ -272,12 +273,12 @@ def _downloaded_before(api: Any, name: str, how: Mapping[str, Any], error: Excep
 def _check_kinds(name: str, files: Sequence[str]) -> None:
     """Raise where there is no run, or something that is not data."""
     if others := _refused(files):
-        raise SkillweaveError(
+        raise RunError(
             f"{name} holds {others}, and a run on the hub is data alone ({', '.join(KINDS)}): "
             "nothing of it is used. Ask who made it to remove that"
         )
     if "run.json" not in files:
-        raise SkillweaveError(f"{name} holds no run of Skillweave: there is no run.json")
+        raise RunError(f"{name} holds no run of Skillweave: there is no run.json")
 
 
 def _refused(files: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import short, shortened
 
 
@@ -30,7 +30,7 @@ def asking(
     except SkillweaveError:
         raise
     except Exception as error:  # of any of the libraries that it stands on
-        raise SkillweaveError(_sentence(error, api.endpoint, name, writes, revision)) from error
+        raise RunError(_sentence(error, api.endpoint, name, writes, revision)) from error
 
 
 def _sentence(

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.reading import check_file, fit, load_json, shown
 from skillweave.runs.links import own_copy
 
@@ -38,7 +38,7 @@ class JsonLines:
         """Append one line per record.
 
         Raises:
-            SkillweaveError: the disk is full or cannot be written.
+            RunError: the disk is full or cannot be written.
         """
         text = "".join(json.dumps(record) + "\n" for record in records)
         try:
@@ -49,7 +49,7 @@ class JsonLines:
             self._file.flush()
         except OSError as error:
             self.close()  # what could not be written must not be written later
-            raise SkillweaveError(
+            raise RunError(
                 f"could not write {self.path}: {error.strerror}. The checkpoint is intact; free "
                 f"space{self._next()}"
             ) from error
@@ -61,7 +61,7 @@ class JsonLines:
         """Remove all after ``size`` bytes: training will write it again; None: remove nothing.
 
         Raises:
-            SkillweaveError: the disk cannot be written.
+            RunError: the disk cannot be written.
         """
         self.close()
         try:
@@ -69,13 +69,13 @@ class JsonLines:
                 own_copy(self.path)
                 os.truncate(self.path, size)
         except OSError as error:
-            raise SkillweaveError(f"could not write {self.path}: {error.strerror}") from error
+            raise RunError(f"could not write {self.path}: {error.strerror}") from error
 
     def read(self) -> Iterator[dict[str, Any]]:
         """The records, without a last line that is incomplete.
 
         Raises:
-            SkillweaveError: a line is damaged, or the path is not a plain file.
+            RunError: a line is damaged, or the path is not a plain file.
         """
         if not self.path.exists():
             return
@@ -87,11 +87,11 @@ class JsonLines:
                 try:
                     record = load_json(line)
                 except (ValueError, RecursionError) as error:
-                    raise SkillweaveError(
+                    raise RunError(
                         f"{self.path} is damaged in line {number}: {str(error)[:300]}"
                     ) from error
                 if not isinstance(record, dict):
-                    raise SkillweaveError(
+                    raise RunError(
                         f"{self.path} is damaged in line {number}: {shown(record)} is no object"
                     )
                 if self._schema is not None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.runs.files import write_bytes
 
 ABOVE = 2
@@ -22,7 +22,7 @@ TRACKERS = ("wandb",)
 
 
 def check_no_links(run: Path) -> None:
-    """Raise a SkillweaveError where a run holds a link, a pipe or a device.
+    """Raise a RunError where a run holds a link, a pipe or a device.
 
     Args:
         run: its directory, which may be reached through a link.
@@ -30,20 +30,20 @@ def check_no_links(run: Path) -> None:
     for entry in _entries(run):
         if entry.is_symlink():
             if not _stays_in_tracker(run, Path(entry.path)):
-                raise SkillweaveError(
+                raise RunError(
                     f"{entry.path} is a link to {_target(entry.path)}, and nothing is written into "
                     "a run with links, as that would change files outside of it. Put a copy in its "
                     "place, or delete it"
                 )
         elif not entry.is_file() and not entry.is_dir():
-            raise SkillweaveError(
+            raise RunError(
                 f"{entry.path} is a pipe or a device, and nothing is written into a run with such "
                 "files. Delete it"
             )
 
 
 def check_no_links_around(folder: Path) -> None:
-    """Raise a SkillweaveError where a folder is in a run that holds a link, or is one."""
+    """Raise a RunError where a folder is in a run that holds a link, or is one."""
     folder = folder.absolute()
     for place in (folder, *folder.parents[:ABOVE]):
         if os.path.lexists(place / "run.json"):
@@ -69,7 +69,7 @@ def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
             with os.scandir(waiting.pop()) as entries:
                 found = sorted(entries, key=lambda entry: entry.name)
         except OSError as error:
-            raise SkillweaveError(f"could not read {error.filename}: {error.strerror}") from error
+            raise RunError(f"could not read {error.filename}: {error.strerror}") from error
         for entry in found:
             yield entry
             if entry.is_dir(follow_symlinks=False):

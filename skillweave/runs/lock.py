@@ -7,7 +7,7 @@ import platform
 from contextlib import suppress
 from pathlib import Path
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 
 try:
     import fcntl
@@ -26,7 +26,7 @@ class Lock:
         """Take it.
 
         Raises:
-            SkillweaveError: another process has it, or the directory cannot be written.
+            RunError: another process has it, or the directory cannot be written.
         """
         self._directory, self._path = directory, directory / NAME
         self.exclusive = False
@@ -49,7 +49,7 @@ class Lock:
         """Lock the file that is open, where the system can.
 
         Raises:
-            SkillweaveError: another process has locked it.
+            RunError: another process has locked it.
         """
         self.exclusive = False
         if fcntl is None:
@@ -59,7 +59,7 @@ class Lock:
         except BlockingIOError as error:
             owner = self._owner()
             self.release()
-            raise SkillweaveError(
+            raise RunError(
                 f"{self._directory} is being trained by {owner}; wait until it ends, or stop it"
             ) from error
         except OSError:  # a file system without locks
@@ -72,7 +72,7 @@ class Lock:
         try:
             self._handle = os.open(self._path, flags, 0o666)
         except OSError as error:
-            raise SkillweaveError(f"could not write {self._path}: {error.strerror}") from error
+            raise RunError(f"could not write {self._path}: {error.strerror}") from error
         _held.add(self._handle)
 
     def _owner(self) -> str:
@@ -86,13 +86,13 @@ class Lock:
         return f"process {number}{where}"
 
     def check(self) -> None:
-        """Raise a SkillweaveError where the run is not there any more."""
+        """Raise a RunError where the run is not there any more."""
         try:
             there = os.path.samestat(os.stat(self._path), os.fstat(self._handle))
         except OSError:
             there = False
         if not there:
-            raise SkillweaveError(
+            raise RunError(
                 f"{self._directory} was deleted or moved while it was being trained; training ends "
                 "here, for there is no run to write to"
             )

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from skillweave.algorithms.config import config_from_json
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.reading import fit, shown
 from skillweave.runs.files import read_json
 from skillweave.runs.kept import Kept
@@ -241,7 +241,7 @@ class Checkpoint(TypedDict):
 
 
 def check_manifest(data: Mapping[str, Any], file: str) -> None:
-    """Raise a SkillweaveError that names the file and the field where a manifest is wrong."""
+    """Raise a RunError that names the file and the field where a manifest is wrong."""
     manifest = fit(Manifest, data, file)
     if manifest["kind"] == "hierarchy":
         manifest = fit(HierarchyManifest, data, file)
@@ -249,18 +249,18 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
         names = [entry["name"] for entry in manifest.get(kind, [])]
         for i, name in enumerate(names):
             if name in names[:i]:
-                raise SkillweaveError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
+                raise RunError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
     if manifest["kind"] == "agent" and len(manifest["stages"]) != 1:
-        raise SkillweaveError(
+        raise RunError(
             f"{file}: stages has {len(manifest['stages'])} entries, but a plain agent has one"
         )
     for i, stage in enumerate(manifest["stages"]):
         where = f"stages[{i}]"
         config_from_json(stage["algorithm"], file, f"{where}.algorithm")
         if stage["status"] == "done" and not {"steps", "seconds"} <= set(stage):
-            raise SkillweaveError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
+            raise RunError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
     if "id" in data and "sha256" not in data:
-        raise SkillweaveError(f"{file} is damaged: no field 'sha256', the checksum of it all")
+        raise RunError(f"{file} is damaged: no field 'sha256', the checksum of it all")
 
 
 def read_manifest(run: Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.messages import told
 from skillweave.runs.directory import RunDirectory
 from skillweave.terminal import say
@@ -34,7 +34,7 @@ class MLflow:
         identifier: the same for this run whenever it goes on, and for no other.
 
     Raises:
-        SkillweaveError: MLflow does not answer.
+        RunError: MLflow does not answer.
     """
 
     def __init__(self, run: RunDirectory, identifier: str) -> None:
@@ -46,7 +46,7 @@ class MLflow:
             self._client: Any = mlflow.MlflowClient()
             found = self._found(identifier) or self._begun(identifier)
         except Exception as error:  # of whatever store it has
-            raise SkillweaveError(
+            raise RunError(
                 f"MLflow at {mlflow.get_tracking_uri()} does not answer: {told(error)}. Set "
                 "MLFLOW_TRACKING_URI, or train without this tracker"
             ) from error

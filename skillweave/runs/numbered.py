@@ -6,7 +6,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 
 FOLDER = Path("runs")
 """Where numbered directories are made, below the working directory."""
@@ -26,7 +26,7 @@ def make_numbered(name: str, below: Path) -> Path:
     Two processes that call it at once get two directories.
 
     Raises:
-        SkillweaveError: it cannot be made.
+        RunError: it cannot be made.
     """
     name, folder = safe_name(name), below / FOLDER
     pattern = re.compile(rf"{re.escape(name)}-(\d+)")
@@ -41,6 +41,4 @@ def make_numbered(name: str, below: Path) -> Path:
                 return path
             number += 1
     except OSError as error:
-        raise SkillweaveError(
-            f"could not make a directory in {folder}: {error.strerror}"
-        ) from error
+        raise RunError(f"could not make a directory in {folder}: {error.strerror}") from error

@@ -9,7 +9,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.messages import shown_path
 from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.files import TEMPORARY, remove
@@ -32,22 +32,22 @@ LOCK_TEXT = re.compile(rb"(\d+ [^\n]*\n)?")
 
 
 def check_replaceable(run: RunDirectory) -> None:
-    """Raise a SkillweaveError where a run has learnt something that a new one would replace."""
+    """Raise a RunError where a run has learnt something that a new one would replace."""
     if run.finished:
-        raise SkillweaveError(
+        raise RunError(
             f"{shown_path(run.path)} holds a finished run, which is never replaced. Load it: "
             f"{load_words(run)}; or give more steps and continue it: {resume_words(run)}; or "
             "choose another directory"
         )
     if run.has_learnt:
-        raise SkillweaveError(
+        raise RunError(
             f"{shown_path(run.path)} holds an unfinished run, {saved_words(run)}. Continue it: "
             f"{resume_words(run)}; or choose another directory"
         )
 
 
 def check_ours(path: Path, run: RunDirectory | None = None) -> None:
-    """Raise a SkillweaveError where a directory holds what training did not write there.
+    """Raise a RunError where a directory holds what training did not write there.
 
     Args:
         run: the run in it; None: there is none.
@@ -58,9 +58,9 @@ def check_ours(path: Path, run: RunDirectory | None = None) -> None:
         lock = path / LOCK
         ours = lock.is_file() and not lock.is_symlink() and lock.stat().st_size < 300
         if any(path.iterdir()) and not (ours and LOCK_TEXT.fullmatch(lock.read_bytes())):
-            raise SkillweaveError(f"{path} exists and is not an empty directory; choose another")
+            raise RunError(f"{path} exists and is not an empty directory; choose another")
     for foreign in _foreign(path, copies):
-        raise SkillweaveError(
+        raise RunError(
             f"{path} holds {foreign.relative_to(path)}, which is no file of a run that has just "
             "begun, so nothing there is replaced; choose another directory"
         )
@@ -88,7 +88,7 @@ def clear(path: Path) -> None:
     """Remove what a run wrote that has not learnt anything; ``check_ours`` comes before.
 
     Raises:
-        SkillweaveError: it cannot be removed.
+        RunError: it cannot be removed.
     """
     remove(path / "run.json")  # first: without it, nothing else counts
     for entry in list(path.iterdir()):

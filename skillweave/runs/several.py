@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.runs.directory import RunDirectory
 
 
@@ -14,7 +14,7 @@ def open_runs(paths: Sequence[Path]) -> list[RunDirectory]:
     """Open the runs at ``paths``; a directory of runs stands for all of them, in their order.
 
     Raises:
-        SkillweaveError: a path holds no run, or a run is damaged.
+        RunError: a path holds no run, or a run is damaged.
     """
     found = []
     for path in paths:
@@ -22,7 +22,7 @@ def open_runs(paths: Sequence[Path]) -> list[RunDirectory]:
         # Where neither is there, opening says what a run is.
         found += [RunDirectory.open(each) for each in inside or [path]]
     if not found:
-        raise SkillweaveError("no runs were given; name a run's directory, or a sweep's")
+        raise DeclarationError("no runs were given; name a run's directory, or a sweep's")
     return found
 
 

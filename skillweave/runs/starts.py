@@ -14,7 +14,7 @@ from typing import Any
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
@@ -49,12 +49,12 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
     """By name, who has learnt in a run, as they were at the end of their latest finished stage.
 
     Raises:
-        SkillweaveError: there is no run, a file of it is damaged, or nobody has found out yet
+        RunError: there is no run, a file of it is damaged, or nobody has found out yet
             whether what it learnt together is better than what was there before.
     """
     run, found = RunDirectory.open(path), dict[str, Learnt]()
     if run.unjudged and all(entry["status"] == "done" for entry in run.manifest["stages"]):
-        raise SkillweaveError(
+        raise RunError(
             f"start_from: {path} was stopped before its end, while what it learnt was compared "
             f"with what was there before; finish it first: {resume_words(run)}"
         )
@@ -91,14 +91,15 @@ def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where
         where: the other run, or runs, for messages.
 
     Raises:
-        SkillweaveError: nobody who learns here has learnt there, or a population is to begin.
+        RunError: no learner of this run has learnt in the other one.
+        DeclarationError: a population is to begin with what was learnt.
     """
     begun: set[str] = set()
     for entry in stages:
         own = [name for name in entry["learns"] if name in learnt and name not in begun]
         begun |= set(own)
         if own and entry.get("evolution") is not None:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"start_from: stage {entry['name']!r} evolves, and members of a population begin "
                 f"with settings and networks of their own, not with what {where} holds. Leave out "
                 "start_from, or evolve only who has not learnt there: evolve={...}"
@@ -110,7 +111,7 @@ def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where
             }
     if not begun:
         here = sorted({name for entry in stages for name in entry["learns"]})
-        raise SkillweaveError(
+        raise RunError(
             f"start_from: nobody who learns here has learnt in {where}: here learn "
             f"{', '.join(here)}, and there {', '.join(learnt) or 'nobody was finished'}"
         )
@@ -148,24 +149,24 @@ def start_of(
     None: it begins afresh, or with what an earlier stage taught.
 
     Raises:
-        SkillweaveError: the run's copy is not there, damaged, or belongs elsewhere.
+        RunError: the run's copy is not there, damaged, or belongs elsewhere.
     """
     told = run.stage(stage).get("starts", {}).get(name)
     if told is None:
         return None
     path = _path(run, name)
     if not path.exists():
-        raise SkillweaveError(
+        raise RunError(
             f"{path} is not there: {name!r} was to begin with it. Put it back, or train anew"
         )
     tensors, header, sha256 = read_signed(path)
     run.must_be_ours(header, path)
     if header.get("kind") != "agent" or header.get("starts") != name:
-        raise SkillweaveError(f"{path} does not hold what {name!r} is to begin with")
+        raise RunError(f"{path} does not hold what {name!r} is to begin with")
     check_unchanged(path, sha256, told["copy"])
     policy = AgentPolicy.from_file(tensors, header, str(path))
     if not same_shapes(policy.algorithm, algorithm):
-        raise SkillweaveError(f"{path} holds other networks than {name!r} has in this run")
+        raise RunError(f"{path} holds other networks than {name!r} has in this run")
     return policy, told["steps"]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from skillweave.algorithms.policy import state_from
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import make_directory, read_tensors, remove, write_tensors
 
@@ -37,14 +37,14 @@ def load_state(run: RunDirectory, name: str, like: S) -> S | None:
     not kept, its state is none of who goes on.
 
     Raises:
-        SkillweaveError: the file is damaged, or belongs elsewhere.
+        RunError: the file is damaged, or belongs elsewhere.
     """
     path = state_path(run, name)
     if not path.exists():
         return None
     tensors, header = read_tensors(path)
     if header.get("learns") != name:
-        raise SkillweaveError(f"{path} does not hold the state of {name!r}")
+        raise RunError(f"{path} does not hold the state of {name!r}")
     run.must_be_ours(header, path)
     if run.stage(header.get("stage", "")).get("kept", {}).get("kept") == "before":
         return None

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, MissingExtra
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.mlflow_tracker import MLflow
 
@@ -166,12 +166,13 @@ def make_trackers(names: Sequence[str], run: RunDirectory | None) -> tuple[Track
     """The trackers with these names; if ``run`` is None, only check that they can be made.
 
     Raises:
-        SkillweaveError: no such tracker, or it does not answer.
+        DeclarationError: there is no such tracker.
+        RunError: it does not answer.
         MissingExtra: its package is not installed.
     """
     for name in names:
         if name not in TRACKERS:
-            raise SkillweaveError(f"no tracker {name!r}; there are: {', '.join(TRACKERS)}")
+            raise DeclarationError(f"no tracker {name!r}; there are: {', '.join(TRACKERS)}")
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(f"tracking with {name}", name)
     return () if run is None else tuple(MAKE[name](run) for name in names)

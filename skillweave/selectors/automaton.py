@@ -15,7 +15,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import LastCall
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.answers import answer
@@ -62,8 +62,8 @@ class Automaton(ReadySelector):
         start: the first state; None: the one that is written first.
 
     Raises:
-        SkillweaveError: a state has no skill, or a transition names a state that is not there;
-            when it acts: no skill of the state may start.
+        DeclarationError: a state has no skill, or a transition names a state that is not there.
+        SkillError: when it acts: no skill of the state may start.
     """
 
     kind = "automaton"
@@ -76,7 +76,7 @@ class Automaton(ReadySelector):
     ) -> None:
         super().__init__("automaton")
         if not isinstance(states, Mapping) or not states:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"an Automaton's states are {short(states)}; give at least one, with its skills: "
                 "states={'search': 'explore'}"
             )
@@ -85,7 +85,7 @@ class Automaton(ReadySelector):
         self.start_state = self.state_names[0] if start is None else start
         self._number_of_state(self.start_state, "start")
         if not isinstance(transitions, Mapping):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"an Automaton's transitions are {short(transitions)}; write "
                 "transitions={('from', 'to'): event}"
             )
@@ -194,13 +194,13 @@ class Automaton(ReadySelector):
     def _ends_of(self, pair: Any, event: Any) -> tuple[int, int]:
         """The states that a transition is between, after a check of both and of its event."""
         if not isinstance(pair, tuple) or len(pair) != 2:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"an Automaton's transition is from {short(pair)}; write ('from', 'to'): event"
             )
         where = f"transition {short(pair)}"
         origin, target = (self._number_of_state(name, where) for name in pair)
         if event not in ENDS and not callable(event):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"automaton: {where} has the event {short(event)}; give a function of a Step, "
                 "'success' or 'failure'"
             )
@@ -208,7 +208,7 @@ class Automaton(ReadySelector):
 
     def _number_of_state(self, name: Any, where: str) -> int:
         if name not in self.state_names:
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"automaton: {where} names the state {short(name)}, which is not there; there are: "
                 f"{listed(self.state_names)}"
             )
@@ -216,7 +216,7 @@ class Automaton(ReadySelector):
 
     def _nothing_may_start(self, memory: Memory, obs: Array, row: int) -> None:
         state = self.state_names[int(memory["state"][row])]
-        raise SkillweaveError(
+        raise SkillError(
             f"{self._who}: in state {short(state)} none of its skills ("
             f"{listed(tuple(self.states[state]))}) may start in observation {shown_obs(obs[row])}: "
             "initiation() is False there. Give the state another skill too, or let one start there"
@@ -225,7 +225,7 @@ class Automaton(ReadySelector):
 
 def _name(state: Any) -> str:
     if not isinstance(state, str) or not state:
-        raise SkillweaveError(f"an Automaton's state is named {short(state)}; it must be text")
+        raise DeclarationError(f"an Automaton's state is named {short(state)}; it must be text")
     return state
 
 
@@ -235,12 +235,12 @@ def _skills(state: str, skills: Any) -> tuple[str, ...] | frozenset[str]:
         return (skills,)
     where = f"automaton: state {short(state)}"
     if not isinstance(skills, list | tuple | set | frozenset):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"{where} has {short(skills)}; give a skill's name, or a list or a set of names"
         )
     if not skills:
-        raise SkillweaveError(f"{where} has no skill: give at least one, to be called in it")
+        raise DeclarationError(f"{where} has no skill: give at least one, to be called in it")
     for name in skills:
         if not isinstance(name, str):
-            raise SkillweaveError(f"{where} has {short(name)} among its skills; give their names")
+            raise DeclarationError(f"{where} has {short(name)} among its skills; give their names")
     return frozenset(skills) if isinstance(skills, set | frozenset) else tuple(skills)

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.collecting.guide import LastCall
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.types import Array, Memory, Step
@@ -34,7 +34,7 @@ class ReadySelector(Foreign):
         """A copy that chooses among the skills of these names, in the hierarchy's order.
 
         Raises:
-            SkillweaveError: it names a skill that is none of them.
+            DeclarationError: it names a skill that is none of them.
         """
         found = copy.copy(self)
         found.skills = skills
@@ -62,14 +62,17 @@ class ReadySelector(Foreign):
         """
         return memory
 
-    def _number(self, skill: Any, where: str) -> int:
-        """The place of a skill in the hierarchy's list.
+    def _number(
+        self, skill: Any, where: str, kind: type[SkillweaveError] = DeclarationError
+    ) -> int:
+        """Return the place of a skill in the hierarchy's list.
 
         Raises:
-            SkillweaveError: there is no skill of this name; the message begins with ``where``.
+            DeclarationError: there is no skill of this name; the message begins with ``where``. It
+                is of another ``kind`` where that is given.
         """
         if not isinstance(skill, str) or skill not in self.skills:
-            raise SkillweaveError(
+            raise kind(
                 f"{where} names {short(skill)}, which is no skill of the hierarchy; there are: "
                 f"{listed(self.skills)}"
             )

@@ -10,7 +10,7 @@ from gymnasium.spaces import Discrete
 
 from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import LastCall
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillError
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
@@ -25,7 +25,7 @@ class FunctionSelector(ReadySelector):
     If it needs a second argument, it is given the ``LastCall``.
 
     Raises:
-        SkillweaveError: when it acts: the function failed, or chose what is no skill, or a skill
+        SkillError: when it acts: the function failed, or chose what is no skill, or a skill
             that may not start.
     """
 
@@ -66,8 +66,10 @@ class FunctionSelector(ReadySelector):
             given = obs
         chosen = as_array(value, self._who)
         if chosen.dtype.kind in "UO" and chosen.shape == (len(obs),):
-            chosen = np.array([self._number(name, self._who) for name in chosen.tolist()], int)
-        chosen = checked_actions(chosen, len(obs), Discrete(len(self.skills)), self._who)
+            numbers = [self._number(name, self._who, SkillError) for name in chosen.tolist()]
+            chosen = np.array(numbers, int)
+        choices = Discrete(len(self.skills))
+        chosen = checked_actions(chosen, len(obs), choices, self._who, SkillError)
         probe(function, given, len(obs), self._who)
         self._check_starts(chosen, obs, mask)
         return chosen, memory
@@ -91,7 +93,7 @@ class FunctionSelector(ReadySelector):
         if len(wrong):
             row = int(wrong[0])
             may = tuple(n for n, yes in zip(self.skills, mask[row], strict=True) if yes)
-            raise SkillweaveError(
+            raise SkillError(
                 f"{self._who} chose skill {self.skills[int(chosen[row])]!r} in observation "
                 f"{shown_obs(obs[row])}, but its initiation() is False there; choose a skill that "
                 f"may start there: {listed(may)}"

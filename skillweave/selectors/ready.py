@@ -19,7 +19,7 @@ def ready_selector(value: Any, skills: tuple[str, ...]) -> ReadySelector | None:
     """The selector that ``value`` means among skills of these names; None: it is none.
 
     Raises:
-        SkillweaveError: it names a skill that is not among them.
+        DeclarationError: it names a skill that is not among them.
     """
     found: ReadySelector
     if isinstance(value, Automaton):

@@ -32,7 +32,7 @@ from enum import IntEnum
 from typing import Any, ClassVar
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.selectors.base import function_name
 from skillweave.types import Array
@@ -55,12 +55,12 @@ class Condition:
         name: used in messages; default: the function's name.
 
     Raises:
-        SkillweaveError: it is no function of observations.
+        DeclarationError: it is no function of observations.
     """
 
     def __init__(self, function: Callable[[Array], Any], name: str = "") -> None:
         if not callable(function) or isinstance(function, type):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"tree: a Condition is {short(function)}; it must be a function of observations"
             )
         self.function, self.name = function, name or function_name(function)
@@ -77,7 +77,7 @@ class Composite:
             are called again.
 
     Raises:
-        SkillweaveError: there are no children, or one is none of these.
+        DeclarationError: there are no children, or one is none of these.
     """
 
     goes_on_after: ClassVar[Status]
@@ -87,9 +87,9 @@ class Composite:
                  memory: bool = True) -> None:  # fmt: skip
         where = f"tree: {type(self).__name__}"
         if not children:
-            raise SkillweaveError(f"{where} has no children: give skills' names or conditions")
+            raise DeclarationError(f"{where} has no children: give skills' names or conditions")
         if not isinstance(memory, bool):
-            raise SkillweaveError(f"{where}: memory is {short(memory)}; it must be True or False")
+            raise DeclarationError(f"{where}: memory is {short(memory)}; it must be True or False")
         self.children = tuple(_child(c, where) for c in children)
         self.memory = memory
 
@@ -101,8 +101,8 @@ class Sequence(Composite):
     as in ``Composite``.
 
     Raises:
-        SkillweaveError: there are no children, or one is none of a name, a condition, a sequence or
-            a fallback.
+        DeclarationError: there are no children, or one is none of a name, a condition, a sequence
+            or a fallback.
     """
 
     goes_on_after = Status.SUCCESS
@@ -115,8 +115,8 @@ class Fallback(Composite):
     as in ``Composite``.
 
     Raises:
-        SkillweaveError: there are no children, or one is none of a name, a condition, a sequence or
-            a fallback.
+        DeclarationError: there are no children, or one is none of a name, a condition, a sequence
+            or a fallback.
     """
 
     goes_on_after = Status.FAILURE
@@ -130,7 +130,7 @@ def _child(child: Any, where: str) -> Node:
         return child
     if callable(child) and not isinstance(child, type):
         return Condition(child)
-    raise SkillweaveError(
+    raise DeclarationError(
         f"{where} has the child {short(child)}; give a skill's name, a condition, a Sequence or a "
         "Fallback"
     )

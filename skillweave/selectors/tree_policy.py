@@ -11,7 +11,7 @@ import numpy as np
 
 from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import LastCall
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.selectors.base import ReadySelector, shown_obs
 from skillweave.selectors.tree import Composite, Condition, Node, Status
 from skillweave.skills.answers import answer
@@ -26,7 +26,8 @@ class TreeSelector(ReadySelector):
     that call did), ``child`` (n, C) (of each sequence and fallback, the child under way).
 
     Raises:
-        SkillweaveError: the tree has no skill; when it acts: it comes to its end without one.
+        DeclarationError: the tree has no skill.
+        SkillError: when it acts: it comes to its end without a skill.
     """
 
     kind = "tree"
@@ -37,7 +38,7 @@ class TreeSelector(ReadySelector):
         self._plan = _Plan()
         self._top = self._plan.add(root, lambda name: 0)
         if not self._plan.skills:
-            raise SkillweaveError(
+            raise DeclarationError(
                 "the tree has no skill: give at least one skill's name as a child"
             )
 
@@ -81,7 +82,7 @@ class TreeSelector(ReadySelector):
             status[again] = self._top.tick(tick, again)
         if (status != Status.RUNNING).any():
             row = int(np.flatnonzero(status != Status.RUNNING)[0])
-            raise SkillweaveError(
+            raise SkillError(
                 f"{self._who} came to its end ({Status(int(status[row])).name}) in observation "
                 f"{shown_obs(obs[row])} without a skill that may start there: add a Fallback whose "
                 "last child is a skill that may start everywhere"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillError
 from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, odd_key
 from skillweave.skills.outputs import as_array, at_step, called
@@ -28,14 +28,14 @@ def answer(
     """What a function of the user's returns, ``checked``.
 
     Raises:
-        SkillweaveError: the function failed, or returned something else than was asked for.
+        SkillError: the function failed, or returned something else than was asked for.
     """
     if isinstance(about, np.ndarray):
         about = read_only(about)
     value = called(function, about, f"{who}: {method}()", elapsed, ids)
     objects = isinstance(value, np.ndarray) and value.dtype == object
     if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
-        raise SkillweaveError(f"{who}: {method}(){at_step(elapsed)}: {odd}")
+        raise SkillError(f"{who}: {method}(){at_step(elapsed)}: {odd}")
     array = checked(value, n, dtype, who, method, elapsed, ids)
     probe(function, about, n, f"{who}: {method}()")
     return array
@@ -57,18 +57,18 @@ def checked(
         ids: in which environments, (n,), for messages; None: in all n.
 
     Raises:
-        SkillweaveError: it has another shape or kind, or is a NaN or an infinity; the message
+        SkillError: it has another shape or kind, or is a NaN or an infinity; the message
             names the skill, the method and the step.
     """
     if value is None:
-        raise SkillweaveError(
+        raise SkillError(
             f"{who}: {method}() returned None{at_step(elapsed)}, but shape ({n},) was expected: "
             "does it lack a return?"
         )
     array = as_array(value, f"{who}: {method}()")
     if array.shape != (n,):
         one = "yes or no" if dtype is bool else "number"
-        raise SkillweaveError(
+        raise SkillError(
             f"{who}: {method}() returned shape {array.shape}{at_step(elapsed)}, but ({n},) was "
             f"expected: one {one} for each of the {n} environments, the first axis of every array"
         )
@@ -81,7 +81,7 @@ def checked(
     if array.dtype == object and all(isinstance(value, NUMBERS) for value in array):
         array = array.astype(np.float64)
     if array.dtype.kind not in "fiub":
-        raise SkillweaveError(
+        raise SkillError(
             f"{who}: {method}() returned {_kind(array)}{at_step(elapsed)}, but rewards are real "
             "numbers"
         )
@@ -89,7 +89,7 @@ def checked(
         array = array.astype(dtype, copy=False)
     if (row := wrong_reward(array)) is not None:
         when = "" if elapsed is None else f" at step {np.broadcast_to(elapsed, n)[row]}"
-        raise SkillweaveError(
+        raise SkillError(
             f"{who}: {method}() returned {array[row]}{when} for environment {_number(row, ids)}: "
             f"rewards must be finite, and at most {LARGEST_REWARD:g} in size"
         )
@@ -104,13 +104,11 @@ def _number(row: int, ids: Array | None) -> int:
 def _flags(array: Array, what: str, when: str, ids: Array | None) -> Array:
     """Numbers that are all 0 or 1, as bool."""
     if array.dtype.kind not in "fiu":
-        raise SkillweaveError(
-            f"{what} returned {_kind(array)}{when}, but yes or no (bool) is asked"
-        )
+        raise SkillError(f"{what} returned {_kind(array)}{when}, but yes or no (bool) is asked")
     wrong = np.flatnonzero((array != 0) & (array != 1))
     if len(wrong):
         row = int(wrong[0])
-        raise SkillweaveError(
+        raise SkillError(
             f"{what} returned {array[row]}{when} for environment {_number(row, ids)}, but yes or "
             "no (bool) is asked: compare with something"
         )

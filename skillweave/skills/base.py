@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
@@ -125,18 +125,18 @@ class Skill:
         return getattr(type(self), method) is not getattr(Skill, method)
 
     def validate(self) -> None:
-        """Raise a SkillweaveError that names what is wrong with the declaration."""
+        """Raise a DeclarationError that names what is wrong with the declaration."""
         where = f"skill {short(self.name)} ({type(self).__name__})"
         if not isinstance(self.name, str):
-            raise SkillweaveError(f"{where}: the name must be text")
+            raise DeclarationError(f"{where}: the name must be text")
         if not self.name:
-            raise SkillweaveError(f"{where} has no name: set the class attribute 'name'")
+            raise DeclarationError(f"{where} has no name: set the class attribute 'name'")
         if not NAME.fullmatch(self.name):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: the name names files too; use letters, digits, '_' and '-', at most 64"
             )
         if DEVICE.fullmatch(self.name):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: the name names files too, and {self.name!r} is a device on Windows; "
                 "choose another name"
             )
@@ -148,7 +148,7 @@ class Skill:
                 with suppress(AttributeError):  # of a property
                     setattr(self, field, found)
         if self.color is not None and not _is_color(self.color):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
                 "0 to 255: color = (230, 80, 60)"
             )
@@ -160,7 +160,7 @@ class Skill:
             )
         for method in self.methods:
             if not callable(getattr(self, method)):
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
 
@@ -213,23 +213,23 @@ class Reflex:
         name: used in messages and captions; default: the condition's name.
 
     Raises:
-        SkillweaveError: the condition is no function, or the name no text.
+        DeclarationError: the condition is no function, or the name no text.
     """
 
     def __init__(
         self, condition: Callable[[Array], Array], action: Any, name: str | None = None
     ) -> None:
         if not callable(condition):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"a Reflex's condition is {short(condition)}; it must be a function of observations"
             )
         if not isinstance(name, str | None):
-            raise SkillweaveError(f"a Reflex's name is {short(name)}; it must be text")
+            raise DeclarationError(f"a Reflex's name is {short(name)}; it must be text")
         self.condition, self.action = condition, action
         self.name = name or getattr(condition, "__name__", "reflex")
 
     def check(self, space: Space[Any]) -> None:
-        """Raise a SkillweaveError where a fixed action is none of ``space``."""
+        """Raise a DeclarationError where a fixed action is none of ``space``."""
         if not callable(self.action):
             self._actions(np.empty((1, 0)), space)
 
@@ -237,7 +237,7 @@ class Reflex:
         """Each ``action`` (N, ...) in ``space`` with this reflex; (N,) bool: where ``obs`` asks it.
 
         Raises:
-            SkillweaveError: what it answers is not what was asked for; the message names it.
+            SkillError: what it answers is not what was asked for; the message names it.
         """
         holds = self.holds(obs)
         if holds.any():
@@ -249,17 +249,17 @@ class Reflex:
         """Evaluate its condition: ``obs`` (N, *obs_shape) to (N,) bool.
 
         Raises:
-            SkillweaveError: the condition returned something else; the message names it.
+            SkillError: the condition returned something else; the message names it.
         """
         return answer(self.condition, obs, len(obs), bool, self._who, "condition")
 
     def fixed(self, space: Space[Any]) -> Array:
         """Its action, where that is no function, as one of ``space``; (...)."""
         who, shape = f"{self._who}: action", space.shape or ()
-        one = as_array(self.action, who)
+        one = as_array(self.action, who, DeclarationError)
         # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
         value = np.full(shape, one) if one.shape == () else one
-        found: Array = checked_actions(value[None], 1, space, who)[0]
+        found: Array = checked_actions(value[None], 1, space, who, DeclarationError)[0]
         return found
 
     @property
@@ -271,7 +271,8 @@ class Reflex:
         n, who = len(obs), f"{self._who}: action"
         if not callable(self.action):
             return np.repeat(self.fixed(space)[None], n, axis=0)
-        actions = checked_actions(called(self.action, obs, f"{who}()"), n, space, f"{who}()")
+        answered = called(self.action, obs, f"{who}()")
+        actions = checked_actions(answered, n, space, f"{who}()", SkillError)
         probe(self.action, obs, n, f"{who}()", space.shape or ())
         return actions
 
@@ -301,7 +302,7 @@ def asked(
     """What a method of a skill says about a step or observations: (n,) float32 or bool.
 
     Raises:
-        SkillweaveError: as of ``answer``.
+        SkillError: as of ``answer``.
     """
     dtype = np.float32 if method == "reward" else bool
     who = f"skill {path_of(skill)!r}"

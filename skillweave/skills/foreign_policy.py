@@ -12,7 +12,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector.utils import batch_space
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import PolicyError, RunError, SkillweaveError
 from skillweave.messages import short, told
 from skillweave.types import Array, Memory, Memoryless, Policy
 
@@ -60,9 +60,9 @@ class Foreign(Memoryless):
         raise NotImplementedError
 
     def must_be_bound(self) -> None:
-        """Raise a SkillweaveError if it has no spaces yet."""
+        """Raise a PolicyError if it has no spaces yet."""
         if self.action_space is None:
-            raise SkillweaveError(f"{self._who} has no spaces yet: bind() it to an environment's")
+            raise PolicyError(f"{self._who} has no spaces yet: bind() it to an environment's")
 
     def source(self) -> dict[str, Any]:
         """Where it comes from, as JSON for ``run.json``: at least its kind."""
@@ -82,7 +82,7 @@ class Foreign(Memoryless):
         """Act once on two made-up observations, so that errors are found before training.
 
         Raises:
-            SkillweaveError: it failed; the message names who, and the space.
+            PolicyError: it failed; the message names who, and the space.
         """
         try:
             self.act(self.start(2), made_up(self.observation_space, 2))
@@ -90,7 +90,7 @@ class Foreign(Memoryless):
             raise
         except (Exception, SystemExit) as error:
             space = short(self.observation_space, 300)
-            raise SkillweaveError(
+            raise PolicyError(
                 f"{self._who} fails on observations of {space}: {told(error)}"
             ) from error
 
@@ -101,7 +101,7 @@ def fitted(
     """The policy, ready to act on the spaces of the environment named ``env``.
 
     Raises:
-        SkillweaveError: it does not fit; the message names ``who`` and both spaces.
+        PolicyError: it does not fit; the message names ``who`` and both spaces.
     """
     from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
 
@@ -112,7 +112,7 @@ def fitted(
         ("action_space", policy.action_space, action_space),
     ):
         if not same_space(mine, theirs):
-            raise SkillweaveError(
+            raise PolicyError(
                 f"{who}: its policy has {kind} {mine}, but the environment {env} has {theirs}"
             )
     if isinstance(policy, Foreign):
@@ -150,26 +150,26 @@ def as_recorded(
     """The policy as it was when ``recorded`` was its source; ``read`` gets the copy kept then.
 
     Raises:
-        SkillweaveError: it is of another kind, or another file that was only named; or the copy is
+        RunError: it is of another kind, or another file that was only named; or the copy is
             damaged, or fits no longer.
     """
     if recorded is None:  # written before sources were
         return policy
     now = source_of(policy)
     if now["kind"] != recorded["kind"]:
-        raise SkillweaveError(
+        raise RunError(
             f"{where} had a policy of kind {_described(recorded)}, but now it is {_described(now)}"
         )
     if recorded.get("sha256") in (None, now.get("sha256")):
         return policy
     content = read() if isinstance(policy, Foreign) else None
     if content is None or not isinstance(policy, Foreign):
-        raise SkillweaveError(
+        raise RunError(
             f"{where} had the policy {_described(recorded)}, but now it is {_described(now)}: "
             "another checksum. Put back what it was trained with, or train anew"
         )
     if checksum(content) != recorded.get("sha256"):
-        raise SkillweaveError(f"{where}: the copy of its policy is damaged: another checksum")
+        raise RunError(f"{where}: the copy of its policy is damaged: another checksum")
     return policy.restored(content)
 
 

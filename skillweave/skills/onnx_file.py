@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, PolicyError, RunError
 from skillweave.messages import shortened
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import Foreign, checksum
@@ -47,17 +47,17 @@ class OnnxPolicy(Foreign):
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or not inputs[0].shape or inputs[0].type not in NUMBERS:
             found = shortened(", ".join(f"{i.name} {i.type}{i.shape}" for i in inputs))
-            raise SkillweaveError(
+            raise PolicyError(
                 f"{file} takes {found or 'nothing'}; it must take one batch of observations"
             )
         names = [o.name for o in outputs]
         if output is not None and output not in names:
             has = shortened(", ".join(names))
-            raise SkillweaveError(f"{file} has no output {output!r}; it has: {has}")
+            raise PolicyError(f"{file} has no output {output!r}; it has: {has}")
         self._input, self.output = inputs[0], output or names[0]
         batch = self._input.shape[0]
         if isinstance(batch, int) and batch != 1:
-            raise SkillweaveError(
+            raise PolicyError(
                 f"{file} takes exactly {batch} observations at once; export it with a dynamic batch"
             )
 
@@ -73,7 +73,7 @@ class OnnxPolicy(Foreign):
         """A copy for these spaces.
 
         Raises:
-            SkillweaveError: its input has another shape; the message names both.
+            PolicyError: its input has another shape; the message names both.
         """
         bound = super().bind(observation_space, action_space, who)
         mine, theirs = self._input.shape[1:], bound.observation_space.shape or ()
@@ -82,7 +82,7 @@ class OnnxPolicy(Foreign):
         )
         if not fits:
             shape = f"({', '.join(map(str, mine))})"
-            raise SkillweaveError(
+            raise PolicyError(
                 f"{bound._who} takes observations of shape {shape}, but the environment has "
                 f"{observation_space}"
             )
@@ -152,7 +152,9 @@ def from_onnx(
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        SkillweaveError: there is no such file, or it is no model of one batch of observations.
+        RunError: there is no such file.
+        PolicyError: it is no model of one batch of observations.
+        MissingExtra: the extra 'onnx' is not installed.
     """
     try:
         import onnx
@@ -162,12 +164,12 @@ def from_onnx(
     try:
         model = onnx.load(str(path))
     except OSError as error:
-        raise SkillweaveError(f"could not read {path}: {error.strerror or error}") from error
+        raise RunError(f"could not read {path}: {error.strerror or error}") from error
     except Exception as error:  # protobuf's own errors have no common class
-        raise SkillweaveError(f"{path} is no ONNX model: {str(error)[:300]}") from error
+        raise PolicyError(f"{path} is no ONNX model: {str(error)[:300]}") from error
     for tensor in model.graph.initializer:
         if np.isnan(_numbers(tensor, path)).any():
-            raise SkillweaveError(f"{path}: its weights {tensor.name[:60]!r} hold NaN")
+            raise PolicyError(f"{path}: its weights {tensor.name[:60]!r} hold NaN")
     return OnnxPolicy(
         model.SerializeToString(deterministic=True),
         Path(path), output, observation_space, action_space,
@@ -181,7 +183,7 @@ def _numbers(tensor: Any, path: str | Path) -> Array:
     try:
         found = numpy_helper.to_array(tensor)
     except Exception as error:
-        raise SkillweaveError(
+        raise PolicyError(
             f"{path}: its weights {tensor.name[:60]!r} are damaged: {str(error)[:300]}"
         ) from error
     return found if np.issubdtype(found.dtype, np.floating) else np.zeros(0)
@@ -199,4 +201,4 @@ def _session(data: bytes, file: Path) -> Any:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own errors have no common class
         told = shortened(str(error))
-        raise SkillweaveError(f"{file} cannot be run by onnxruntime: {told}") from error
+        raise PolicyError(f"{file} cannot be run by onnxruntime: {told}") from error

@@ -10,7 +10,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from skillweave.arguments import meant
-from skillweave.errors import SkillweaveError
+from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.messages import short, told
 from skillweave.skills.info_words import keys_told, odd_key
 from skillweave.tracebacks import is_users
@@ -18,12 +18,25 @@ from skillweave.types import Array, Step
 
 
 def called(
-    function: Any, argument: Any, who: str, elapsed: Any = None, ids: Array | None = None
+    function: Any,
+    argument: Any,
+    who: str,
+    elapsed: Any = None,
+    ids: Array | None = None,
+    kind: type[SkillweaveError] = SkillError,
 ) -> Any:
-    """The result of a function of the user.
+    """Return the result of a function of the user.
+
+    Args:
+        function: takes one argument.
+        argument: a step, or observations.
+        who: names the function in messages.
+        elapsed: the step of the episode, if known.
+        ids: the environments that the rows stand for.
+        kind: of the error: a PolicyError where the function is a policy.
 
     Raises:
-        SkillweaveError: it raised; the message names ``who``, the line, and the step if known.
+        SkillError: it raised; the message names ``who``, the line, and the step if known.
     """
     try:
         return function(argument)
@@ -33,9 +46,7 @@ def called(
         about = getattr(argument, "shape", None)
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
-        raise SkillweaveError(
-            f"{who} raised {told(error)}{at_step(elapsed)}{given}{advice}"
-        ) from error
+        raise kind(f"{who} raised {told(error)}{at_step(elapsed)}{given}{advice}") from error
 
 
 def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:
@@ -77,13 +88,13 @@ def _not_entered(error: BaseException) -> bool:
 
 
 def blame(error: BaseException, who: str) -> NoReturn:
-    """Raise a SkillweaveError that names ``who`` where the user's code raised ``error``.
+    """Raise a PolicyError that names ``who`` where the user's code raised ``error``.
 
     Otherwise raise ``error`` itself: its traceback shows what is wrong in this library.
     """
     if isinstance(error, SkillweaveError) or not is_users(error):
         raise error
-    raise SkillweaveError(f"{who} raised {told(error)}") from error
+    raise PolicyError(f"{who} raised {told(error)}") from error
 
 
 def at_step(elapsed: Any) -> str:
@@ -91,45 +102,46 @@ def at_step(elapsed: Any) -> str:
     return "" if elapsed is None else f" at step {np.max(elapsed)}"
 
 
-def as_array(value: Any, who: str) -> Array:
-    """``value`` as an array.
+def as_array(value: Any, who: str, kind: type[SkillweaveError] = SkillError) -> Array:
+    """Return ``value`` as an array.
 
     Raises:
-        SkillweaveError: it cannot be converted; the message names ``who``.
+        SkillError: it cannot be converted; the message names ``who``. It is of another ``kind``
+            where that is given.
     """
     try:
         return np.asarray(value)
     except Exception as error:
-        raise SkillweaveError(
-            f"{who} returned {short(value)}, which is no array: {told(error)}"
-        ) from error
+        raise kind(f"{who} returned {short(value)}, which is no array: {told(error)}") from error
 
 
-def checked_actions(value: Any, n: int, space: Space[Any], who: str) -> Array:
+def checked_actions(
+    value: Any, n: int, space: Space[Any], who: str, kind: type[SkillweaveError] = PolicyError
+) -> Array:
     """``value`` as actions (n, *shape) of ``space``; those of a Box are clipped to its bounds.
 
     Raises:
-        SkillweaveError: the shape or the type of number is wrong, or there is no such action;
-            the message names ``who`` and the space.
+        PolicyError: the shape or the type of number is wrong, or there is no such action; the
+            message names ``who`` and the space. It is of another ``kind`` where that is given.
     """
-    action, shape = as_array(value, who), (n, *(space.shape or ()))
+    action, shape = as_array(value, who, kind), (n, *(space.shape or ()))
     if action.shape != shape:
-        raise SkillweaveError(
+        raise kind(
             f"{who} returned shape {action.shape}, but {shape} was expected: one action of {space} "
             f"for each of the {n} environments"
         )
     real = np.issubdtype(space.dtype, np.floating)
     if action.dtype.kind not in ("iubf" if real else "iub"):
         wanted = "numbers" if real else "whole numbers"
-        raise SkillweaveError(f"{who} returned {action.dtype}, but actions of {space} are {wanted}")
+        raise kind(f"{who} returned {action.dtype}, but actions of {space} are {wanted}")
     if isinstance(space, Box):
         if not np.isfinite(action).all():
-            raise SkillweaveError(f"{who} returned a NaN or an infinity as an action of {space}")
+            raise kind(f"{who} returned a NaN or an infinity as an action of {space}")
         return action.clip(space.low, space.high).astype(space.dtype, copy=False)
     bounds = _bounds(space)
     if bounds is not None and ((action < bounds[0]) | (action >= bounds[1])).any():
         wrong = action[(action < bounds[0]) | (action >= bounds[1])][0]
-        raise SkillweaveError(f"{who} returned {wrong}, which is no action of {space}")
+        raise kind(f"{who} returned {wrong}, which is no action of {space}")
     return action.astype(space.dtype, copy=False)
 
 
@@ -155,12 +167,12 @@ def decoded(
         return checked_actions(output.reshape(n, *shape) if flat else output, n, space, who)
     width = _width(space)
     if output.shape != (n, width):
-        raise SkillweaveError(
+        raise PolicyError(
             f"{who} returned shape {output.shape}, but {(n, width)} was expected: logits for the "
             f"actions of {space}"
         )
     if np.isnan(output).any():
-        raise SkillweaveError(f"{who} returned NaN as a logit")
+        raise PolicyError(f"{who} returned NaN as a logit")
     rng = rng or np.random.default_rng()
     if isinstance(space, MultiBinary):
         noise = 0.0 if deterministic else rng.logistic(size=output.shape)
@@ -189,7 +201,7 @@ def _width(space: Space[Any]) -> int:
         return int(np.prod(space.shape))
     if isinstance(space, Discrete | MultiDiscrete):
         return sum(_choices(space))
-    raise SkillweaveError(f"a network's output cannot be read as actions of {space}")
+    raise PolicyError(f"a network's output cannot be read as actions of {space}")
 
 
 def _bounds(space: Space[Any]) -> tuple[Any, Any] | None:

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillError, SkillweaveError
 from skillweave.messages import told
 from skillweave.types import Array, Step, read_only
 
@@ -70,6 +70,7 @@ def probe(
     n: int,
     who: str,
     shape: tuple[int, ...] = (),
+    kind: type[SkillweaveError] = SkillError,
 ) -> None:
     """Call a function, if it is its first time, for other numbers of environments than n.
 
@@ -79,9 +80,10 @@ def probe(
         n: environments.
         who: what messages call the function.
         shape: of its answer for one environment.
+        kind: of the error: a PolicyError where the function is a policy.
 
     Raises:
-        SkillweaveError: its answer does not have a row for each environment; the message names it.
+        SkillError: its answer does not have a row for each environment; the message names it.
     """
     owner = getattr(function, "__self__", function)
     if not n or not _seen.first_time(owner, getattr(function, "__name__", "")):
@@ -98,13 +100,13 @@ def probe(
             except (Exception, SystemExit) as error:
                 if not certain:
                     return
-                raise SkillweaveError(
+                raise kind(
                     f"{who} answers for {n} environments, but for {m} it raised {told(error)}: "
                     f"{AXIS}"
                 ) from error
             found, wanted = np.shape(answer), (m, *shape)
             if found != wanted and certain:
-                raise SkillweaveError(
+                raise kind(
                     f"{who} returned shape {found} for {m} environments, but {wanted} was "
                     f"expected; for {n} its shape was right by chance: {AXIS}"
                 )

@@ -7,7 +7,7 @@ import sys
 from types import MethodType
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.skills.base import Skill
 from skillweave.skills.scripted import from_function
@@ -19,14 +19,14 @@ def ready_policy(skill: Skill) -> Policy | None:
     """A skill's ready policy, functions and modules made into policies; None: it is trained.
 
     Raises:
-        SkillweaveError: the attribute ``policy`` is nothing that can act.
+        DeclarationError: the attribute ``policy`` is nothing that can act.
     """
     value: Any = skill.policy
     if value is None:
         return None
     where = f"skill {skill.name!r}: policy is"
     if isinstance(value, type):
-        raise SkillweaveError(f"{where} the class {value.__name__}, not a policy")
+        raise DeclarationError(f"{where} the class {value.__name__}, not a policy")
     if hasattr(value, "act") and hasattr(value, "start"):
         policy: Policy = value
         return policy
@@ -40,7 +40,7 @@ def ready_policy(skill: Skill) -> Policy | None:
         value = value.__func__
     if callable(value):
         return from_function(value)
-    raise SkillweaveError(
+    raise DeclarationError(
         f"{where} {short(value)}, which cannot act; give a function of observations, a torch "
         "module, from_sb3(...), from_onnx(...), or a policy"
     )

@@ -12,7 +12,7 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 
 from skillweave.arguments import checked_names
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import short, shortened
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import Foreign, checksum
@@ -111,17 +111,19 @@ def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = F
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        SkillweaveError: the zip is not trusted, is not there, or holds no such model.
+        PolicyError: the zip is not trusted, or holds no such model.
+        RunError: the zip is not there.
+        DeclarationError: ``model`` or ``algorithm`` is something else.
     """
     if not isinstance(model, str | Path):
         if not (hasattr(model, "policy") and hasattr(model, "observation_space")):
-            raise SkillweaveError(
+            raise DeclarationError(
                 f"{short(model)} is neither a Stable-Baselines3 model nor the path of one"
             )
         return SB3Policy(model)
     file = Path(model)
     if trust is not True:
-        raise SkillweaveError(
+        raise PolicyError(
             f"{file} was not opened: a Stable-Baselines3 zip holds pickles, which can run any code "
             "on your machine. If you trust whoever made it: "
             f"from_sb3({str(file)!r}, {algorithm!r}, trust=True)"
@@ -133,7 +135,7 @@ def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = F
     try:
         loaded = kind.load(io.BytesIO(content), device="cpu", **less)
     except Exception as error:
-        raise SkillweaveError(
+        raise PolicyError(
             f"{file} could not be opened as Stable-Baselines3's {kind.__name__}: "
             f"{type(error).__name__}: {shortened(str(error))}"
         ) from error
@@ -149,7 +151,7 @@ def _algorithm(algorithm: str | type | None, file: Path) -> Any:
         return algorithm
     if isinstance(algorithm, str) and algorithm.lower() in ALGORITHMS:
         return getattr(stable_baselines3, algorithm.upper())
-    raise SkillweaveError(
+    raise DeclarationError(
         f"{file}: algorithm is {algorithm!r}; say which one saved it, as its class or one of "
         f"{', '.join(ALGORITHMS)}"
     )

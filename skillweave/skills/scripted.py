@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
 from skillweave.skills.foreign_policy import Foreign, qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
@@ -41,12 +41,12 @@ class ScriptedPolicy(Foreign):
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """The function's actions, checked where the action space is known."""
-        action = called(self.function, read_only(obs), self._who)
+        action = called(self.function, read_only(obs), self._who, kind=PolicyError)
         if self.action_space is None:
-            return as_array(action, self._who), memory
+            return as_array(action, self._who, PolicyError), memory
         n, shape = len(obs), self.action_space.shape or ()
         actions = checked_actions(action, n, self.action_space, self._who)
-        probe(self.function, obs, n, self._who, shape)
+        probe(self.function, obs, n, self._who, shape, PolicyError)
         return actions, memory
 
     def source(self) -> dict[str, Any]:
@@ -77,10 +77,10 @@ def from_function(
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        SkillweaveError: it is no function of observations.
+        DeclarationError: it is no function of observations.
     """
     if not callable(function):
-        raise SkillweaveError(
+        raise DeclarationError(
             f"from_function takes a function of observations, not {short(function)}"
         )
     return ScriptedPolicy(function, observation_space, action_space)

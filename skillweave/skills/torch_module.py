@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign, checksum, qualified
 from skillweave.skills.outputs import decoded
@@ -58,7 +58,7 @@ class TorchPolicy(Foreign):
         with torch.inference_mode():
             output = self.module(_tensors(unpack(self.observation_space, obs), device, dtype))
         if not isinstance(output, torch.Tensor):
-            raise SkillweaveError(
+            raise PolicyError(
                 f"{self._who} returned a {type(output).__name__}; forward must return one tensor"
             )
         output = output.float() if output.is_floating_point() else output
@@ -105,10 +105,10 @@ def from_torch(
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        SkillweaveError: it is no module made of its class.
+        DeclarationError: it is no module made of its class.
     """
     if isinstance(module, type) or not hasattr(module, "state_dict"):
-        raise SkillweaveError(f"from_torch takes a module made of its class, not {short(module)}")
+        raise DeclarationError(f"from_torch takes a module made of its class, not {short(module)}")
     return TorchPolicy(module, observation_space, action_space)
 
 
@@ -126,7 +126,7 @@ def weights_of(module: nn.Module, who: str) -> bytes:
     """The state of a module as a safetensors file.
 
     Raises:
-        SkillweaveError: it has state that is not a tensor.
+        PolicyError: it has state that is not a tensor.
     """
     import safetensors.torch
     from torch import Tensor
@@ -134,9 +134,7 @@ def weights_of(module: nn.Module, who: str) -> bytes:
     state = module.state_dict()
     for name, value in state.items():
         if not isinstance(value, Tensor):
-            raise SkillweaveError(
-                f"{who}: its state {name!r} is a {type(value).__name__}, no tensor"
-            )
+            raise PolicyError(f"{who}: its state {name!r} is a {type(value).__name__}, no tensor")
     # Clones: modules may share tensors, which the format does not know.
     return safetensors.torch.save({k: v.detach().cpu().clone() for k, v in state.items()})
 
@@ -145,7 +143,7 @@ def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
     """A copy of a module with the weights of ``weights_of``.
 
     Raises:
-        SkillweaveError: they have other names or shapes.
+        RunError: they have other names or shapes.
     """
     import safetensors
     import safetensors.torch
@@ -158,5 +156,5 @@ def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
         found.load_state_dict(weights)
     except (RuntimeError, safetensors.SafetensorError) as error:
         told = shortened(str(error))
-        raise SkillweaveError(f"{who}: the weights in the run do not fit it: {told}") from error
+        raise RunError(f"{who}: the weights in the run do not fit it: {told}") from error
     return found

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.spaces.packing import parts
 
@@ -19,10 +19,10 @@ _LONGEST = 30
 """Numbers that a message lists one by one."""
 
 
-def unsupported_action(space: gym.Space[Any]) -> SkillweaveError:
+def unsupported_action(space: gym.Space[Any]) -> EnvError:
     """Return the error for an action space that is not supported; it shows a wrapper."""
     shown = " ".join(short(space, 200).split())
-    return SkillweaveError(
+    return EnvError(
         f"action space {shown} is not supported; supported are: {ACTIONS}. {_way(space)}"
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.spaces.action_advice import unsupported_action
 from skillweave.spaces.packing import check_size
 from skillweave.types import Array
@@ -97,14 +97,14 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
     """The codec of an action space.
 
     Raises:
-        SkillweaveError: the space is not supported; the message says which are.
+        EnvError: the space is not supported; the message says which are.
     """
     kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary | gym.spaces.Box
     if not isinstance(space, kinds):
         raise unsupported_action(space)
     check_size(space, "action", _width(space))
     if not _width(space):
-        raise SkillweaveError(f"action space {space} holds nothing to choose")
+        raise EnvError(f"action space {space} holds nothing to choose")
     if isinstance(space, gym.spaces.Discrete):
         return ActionCodec(space, (int(space.n),), _first(space.start))
     if isinstance(space, gym.spaces.MultiDiscrete):

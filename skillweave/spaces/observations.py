@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.spaces.packing import LARGEST, check_size, obs_dtype, obs_shape, parts
 from skillweave.types import Array
 
@@ -265,7 +265,7 @@ def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = N
             shape says it, of all images. None: the shapes alone count.
 
     Raises:
-        SkillweaveError: the space is not supported; the message says which are.
+        EnvError: the space is not supported; the message says which are.
     """
     dtype = obs_dtype(space)
     leaves = tuple(_leaves(space, dtype, None))
@@ -277,7 +277,7 @@ def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = N
     vectors = [leaf for leaf in leaves if leaf.image is None]
     layouts = [leaf.image for leaf in leaves if leaf.image is not None]
     if not any(leaf.size for leaf in leaves):
-        raise SkillweaveError(f"the observation space {space} holds no number: nothing can be seen")
+        raise EnvError(f"the observation space {space} holds no number: nothing can be seen")
     check_size(space, "observation", sum(leaf.size for leaf in vectors))
     pixels = sum(leaf.size for leaf in leaves) - sum(leaf.size for leaf in vectors)
     check_size(space, "observation", pixels, 16 * LARGEST)

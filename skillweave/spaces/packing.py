@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.types import Array
 
@@ -24,14 +24,14 @@ LARGEST = 1_000_000
 
 
 def check_size(space: gym.Space[Any], what: str, numbers: int, largest: int = LARGEST) -> None:
-    """Raise a SkillweaveError where a network would need absurdly many numbers for a space.
+    """Raise an EnvError where a network would need absurdly many numbers for a space.
 
     The first layer alone has a weight for each number and each unit, and the optimiser keeps two
     more numbers for each weight.
     """
     if numbers > largest:
         gigabytes = numbers * 64 * 4 * 3 / 1e9
-        raise SkillweaveError(
+        raise EnvError(
             f"{what} space {short(space)} is {numbers:,} numbers to a network, choices one-hot; at "
             f"most {largest:,} are supported: 64 units that take them all in would need "
             f"{gigabytes:,.1f} GB. Wrap the environment so that it says the same in fewer numbers"
@@ -42,7 +42,7 @@ def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
     """The named parts of a Dict or Tuple, in order; None for any other space.
 
     Raises:
-        SkillweaveError: there are none, or their names are not text.
+        EnvError: there are none, or their names are not text.
     """
     if isinstance(space, gym.spaces.Dict):
         found = dict(space.spaces)
@@ -51,7 +51,7 @@ def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
     else:
         return None
     if not found or not all(isinstance(name, str) and name for name in found):
-        raise SkillweaveError(f"space {space} needs at least one part, each with text as its name")
+        raise EnvError(f"space {space} needs at least one part, each with text as its name")
     return found
 
 
@@ -64,7 +64,7 @@ def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
     """The dtype of observations; a structured one for Dict and Tuple.
 
     Raises:
-        SkillweaveError: the space is not supported; the message says which are, and what to do.
+        EnvError: the space is not supported; the message says which are, and what to do.
     """
     return _dtype(space, space, ())
 
@@ -88,11 +88,9 @@ def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...])
                     if place
                     else f"convert it: EnvSpec(env, wrappers=({wrapper},))"
                 )
-                raise SkillweaveError(
-                    f"{what} is of {dtype}, which PyTorch does not have; {advice}"
-                )
+                raise EnvError(f"{what} is of {dtype}, which PyTorch does not have; {advice}")
             return dtype
-        raise SkillweaveError(_unsupported(space, whole, place))
+        raise EnvError(_unsupported(space, whole, place))
     fields = [
         (name, _dtype(part, whole, (*place, name)), obs_shape(part)) for name, part in inner.items()
     ]
@@ -126,7 +124,7 @@ def _unsupported(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str,
 def _is_supported(space: gym.Space[Any]) -> bool:
     try:
         obs_dtype(space)
-    except SkillweaveError:
+    except EnvError:
         return False
     return True
 

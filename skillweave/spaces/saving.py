@@ -8,7 +8,7 @@ from typing import Annotated, Any, NotRequired, TypedDict
 import gymnasium as gym
 import numpy as np
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError, RunError
 from skillweave.reading import fit, shown
 from skillweave.settings import LARGEST, AtLeastOne, Check
 from skillweave.spaces.observations import image_layout
@@ -76,7 +76,7 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
     """A supported space as plain JSON; infinities become strings, equal bounds one number.
 
     Raises:
-        SkillweaveError: the space is not supported; the message says which are.
+        EnvError: the space is not supported; the message says which are.
     """
     match space:
         case gym.spaces.Dict():
@@ -101,18 +101,18 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
         case gym.spaces.MultiBinary():
             n = space.n if isinstance(space.n, int) else list(space.shape)
             return {"type": "MultiBinary", "n": n}
-    raise SkillweaveError(f"space {space} is not supported; supported are: {OBSERVATIONS}")
+    raise EnvError(f"space {space} is not supported; supported are: {OBSERVATIONS}")
 
 
 def space_from_json(data: Any) -> gym.Space[Any]:
     """The inverse of ``space_to_json``.
 
     Raises:
-        SkillweaveError: the JSON does not describe a supported space.
+        RunError: the JSON does not describe a supported space.
     """
     kind = data.get("type") if isinstance(data, dict) else None
     if not isinstance(kind, str) or kind not in _SCHEMAS:
-        raise SkillweaveError(
+        raise RunError(
             f"{shown(data)} is no space, or one of a type that is not supported; supported are: "
             f"{OBSERVATIONS}"
         )
@@ -121,7 +121,7 @@ def space_from_json(data: Any) -> gym.Space[Any]:
         return _made(data)
     # Gymnasium's own checks of values are assertions, partly.
     except (TypeError, ValueError, ArithmeticError, AssertionError, AttributeError) as error:
-        raise SkillweaveError(f"not a space: {shown(data)} ({str(error)[:300]})") from error
+        raise RunError(f"not a space: {shown(data)} ({str(error)[:300]})") from error
 
 
 def _made(data: dict[str, Any]) -> gym.Space[Any]:

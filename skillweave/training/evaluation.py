@@ -219,7 +219,8 @@ def evaluate(
 
     Raises:
         PolicyError: the policy was made for other spaces.
-        DeclarationError: there is no such engine, or no pool.
+        DeclarationError: there is no such engine.
+        EnvError: the environment cannot be made, or there is no pool of it.
     """
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)

@@ -235,7 +235,7 @@ class StageLog:
         for tensors in ({**extra, **spare}, extra) if spare and small else (extra,):
             try:
                 write(state, header, tensors)
-            except SkillweaveError as error:
+            except RunError as error:
                 problem = error
             else:
                 self._has_final = spent
@@ -296,7 +296,7 @@ class StageLog:
         name = self.entry["name"]
         try:
             self.run.save_policies(name, policies)
-        except SkillweaveError:
+        except RunError:
             if not self.run.make_room():
                 raise
             self.run.save_policies(name, policies)

@@ -36,6 +36,7 @@ from skillweave import (
     Network,
     Reflex,
     Run,
+    RunError,
     SkillweaveError,
 )
 from skillweave.cli.main import main
@@ -360,7 +361,7 @@ def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
 
     def full(target: Path, data: bytes, **how: Any) -> None:
         if "checkpoint" in target.name and len(data) > allowed:
-            raise SkillweaveError(f"could not write {target}: No space left on device")
+            raise RunError(f"could not write {target}: No space left on device")
         write(target, data, **how)
 
     with monkeypatch.context() as patched:
@@ -384,7 +385,7 @@ def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(
     def full(target: Path, data: bytes, **how: Any) -> None:
         if target.name == "selector.safetensors" and (path / "final/left.safetensors").exists():
             failed.append(1)
-            raise SkillweaveError(f"could not write {target}: No space left on device")
+            raise RunError(f"could not write {target}: No space left on device")
         write(target, data, **how)
 
     with monkeypatch.context() as patched:

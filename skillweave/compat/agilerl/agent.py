@@ -12,7 +12,7 @@ import torch
 from skillweave.compat.agilerl_files import network_of, observations_of
 from skillweave.compat.batches import returns_of
 from skillweave.compat.single_agent import SingleAgent
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.stacks import Member
 
 MLP: dict[str, Any] = {"arch": "mlp", "hidden_size": [64, 64]}
@@ -61,7 +61,7 @@ class Agent:
         """Begin with fresh weights; ``given`` are the constructor's arguments."""
         for name, value in given.items():
             if (name == "accelerator" or "_network" in name) and value is not None:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{self.algo}({name}=...) is not supported; for networks beyond net_config "
                     "see register_encoder of the native API"
                 )
@@ -116,13 +116,13 @@ class Agent:
         """Become the agent of a checkpoint, or of any file with a native agent of this kind.
 
         Raises:
-            SkillweaveError: the file is missing, a pickle of AgileRL's, or another algorithm's.
+            RunError: the file is missing, a pickle of AgileRL's, or another algorithm's.
         """
         native, past = SingleAgent.load(path, random_seed())
         algo = past.pop("algo", self.algo)
         if not isinstance(native.member.config, self.kind) or algo != self.algo:
             kind = type(native.member.config).__name__
-            raise SkillweaveError(f"{path} holds an agent of {kind} ({algo}), not of {self.algo}")
+            raise RunError(f"{path} holds an agent of {kind} ({algo}), not of {self.algo}")
         self._wrap(native)
         self.__dict__.update(past)
 

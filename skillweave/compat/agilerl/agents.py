@@ -7,7 +7,7 @@ import numpy as np
 
 from skillweave.algorithms import config
 from skillweave.compat.agilerl.agent import MLP, Agent, Setting
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.types import Array
 
 
@@ -38,7 +38,7 @@ class PPO(Agent):
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
         """Sampled actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
         if action is not None or grad:
-            raise SkillweaveError("getAction(action=, grad=) is a part of learning: use learn()")
+            raise DeclarationError("getAction(action=, grad=) is a part of learning: use learn()")
         return self.native.sample(state)
 
     def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> float:

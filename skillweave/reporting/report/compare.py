@@ -36,7 +36,8 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
         ``path``, ``bytes``, ``seconds``, and ``missing``: sentences on what is not in it.
 
     Raises:
-        SkillweaveError: a run is damaged, or given twice, or the file cannot be written.
+        DeclarationError: a run is given twice.
+        RunError: a run is damaged, or the file cannot be written.
         MissingExtra: the extra 'report' is not installed.
     """
     began = time.perf_counter()

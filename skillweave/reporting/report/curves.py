@@ -36,7 +36,7 @@ def read_curves(run: RunDirectory) -> list[Curves]:
     """The curves of every agent, in the order of the schedule; stages without metrics have none.
 
     Raises:
-        SkillweaveError: the file is damaged.
+        RunError: the file is damaged.
     """
     found: dict[tuple[str, str], Curves] = {}
     stages = {entry["name"]: entry for entry in run.manifest["stages"]}

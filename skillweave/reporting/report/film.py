@@ -12,7 +12,7 @@ import numpy as np
 
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import frame_of
@@ -50,7 +50,7 @@ def make_film(
         quiet: no progress.
 
     Raises:
-        SkillweaveError: the environment gives no frames, or does not repeat itself.
+        EnvError: the environment gives no frames, or does not repeat itself.
         MissingExtra: the extra 'video' is not installed.
     """
     env = spec.make(render_mode="rgb_array")
@@ -91,7 +91,7 @@ def _replay(
         progress.count(1, i + 1 == len(episode.actions))
         over = bool(raw.terminated[0] | raw.truncated[0])
         if float(raw.reward[0]) != reward or (over and i + 1 < len(episode.actions)):
-            raise SkillweaveError(
+            raise EnvError(
                 f"from seed {episode.seed} and with the same actions, the environment did another "
                 f"thing in step {i + 1}: it does not repeat itself"
             )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.reporting.report import facts
 from skillweave.runs.directory import RunDirectory
 
@@ -28,10 +28,10 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
     """The groups, in the order of their first runs.
 
     Raises:
-        SkillweaveError: no runs, or two that have the same seed and the same settings.
+        DeclarationError: no runs, or two that have the same seed and the same settings.
     """
     if not runs:
-        raise SkillweaveError("no runs were given; name at least one run's directory")
+        raise DeclarationError("no runs were given; name at least one run's directory")
     found: dict[str, Group] = {}
     for run in runs:
         own = facts.settings(run.manifest)
@@ -39,7 +39,7 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
         group = found.setdefault(key, Group(_letter(len(found)), _base(run), [], own))
         for other in group.runs:
             if other.manifest["seed"] == run.manifest["seed"]:
-                raise SkillweaveError(
+                raise DeclarationError(
                     f"{other.path} and {run.path} have the same settings and the same seed, "
                     f"{run.manifest['seed']}; name one of them"
                 )

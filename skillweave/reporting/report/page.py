@@ -30,7 +30,7 @@ def write_page(
         ``path`` and ``bytes``.
 
     Raises:
-        SkillweaveError: it cannot be written.
+        RunError: it cannot be written.
         MissingExtra: the extra 'report' is not installed.
     """
     jinja2 = need("jinja2")

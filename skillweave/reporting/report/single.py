@@ -150,7 +150,7 @@ def write_report(
         ``missing``: sentences on what is not in it.
 
     Raises:
-        SkillweaveError: the run is damaged, or the file cannot be written.
+        RunError: the run is damaged, or the file cannot be written.
         MissingExtra: the extra 'report' is not installed.
     """
     began = time.perf_counter()

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.compat.agilerl.agent import random_seed
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.evolution.config import KINDS, Range
 from skillweave.evolution.config import Mutations as Native
 
@@ -32,7 +32,7 @@ class Mutations:
             "learn_step": ("update_ratio", Range(1 / max_learn_step, 1 / min_learn_step)),
         }
         if unknown := set(rl_hp_selection or ()) - set(known):
-            raise SkillweaveError(f"rl_hp_selection has {unknown}; there are: {', '.join(known)}")
+            raise DeclarationError(f"rl_hp_selection has {unknown}; there are: {', '.join(known)}")
         self._ranges = dict(known[k] for k in rl_hp_selection or ())
         self._kinds = np.array([no_mutation, rl_hp, parameters, architecture, activation], float)
         self._how: Any = {"strength": mutation_sd, "layer_share": new_layer_prob}

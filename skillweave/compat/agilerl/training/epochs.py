@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave.compat.agilerl.agent import swapped
 from skillweave.compat.wandb_runs import start_wandb
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 
 Result = tuple[list[Any], list[list[float]]]
 
@@ -23,12 +23,12 @@ class Epochs(SimpleNamespace):
     def run(self, episode: Callable[[Any, int], Any]) -> Result:
         """Train; ``episode`` plays one episode of an agent, lets it learn and returns the loss."""
         if self.accelerator is not None or not self.pop:
-            raise SkillweaveError("pop must have an agent, and accelerator be None")
+            raise DeclarationError("pop must have an agent, and accelerator be None")
         if not hasattr(self.env, "num_envs"):
             one = self.env
             self.env = SyncVectorEnv([lambda: one], autoreset_mode=AutoresetMode.SAME_STEP)
         if self.env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
-            raise SkillweaveError("env must reset in the same step: make it with makeVectEnvs")
+            raise DeclarationError("env must reset in the same step: make it with makeVectEnvs")
         name, found = f"{self.env_name}-EvoHPO-{self.algo}", []
         settings, key = {**(self.INIT_HP or {}), **(self.MUT_P or {})}, self.wandb_api_key
         self.tracked = start_wandb("AgileRL", name, settings, key) if self.wb else None

@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from skillweave.compat.agilerl.agents import DDPG, DQN, PPO, TD3, RainbowDQN
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 
 _KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDPG, TD3)}
 
@@ -35,17 +35,17 @@ def initialPopulation(
     """Fresh agents of one kind; settings by their names in capitals from ``INIT_HP``.
 
     Raises:
-        SkillweaveError: no such algorithm, or a setting without a default is missing.
+        DeclarationError: no such algorithm, or a setting without a default is missing.
     """
     given = locals() | {"critic_networks": critic_network}
     if algo not in _KINDS:
-        raise SkillweaveError(f"no algorithm {algo!r} here; there are: {', '.join(_KINDS)}")
+        raise DeclarationError(f"no algorithm {algo!r} here; there are: {', '.join(_KINDS)}")
     known = inspect.signature(_KINDS[algo]).parameters
     settings = {k: INIT_HP[k.upper()] for k in known if k.upper() in INIT_HP}
     settings |= {k: v for k, v in given.items() if k in known}
     missing = [k.upper() for k, p in known.items() if p.default is p.empty and k not in settings]
     if missing:
-        raise SkillweaveError(f"INIT_HP has no {', '.join(missing)}, which {algo} needs")
+        raise DeclarationError(f"INIT_HP has no {', '.join(missing)}, which {algo} needs")
     return [_KINDS[algo](**settings | {"index": i}) for i in range(population_size)]
 
 
