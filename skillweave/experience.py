@@ -30,6 +30,8 @@ class Column:
     """The last axis is as long as the longest row needs; zeros follow shorter ones."""
     rollout: bool = True
     """``Rollout`` has it."""
+    raw: bool = False
+    """It says what happened, whoever learns from it; recorded only where a learner asks for it."""
 
 
 SCHEMA: dict[str, Column] = {
@@ -52,8 +54,21 @@ SCHEMA: dict[str, Column] = {
     "guide": Column(),  # (T, N, A) float32, logits of a ready selector's choice
     "overridden": Column(),  # (T, N) bool, a reflex acted instead of ``action``
     "call_start": Column(),  # (T, N) bool, a call starts here; for critics of skills
+    # What a skill's reward, termination and success are judged by again, later:
+    "env_reward": Column(raw=True),  # (T, N) float32, the environment's own
+    "env_action": Column(raw=True, rollout=False),  # (T, N, …), in the environment's units
+    "env_terminated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own end
+    "env_truncated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own limit
+    "call_elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the call so far
 }
 """All columns, by name. A row is a step of an environment, or a decision with its whole call."""
+INFO = "info."
+"""The names of columns of ``info`` begin so, ``info.key``; they are recorded as raw columns are."""
+
+
+def column(name: str) -> Column:
+    """Return a column of ``SCHEMA``, or that of a key of ``info``."""
+    return Column(raw=True, rollout=False) if name.startswith(INFO) else SCHEMA[name]
 
 
 class Batch(Mapping[str, Array]):
@@ -68,7 +83,7 @@ class Batch(Mapping[str, Array]):
 
     def __init__(self, **columns: Array | None) -> None:
         """Take the columns that are not None."""
-        unknown = columns.keys() - SCHEMA.keys()
+        unknown = [name for name in columns.keys() - SCHEMA.keys() if not name.startswith(INFO)]
         assert not unknown, f"no column of SCHEMA: {unknown}"
         self._columns = {name: x for name, x in columns.items() if x is not None}
 
@@ -105,7 +120,7 @@ class Batch(Mapping[str, Array]):
 
     def rows(self, part: slice) -> Batch:
         """Return some of the T rows."""
-        whole = {k: v if SCHEMA[k].per_env else v[part] for k, v in self.items()}
+        whole = {k: v if column(k).per_env else v[part] for k, v in self.items()}
         return Batch(**whole)
 
 
@@ -125,7 +140,7 @@ def _as_high(batch: Batch, height: int) -> Batch:
     if rows == height:
         return batch
     valid = np.concatenate([batch.valid_rows, np.zeros((height - rows, envs), bool)])
-    whole = {k: v if SCHEMA[k].per_env else _padded(v, height - rows) for k, v in batch.items()}
+    whole = {k: v if column(k).per_env else _padded(v, height - rows) for k, v in batch.items()}
     return Batch(**(whole | {"valid": valid}))
 
 
@@ -134,10 +149,11 @@ def _padded(x: Array, more: int) -> Array:
 
 
 def _joined(parts: list[Array | None], members: int, name: str) -> Array:
-    column, axis = SCHEMA[name], 0 if SCHEMA[name].per_env else 1
+    about = column(name)
+    axis = 0 if about.per_env else 1
     example = next(part for part in parts if part is not None)
-    known = [np.full_like(example, column.fill) if p is None else p for p in parts]
-    if column.ragged:
+    known = [np.full_like(example, about.fill) if p is None else p for p in parts]
+    if about.ragged:
         known = padded_last_axis(known)
     split = [x.reshape(*x.shape[:axis], members, -1, *x.shape[axis + 1 :]) for x in known]
     whole = np.concatenate(split, axis + 1)
@@ -181,6 +197,7 @@ class Rollout:
     guide: Tensor | None = None  # (P, T, B, A), logits of a ready selector's choice
     overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted instead; None: nowhere
     call_start: Tensor | None = None  # (P, T, B) bool, a call starts here; for critics of skills
+    env_reward: Tensor | None = None  # (P, T, B), the environment's own, where it was asked for
     reference: Reference | None = None  # the policy to stay near
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
@@ -216,6 +233,8 @@ class Sample:
     between_mask: Tensor | None = None  # (P, B, n − 1, A) bool, allowed actions; None: all
     between_discount: Tensor | None = None
     """(P, B, n − 1), the factor of a reward there: γ^Στ, or 0 where the rows ended before."""
+    env_reward: Tensor | None = None
+    """(P, B) the environment's own in the first row, where it was asked for."""
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
     def split(self, batch: int) -> Iterator[Sample]:

@@ -145,6 +145,8 @@ class Algorithm:
     """The kinds of action spaces that it can act in."""
     state_type: ClassVar[Any] = AgentState
     """The dataclass of tensors that it learns."""
+    raw: ClassVar[tuple[str, ...]] = ()
+    """Raw columns of experience that it learns from, too: "env_reward", the environment's own."""
     member_hyperparameters: ClassVar[tuple[str, ...]] = ("learning_rate", "gamma")
     """Fields of the config that each member has its own value of, and the state a tensor (P,)."""
     follows_schedules: ClassVar[bool] = False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -33,6 +35,7 @@ class Columns:
         mask_size: number of discrete actions.
         each: bytes that every transition takes elsewhere.
         keep_rewards: of calls, keep the reward of every step, so that any γ can be applied.
+        raw: names of raw columns of ``SCHEMA`` that are kept, too, as they come.
 
     Raises:
         TrainingError: it is larger than the free memory.
@@ -50,6 +53,7 @@ class Columns:
         mask_size: int | None,
         each: int,
         keep_rewards: bool,
+        raw: Sequence[str] = (),
     ) -> None:
         if capacity < num_envs:
             raise DeclarationError(
@@ -76,7 +80,7 @@ class Columns:
         self._column = np.arange(num_envs)
         self._open = np.zeros(num_envs, bool)  # the trajectory goes on there
         self._space, self._mask_size = observation_space, mask_size or 0
-        self._keeps_rewards = keep_rewards
+        self._keeps_rewards, self.raw = keep_rewards, tuple(raw)
         # The rewards of calls one after another; "call" says where those of a slot begin.
         self._rewards, self._rewards_used = np.zeros(64 * keep_rewards, np.float32), 0
 
@@ -154,6 +158,10 @@ class Columns:
             self.data.pop(name, None)
             if name in state:
                 self._start(name)
+        for name in self.raw:
+            self.data.pop(name, None)
+            if name in state:
+                self._start_raw(name, state[name].numpy())
         self._rewards_used = len(state["rewards"]) if "rewards" in state else 0
         self._rewards = np.zeros(max(self._rewards_used, len(self._rewards)), np.float32)
         copy_into({"newest": self.newest}, state)
@@ -193,6 +201,10 @@ class Columns:
             data["kind"][slot] = NOTHING  # what is overwritten needs its rewards no more
             each = rows["rewards"] if "rewards" in rows else rows["reward"][..., None]
             self._keep_rewards(slot, flat(each), flat(rows["steps"]))
+        for name in (name for name in self.raw if name in rows):
+            if name not in data:
+                self._start_raw(name, flat(rows[name]))
+            data[name][slot] = flat(rows[name])
         if "mask" in data:
             for where, x in (after, next_mask), (slot, mask):
                 data["mask"][where] = 255 if x is None else np.packbits(flat(x), axis=-1)
@@ -230,6 +242,16 @@ class Columns:
             self.data[name], self._rewards_used = np.zeros(self.slots, np.int64), 0
             kept = self.data["kind"].nonzero()[0]
             self._keep_rewards(kept, self.data["reward"][kept, None], np.ones(len(kept), np.int64))
+
+    def _start_raw(self, name: str, like: Array) -> None:
+        """Begin to store a raw column, of the shape and type of ``like`` (k, …).
+
+        Raises:
+            TrainingError: it takes more than the free memory.
+        """
+        each = like.dtype.itemsize * math.prod(like.shape[1:])
+        check_memory(self.slots, each, f"the column {name!r} of a replay buffer", "buffer_size")
+        self.data[name] = np.zeros((self.slots, *like.shape[1:]), like.dtype)
 
     def _keep_rewards(self, slot: Array, rewards: Array, steps: Array) -> None:
         """Append the rewards (k, longest) of calls of ``steps`` (k,); none after those given."""

@@ -18,7 +18,7 @@ DTYPES = {
     "valid": torch.bool, "advantage": torch.float32, "episode_start": torch.bool,
     "overridden": torch.bool, "call_start": torch.bool, "mask": torch.bool,
     "dist_params": torch.float32, "guide": torch.float32, "recurrent_state": torch.float32,
-    "log_std": torch.float32,
+    "log_std": torch.float32, "env_reward": torch.float32,
 }  # fmt: skip
 """Of all fields but observations and actions."""
 NEEDED = {"obs", "next_obs", "action", "reward", "steps", "terminated", "last", "valid"}

@@ -13,9 +13,21 @@ from torch import Tensor
 
 from skillweave.buffers.columns import NOTHING, TERMINATED, Columns, copy_into
 from skillweave.buffers.priorities import Priorities
+from skillweave.errors import TrainingError
 from skillweave.experience import Batch, Sample
 from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array
+
+
+class Relabel(Protocol):
+    """Judges rows again when they are drawn, in place of what they were judged when stored."""
+
+    raw: tuple[str, ...]
+    """The raw columns of ``SCHEMA`` that it needs."""
+
+    def __call__(self, rows: Batch) -> Batch:
+        """Return rows (P·B, n) with other ``reward``, ``terminated`` and ``truncated``."""
+        ...
 
 
 class _Settings(Protocol):
@@ -40,6 +52,8 @@ def replay_store(
     *,
     shared: bool = False,
     between: bool = False,
+    raw: Sequence[str] = (),
+    relabel: Relabel | None = None,
     device: str | torch.device = "cpu",
 ) -> ReplayStore:
     """An empty replay store as an algorithm's settings ask for.
@@ -49,7 +63,8 @@ def replay_store(
     Args:
         num_envs: of all members together.
         shared: members learn from what all did; ``buffer_size`` is then that of all together.
-        between: as ``OffPolicyAlgorithm.between`` says.
+        between, raw: as ``OffPolicyAlgorithm`` says.
+        relabel: judges transitions again when they are drawn.
 
     Raises:
         TrainingError: it is larger than the machine's memory.
@@ -68,6 +83,8 @@ def replay_store(
         prioritized=config.prioritized,
         alpha=config.priority_alpha,
         between=between,
+        raw=raw,
+        relabel=relabel,
         device=device,
     )
 
@@ -83,6 +100,9 @@ class ReplayStore:
         mask_size: number of discrete actions.
         n_step, prioritized, alpha: how it is sampled (Schaul et al. 2016).
         between: samples hold the observations between the n steps, too.
+        raw: raw columns that are kept, and of which samples have those that they name.
+        relabel: judges transitions again when they are drawn; None: they keep the reward and the
+            ends that they were stored with. Only for rows of one step.
         device: of the samples.
 
     Raises:
@@ -105,12 +125,16 @@ class ReplayStore:
         prioritized: bool = False,
         alpha: float = 0.6,
         between: bool = False,
+        raw: Sequence[str] = (),
+        relabel: Relabel | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
+        needed = (*raw, *(() if relabel is None else relabel.raw))
+        self._relabel = relabel
         self._columns = Columns(
             capacity, num_envs, observation_space, action_shape, action_dtype,
             mask_size=mask_size, each=4 * prioritized * (members if shared else 1),
-            keep_rewards=shared,
+            keep_rewards=shared, raw=tuple(dict.fromkeys(needed)),
         )  # fmt: skip
         self.num_envs = num_envs
         self._n_step, self._between = n_step, between and n_step > 1
@@ -125,6 +149,11 @@ class ReplayStore:
     def __len__(self) -> int:
         """Transitions that can be sampled, over all columns."""
         return int((self._columns.data["kind"] != NOTHING).sum())
+
+    @property
+    def raw(self) -> tuple[str, ...]:
+        """The raw columns that it keeps."""
+        return self._columns.raw
 
     @property
     def ready(self) -> bool:
@@ -173,31 +202,77 @@ class ReplayStore:
         """The transitions (P, B) that a sample, perhaps of another store, calls ``index``."""
         columns, data = self._columns, self._columns.data
         factor = gamma.float().cpu().numpy()[:, None]
-        start = slot = index % columns.slots
-        reward, discount = columns.reward(factor, slot), columns.power(factor, slot)
-        after = columns.after(slot)
+        start = index % columns.slots
+        slots, follows = self._chain(start)
+        judged = None if self._relabel is None else self._judged(self._relabel, slots, follows)
+        slot, goes_on = start, np.ones(start.shape, bool)
+        reward, discount = np.zeros(1, np.float32), np.ones(1, np.float32)
         between: list[tuple[Array, Array]] = []
-        for _ in range(self._n_step - 1):
-            goes_on = data["kind"].take(after) != NOTHING
-            slot = np.where(goes_on, after, slot)
-            between.append((slot, np.where(goes_on, discount, np.float32(0))))
-            reward += np.where(goes_on, discount * columns.reward(factor, slot), np.float32(0))
-            discount = np.where(goes_on, discount * columns.power(factor, slot), discount)
-            after = columns.after(slot)
+        for k in range(self._n_step):
+            if k:
+                goes_on = goes_on & follows[..., k]
+                if judged is not None:
+                    goes_on &= ~judged.ended[..., k - 1]
+                slot = np.where(goes_on, slots[..., k], slot)
+                between.append((slot, np.where(goes_on, discount, np.float32(0))))
+            here = columns.reward(factor, slot) if judged is None else judged["reward"][..., k]
+            power = columns.power(factor, slot)
+            if k:
+                reward += np.where(goes_on, discount * here, np.float32(0))
+                discount = np.where(goes_on, discount * power, discount)
+            else:
+                reward, discount = here, power
+        after = columns.after(slot)
+        terminated = data["kind"].take(slot) == TERMINATED
+        if judged is not None:
+            last = (slots == slot[..., None]).argmax(-1)[..., None]
+            terminated = np.take_along_axis(judged["terminated"], last, -1)[..., 0]
         action = data["action"].take(start, axis=0)
+        env_reward = data.get("env_reward")
         return Sample(
             obs=self._tensor(data["obs"].take(start, axis=0)),
             action=self._tensor(action.astype(np.int64) if action.dtype.kind in "iu" else action),
             reward=self._tensor(reward),
-            discount=self._tensor(discount * (data["kind"].take(slot) != TERMINATED)),
+            discount=self._tensor(discount * ~terminated),
             next_obs=self._tensor(data["obs"].take(after, axis=0)),
             mask=self._mask(start),
             next_mask=self._mask(after),
             weight=None if weight is None else self._tensor(weight),
             index=index,
+            env_reward=None if env_reward is None else self._tensor(env_reward.take(start)),
             progress=progress,
             **self._seen_between(between),
         )
+
+    def _chain(self, start: Array) -> tuple[Array, Array]:
+        """Return the slots of n rows from ``start`` (P, B) on, and which follow it, (P, B, n).
+
+        Where a row does not follow, its slot is that of the last one that does.
+        """
+        slots, follows = [start], [np.ones(start.shape, bool)]
+        for _ in range(self._n_step - 1):
+            after = self._columns.after(slots[-1])
+            follows.append(self._columns.data["kind"].take(after) != NOTHING)
+            slots.append(np.where(follows[-1], after, slots[-1]))
+        return np.stack(slots, -1), np.stack(follows, -1)
+
+    def _judged(self, relabel: Relabel, slots: Array, follows: Array) -> Batch:
+        """Return the rows of ``slots`` (P, B, n) with the outcome that ``relabel`` gives them."""
+        columns, data = self._columns, self._columns.data
+        if "steps" in data:
+            raise TrainingError("transitions of several steps cannot be judged again")
+        flat = slots.reshape(-1, slots.shape[-1])
+        named = {k: data[k].take(flat, axis=0) for k in ("obs", "action", "reward", *columns.raw)}
+        never = np.zeros(flat.shape, bool)
+        rows = Batch(
+            **named,
+            next_obs=data["obs"].take(columns.after(flat), axis=0),
+            terminated=never,
+            truncated=never,
+        )
+        found = relabel(rows)
+        outcome = {k: found[k].reshape(slots.shape) for k in ("reward", "terminated", "truncated")}
+        return Batch(**outcome)
 
     def update_priorities(self, index: Array, priority: Tensor, first: int = 0) -> None:
         """New priorities (P, B), above 0, of what members from ``first`` on have sampled."""

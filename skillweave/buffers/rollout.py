@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from skillweave.buffers.held import ONE_ROW, check_held
-from skillweave.experience import SCHEMA, Batch, Reference, Rollout
+from skillweave.experience import SCHEMA, Batch, Reference, Rollout, column
 from skillweave.spaces import ActionCodec, to_tensor
 from skillweave.types import Array, unprefixed
 
@@ -45,7 +45,8 @@ class RolloutStore:
         valid, last = batch.valid_rows, batch.ended
         if not valid.any():
             return
-        rows = {k: x for k, x in batch.items() if SCHEMA[k].rollout and not SCHEMA[k].per_env}
+        kept = {k: x for k, x in batch.items() if column(k).rollout}
+        rows = {k: x for k, x in kept.items() if not column(k).per_env}
         rows |= {"last": last, "valid": valid}
         del rows["truncated"]
         if valid.all():
@@ -53,13 +54,12 @@ class RolloutStore:
         else:
             cells, valid = _valid_first(valid, self._members)
             rows = {k: x.reshape(-1, *x.shape[2:])[cells] for k, x in rows.items()}
-            column = np.flatnonzero(valid[0])
-            rows["last"][valid.sum(0)[column] - 1, column] = True
+            filled = np.flatnonzero(valid[0])
+            rows["last"][valid.sum(0)[filled] - 1, filled] = True
             rows |= {"last": rows["last"] & valid, "valid": valid}
         held = {k: self._by_member(x) for k, x in rows.items()}
-        for name, x in batch.items():
-            if SCHEMA[name].per_env:
-                held[name] = self._by_member(x[None])
+        for name in kept.keys() - rows.keys() - {"truncated"}:
+            held[name] = self._by_member(kept[name][None])
         if log_std is not None:
             held["log_std"] = log_std
         self._held.append(held)

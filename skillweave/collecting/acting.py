@@ -47,6 +47,7 @@ class Request:
     below: Mapping[str, Request] = field(default_factory=dict)
     """By path, the requests to those that learn below a selector."""
     action_repeat: ActionRepeat | None = None  # None: there are none
+    record: tuple[str, ...] = ()  # raw columns to record
 
     def of_collector(self, number: int) -> Request:
         """The same for one of several collectors."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 
 from skillweave.collecting.ends import CallEnd
 from skillweave.envs.infos import info_rows, told_success
+from skillweave.errors import EnvError
+from skillweave.experience import INFO, Batch
 from skillweave.skills import Skill, asked
+from skillweave.skills.info_words import keys_told
 from skillweave.types import Array, Step
 
 
@@ -77,6 +81,70 @@ def terminated_in_call(skill: Skill, step: Step, end: Array, ids: Array) -> Arra
         last = seen_by(skill, step, step.elapsed[rows], rows)
         terminated[rows] = judge(skill, last, ids[rows]).stops
     return terminated
+
+
+RAW = ("env_action", "env_reward", "env_terminated", "env_truncated", "call_elapsed")
+"""The raw columns that rows are judged by again."""
+
+
+class JudgedBy:
+    """Judges stored rows by a skill: a ``Relabel`` of replay.
+
+    Args:
+        skill: whose reward and ends count; it must answer the same when asked twice.
+        info: keys of ``info`` that its methods read.
+    """
+
+    def __init__(self, skill: Skill, info: Sequence[str] = ()) -> None:
+        self._skill, self._info = skill, tuple(info)
+        self.raw = (*RAW, *(INFO + key for key in info))
+
+    def __call__(self, rows: Batch) -> Batch:
+        """Return the rows, any lead axes, with the skill's reward and ends."""
+        lead = rows["reward"].shape
+        flat = {k: v.reshape(-1, *v.shape[len(lead) :]) for k, v in rows.items()}
+        step = Step(
+            obs=flat["obs"],
+            action=flat["env_action"],
+            next_obs=flat["next_obs"],
+            reward=flat["env_reward"],
+            terminated=flat["env_terminated"],
+            truncated=flat["env_truncated"],
+            timed_out=np.zeros(len(flat["reward"]), bool),
+            elapsed=flat["call_elapsed"],
+            info={key: flat[INFO + key] for key in self._info},
+        )
+        outcome = judge(self._skill, seen_by(self._skill, step, step.elapsed))
+        return rows.replace(
+            reward=outcome.reward.reshape(lead),
+            terminated=outcome.terminated.reshape(lead),
+            truncated=outcome.truncated.reshape(lead),
+        )
+
+
+def raw_columns(step: Step, elapsed: Array, wanted: Sequence[str]) -> dict[str, Array]:
+    """Return the raw columns of a step that are wanted, (N, …) each.
+
+    Args:
+        elapsed: (N,) steps of the call so far.
+
+    Raises:
+        EnvError: no environment gives a key of ``info`` that is wanted.
+    """
+    known = {
+        "env_action": step.action,
+        "env_reward": step.reward,
+        "env_terminated": step.terminated,
+        "env_truncated": step.truncated,
+        "call_elapsed": elapsed,
+    }
+    found: dict[str, Array] = {}
+    for name in wanted:
+        key = name.removeprefix(INFO)
+        if name not in known and key not in step.info:
+            raise EnvError(f"info[{key!r}] is to be recorded, but {keys_told(step.info)}")
+        found[name] = known[name] if name in known else np.asarray(step.info[key])
+    return found
 
 
 def seen_by(skill: Skill | None, step: Step, elapsed: Array, rows: Array | None = None) -> Step:

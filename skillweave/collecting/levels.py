@@ -137,6 +137,14 @@ class Level:
                 found[rows] = level.leaf(memory, ids[rows])
         return found
 
+    def elapsed(self, memory: Memory, ids: Array) -> Array:
+        """Return the steps of the calls of the leaves that act in environments ``ids`` (k,)."""
+        running, found = memory[f"{self.prefix}skill"][ids], memory[f"{self.prefix}elapsed"][ids]
+        for i, level in self.below.items():
+            if len(rows := np.flatnonzero(running == i)):
+                found[rows] = level.elapsed(memory, ids[rows])
+        return found
+
     def called(self, memory: Memory, ids: Array) -> Iterator[tuple[int, Array]]:
         """Each skill's number, and the rows of ``ids`` in whose environments it is called."""
         running = memory[f"{self.prefix}skill"][ids]

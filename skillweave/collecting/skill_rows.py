@@ -10,7 +10,7 @@ import numpy as np
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.judge import judge, seen_by
+from skillweave.collecting.judge import judge, raw_columns, seen_by
 from skillweave.collecting.starters import StartPolicy
 from skillweave.collecting.writer import BatchWriter
 from skillweave.envs.engine import Engine, RawStep
@@ -120,7 +120,7 @@ class SkillCollector(Collector):
 
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request)
-        self._rng = (request.seeds / "search").numpy()
+        self._rng, self._record = (request.seeds / "search").numpy(), request.record
 
     def _step(self, out: BatchWriter | None = None) -> None:
         """One step of every environment."""
@@ -164,6 +164,7 @@ class SkillCollector(Collector):
                 next_mask=self.engine.mask(),
                 dist_params=acted.dist_params,
                 overridden=overridden,
+                **raw_columns(step, self.kept["elapsed"], self._record),
             )
             out.next()
         self._count(raw, judged, playing)

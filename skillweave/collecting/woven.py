@@ -12,7 +12,7 @@ from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import ActiveGuide
-from skillweave.collecting.judge import judge, seen_by, terminated_in_call
+from skillweave.collecting.judge import judge, raw_columns, seen_by, terminated_in_call
 from skillweave.collecting.levels import CRITIC, SELECTOR, Level, NestedLevel, with_learners
 from skillweave.collecting.writer import BatchWriter
 from skillweave.envs.engine import Engine, RawStep
@@ -90,7 +90,7 @@ class WovenCollector(DecisionCollector):
 
     def _prepare(self, request: Request) -> None:
         super()._prepare(request)
-        self._gammas = {}
+        self._gammas, self._request_raw = {}, request.record
         for path, acting in self.learners.items():
             acting.begin(request.below[path], every_step=False)
             self._gammas[path] = request.below[path].gamma.astype(np.float64).repeat(acting.each)
@@ -131,12 +131,19 @@ class WovenCollector(DecisionCollector):
             mask=mask,
             next_mask=self.engine.mask(),
             overridden=self.overridden,
+            **self._raw(step),
         )
         rows.leaf[rows.shared.row], rows.fresh[rows.shared.row] = self.kept["leaf"], self._fresh
         truncated = raw.truncated & ~raw.terminated
         self._write_critic(self.root, self._all, raw.reward, raw.terminated, truncated)
         self._walk(self.root, self._all, step, end)
         rows.next()
+
+    def _raw(self, step: Step) -> dict[str, Array]:
+        """Return the raw columns of a step that learners ask for."""
+        if not self._request_raw:
+            return {}
+        return raw_columns(step, self.root.elapsed(self.memory, self._all), self._request_raw)
 
     def _write_critic(
         self, level: Level, ids: Array, reward: Array, terminated: Array, truncated: Array

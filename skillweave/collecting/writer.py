@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from skillweave.experience import SCHEMA, Batch
+from skillweave.experience import Batch, column
 from skillweave.types import Array
 
 
@@ -29,22 +31,19 @@ class BatchWriter:
         Args:
             ids: (k,) only in these environments; values are (k, …).
         """
+        at: Any = self.row if ids is None else (self.row, ids)
         for name, value in values.items():
             if value is not None:
-                column = self.column(name, value)
-                if ids is None:
-                    column[self.row] = value
-                else:
-                    column[self.row, ids] = value
+                self.column(name, value)[at] = value
 
     def column(self, name: str, like: Array) -> Array:
         """Return a column, (T, N, …), of the shape and type of ``like`` (k, …) if it is new."""
-        column = self._columns.get(name)
-        if column is None:
-            shape, fill = (*self._lead, *like.shape[1:]), SCHEMA[name].fill
-            column = np.full(shape, fill, like.dtype) if fill else np.zeros(shape, like.dtype)
-            self._columns[name] = column
-        return column
+        values = self._columns.get(name)
+        if values is None:
+            shape, fill = (*self._lead, *like.shape[1:]), column(name).fill
+            values = np.full(shape, fill, like.dtype) if fill else np.zeros(shape, like.dtype)
+            self._columns[name] = values
+        return values
 
     def get(self, name: str) -> Array | None:
         """Return a column, (T, N, …); None: it was not written."""

@@ -107,7 +107,8 @@ class RolloutLearner:
         params, self._resumed = self._resumed or algorithm.acting_params(state, progress), None
         seeds = self._seeds / "collect" / update
         self._asked = params, progress
-        return Request(algorithm.config.n_steps, (params,), state.gamma.cpu().numpy(), seeds)
+        rows, gamma = algorithm.config.n_steps, state.gamma.cpu().numpy()
+        return Request(rows, (params,), gamma, seeds, record=algorithm.raw)
 
     def take(self, batches: Mapping[str, Batch]) -> None:
         """Keep a rollout, and what it was collected with."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams
-from skillweave.buffers.replay import ReplayStore, replay_store
+from skillweave.buffers.replay import Relabel, ReplayStore, replay_store
 from skillweave.collecting.acting import ActionRepeat, Request
 from skillweave.experience import Batch
 from skillweave.ops.device import resolve_device
@@ -89,6 +89,7 @@ class ReplayLearner:
             seeds,
             at_random,
             action_repeat=self._action_repeat(update * rows, progress),
+            record=self.store.raw,
         )
 
     def _action_repeat(self, at: int, progress: float) -> ActionRepeat | None:
@@ -237,22 +238,36 @@ def check_counts(kept: dict[str, Tensor], num_envs: int) -> None:
 
 
 def store_of(
-    algorithm: Any, num_envs: int, members: int = 1, *, shared: bool = False
+    algorithm: Any,
+    num_envs: int,
+    members: int = 1,
+    *,
+    shared: bool = False,
+    relabel: Relabel | None = None,
 ) -> ReplayStore:
     """An empty replay store for an algorithm's samples.
 
     Args:
         num_envs: of all members together.
         shared: members learn from what all did.
+        relabel: judges transitions again when they are drawn.
 
     Raises:
         TrainingError: it is larger than the machine's memory.
         DeclarationError: it holds not even one row.
     """
     return replay_store(
-        algorithm.config, algorithm.codec, algorithm.observation_space, num_envs, members,
-        shared=shared, between=algorithm.between, device=resolve_device(algorithm.config.device),
-    )  # fmt: skip
+        algorithm.config,
+        algorithm.codec,
+        algorithm.observation_space,
+        num_envs,
+        members,
+        shared=shared,
+        between=algorithm.between,
+        raw=algorithm.raw,
+        relabel=relabel,
+        device=resolve_device(algorithm.config.device),
+    )
 
 
 def learner_of(

@@ -66,7 +66,9 @@ class WovenLearner:
         else:
             rows, seeds = max(r.rows for r in below.values()), first.seeds / self._selector
             first = Request(rows, (), first.gamma, seeds)
-        return replace(first, below={k.removeprefix(self._node): r for k, r in below.items()})
+        record = tuple(dict.fromkeys(name for r in below.values() for name in r.record))
+        below = {k.removeprefix(self._node): r for k, r in below.items()}
+        return replace(first, below=below, record=record)
 
     def take(self, batches: Mapping[str, Batch]) -> None:
         """Give each learner its own rows, and skills the task's advantage, if it has a weight."""

@@ -113,7 +113,7 @@ def test_each_of_its_ends_begins_anew_and_it_is_led_again():
 def test_where_no_starter_may_start_chance_acts():
     collector, asked = collector_of(OnlyFar), requests(600)
     first = collector.collect(next(asked)).batches[""]
-    assert len(np.unique(first.action[~first.valid])) == 5
+    assert len(np.unique(first["action"][~first["valid"]])) == 5
     with pytest.raises(SkillweaveError, match="steps of calling 'only_far'"):
         collector.collect(next(requests(6_000)))
 
