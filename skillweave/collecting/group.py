@@ -1,4 +1,4 @@
-"""Several collectors that fill one experience: in this thread, or each in a process of its own."""
+"""Several collectors that fill one batch, in this thread."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import numpy as np
 
 from skillweave.collecting.acting import Request
 from skillweave.collecting.collector import Collected, Collector, joined_collected
-from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.errors import DeclarationError, RunError
-from skillweave.notices import notice
 from skillweave.seeding import Seeds
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -103,35 +101,6 @@ def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
             "as many as it began with"
         )
     return [unprefixed(str(i), state) for i in range(count)]
-
-
-MakeCollectors = Callable[[MakeCollector, int, int, int, str], Collectors]
-"""As ``make_collectors``: who makes them says where they run."""
-
-
-def make_collectors(
-    make: MakeCollector, num_envs: int, workers: int, members: int, name: str
-) -> Collectors:
-    """Collectors of ``num_envs`` environments: one in this thread, or ``workers`` processes.
-
-    Args:
-        make: makes one.
-        workers: 0 and 1: in this thread.
-
-    Raises:
-        DeclarationError: the environments cannot be shared out equally.
-    """
-    if workers <= 1:
-        return Collectors([make(num_envs, 0)], members)
-    each = share_of(num_envs, workers, members, name)
-    if why := why_no_processes() or runs_again():
-        notice(
-            f"{name}: its {workers} collectors work in this process, one after another, as {why}"
-        )
-        return Collectors([make(each, i * each) for i in range(workers)], members)
-    from skillweave.collecting.processes import ProcessCollectors
-
-    return ProcessCollectors(make, each, workers, members, name)
 
 
 def share_of(num_envs: int, workers: int, members: int, name: str) -> int:

@@ -5,10 +5,38 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from skillweave.collecting.group import MakeCollectors, make_collectors
+from skillweave.collecting.group import Collectors, MakeCollector, share_of
+from skillweave.collecting.processes import ProcessCollectors, process_workers
 from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.collecting.workers import LocalWorker, MakeStanding, Workers
 from skillweave.notices import notice
+
+MakeCollectors = Callable[[MakeCollector, int, int, int, str], Collectors]
+"""Makes collectors, as ``make_collectors`` does."""
+
+
+def make_collectors(
+    make: MakeCollector, num_envs: int, workers: int, members: int, name: str
+) -> Collectors:
+    """Make collectors of ``num_envs`` environments: one in this thread, or ``workers`` processes.
+
+    Args:
+        make: makes one.
+        workers: 0 and 1: in this thread.
+
+    Raises:
+        DeclarationError: the environments cannot be shared out equally.
+    """
+    if workers <= 1:
+        return Collectors([make(num_envs, 0)], members)
+    each = share_of(num_envs, workers, members, name)
+    if why := why_no_processes() or runs_again():
+        notice(
+            f"{name}: its {workers} collectors work in this process, one after another, as {why}"
+        )
+        return Collectors([make(each, i * each) for i in range(workers)], members)
+    return ProcessCollectors(make, each, workers, members, name)
+
 
 MakeWorkers = Callable[[MakeStanding, int, str], Workers]
 """Given what makes the thing that stands at a worker (of 1 and its number), how many workers, and
@@ -27,8 +55,6 @@ def _processes(make: MakeStanding, count: int, name: str) -> Workers:
     if why := why_no_processes() or runs_again():
         notice(f"{name}: its {count} parts work in this process, one after another, as {why}")
         return Workers([LocalWorker(make, 1, i) for i in range(count)], name)
-    from skillweave.collecting.processes import process_workers
-
     return process_workers(make, count, name)
 
 

@@ -15,7 +15,8 @@ from skillweave.algorithms.base import Algorithm, state_to
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
+from skillweave.collecting.group import MakeCollector
+from skillweave.collecting.where import MakeCollectors, make_collectors
 from skillweave.errors import DeclarationError
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory

@@ -16,7 +16,8 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, checked_tensor, make_algorithm, state_from
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.group import MakeCollector, MakeCollectors, make_collectors
+from skillweave.collecting.group import MakeCollector
+from skillweave.collecting.where import MakeCollectors, make_collectors
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine

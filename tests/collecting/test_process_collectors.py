@@ -20,9 +20,10 @@ from toy_acting import Again, Choices, Mortal, requests
 from skillweave.collecting import processes, worker_process
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.group import Collectors, make_collectors
+from skillweave.collecting.group import Collectors
 from skillweave.collecting.processes import ProcessCollectors
 from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.where import make_collectors
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds

@@ -28,8 +28,7 @@ from skillweave import (
     Ray,
     SkillweaveError,
 )
-from skillweave.collecting.group import make_collectors
-from skillweave.collecting.where import Where
+from skillweave.collecting.where import Where, make_collectors
 from skillweave.collecting.workers import Station, Workers
 from skillweave.evolution.fitness import FitnessArena
 from skillweave.evolution.population import Population
