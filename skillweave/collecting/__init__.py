@@ -1,1 +1,1 @@
-"""Who steps environments: collectors, and the calls of skills in them."""
+"""Collectors, which step environments, and the calls of skills in them."""

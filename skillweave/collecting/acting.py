@@ -33,7 +33,7 @@ class ActionRepeat:
 
 @dataclass(frozen=True)
 class Request:
-    """What a collector is asked for: so many rows, by these parameters.
+    """A request to collectors: the number of rows, and the parameters to act by.
 
     Everything that is random while they are collected follows from ``seeds``.
     """
@@ -50,7 +50,7 @@ class Request:
     record: tuple[str, ...] = ()  # raw columns to record
 
     def of_collector(self, number: int) -> Request:
-        """The same for one of several collectors."""
+        """Return the request to one of several collectors."""
         below = {path: part.of_collector(number) for path, part in self.below.items()}
         action_repeat = self.action_repeat and replace(
             self.action_repeat, seeds=self.action_repeat.seeds / number

@@ -1,8 +1,8 @@
 """Collectors as actors of Ray: on this machine, or on any node of a cluster.
 
-Parameters go into Ray's object store once for each request, whoever reads them; experience comes
-back through it. An actor that dies, alone or with its node, is made again (``workers``), wherever
-there is room.
+Parameters go into Ray's object store once for each request, however many workers read them;
+batches come back through it. An actor that dies, alone or with its node, is recreated (``workers``)
+wherever there is room.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Actors:
         count: how many there may be at once; the cluster keeps room for them.
         cpus: of each.
         patience: seconds to wait while the cluster has no room for them.
-        tell: is told what people should know.
+        tell: called with sentences for people.
     """
 
     def __init__(
@@ -287,7 +287,7 @@ def differing_versions(there: dict[str, Any]) -> str:
 
 
 def _how(lost: Exception) -> str:
-    """What became of an actor, as people say it."""
+    """Describe what became of an actor."""
     if isinstance(lost, exceptions.OutOfMemoryError):
         return "was ended by Ray, as its node was short of memory"
     if isinstance(lost, exceptions.ActorUnavailableError):

@@ -44,7 +44,7 @@ class SkillSet:
 
     @property
     def choices(self) -> int:
-        """Of how many a choice is one: the first skill with each length, then the next skill."""
+        """The number of choices: the first skill with each length, then the next skill."""
         return len(self.skills) * max(1, len(self.lengths))
 
     @property
@@ -54,7 +54,7 @@ class SkillSet:
         return round(sum(lengths) / len(lengths)) if lengths else cast(Any, self.call_steps)
 
     def mask(self, obs: Array, age: Array | None = None) -> Array | None:
-        """Which choices are allowed, (n, choices) bool; None: all, everywhere.
+        """Return the allowed choices, (n, choices) bool; None: all, everywhere.
 
         Args:
             age: (n,), steps of the episodes so far, for messages.
@@ -83,13 +83,13 @@ class SkillSet:
 
     @property
     def restricts(self) -> bool:
-        """Whether some skill, here or in a hierarchy below, may not start everywhere."""
+        """True if some skill, here or in a hierarchy below, may not start everywhere."""
         below = (skills_below(p) for p in self.policies)
         own = any(s.defines("initiation") for s in self.skills)
         return own or any(skills.restricts for skills in below if skills is not None)
 
     def _may_start(self, i: int, obs: Array) -> Array:
-        """Where skill ``i`` may start, (n,); a hierarchy only where one of its skills may."""
+        """Return where skill ``i`` may start, (n,); a hierarchy where one of its skills may, too."""
         skill, below = self.skills[i], skills_below(self.policies[i])
         may = np.ones(len(obs), bool)
         if skill.defines("initiation"):

@@ -1,4 +1,4 @@
-"""Where collectors run if not here: on Ray."""
+"""Collectors on other machines, by Ray."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Ray:
 
         Args:
             most: workers that will run at once.
-            tell: is told what people should know.
+            tell: called with sentences for people.
 
         Raises:
             SkillweaveError: the kinds of ``joined``.
@@ -138,7 +138,7 @@ class Ray:
                     "--head; or leave 'auto' out, for this machine alone"
                 ) from error
             raise TrainingError(
-                f"somebody listens at {short(address)}, but Ray could not connect "
+                f"a program listens at {short(address)}, but Ray could not connect "
                 f"({told(error)}). Perhaps it is no Ray cluster, or one that asks for a token, as "
                 "those of `ray start` do: then RAY_AUTH_MODE=token is needed here, too (see Ray's "
                 "page on token authentication)"
@@ -150,14 +150,14 @@ class Ray:
 
 
 def imported() -> Any:
-    """Ray, told to be quiet.
+    """Ray, with its own output off.
 
     Raises:
         MissingExtra: it is not installed.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    # What Ray says of lost actors would go to standard output; it is told by ``workers``.
+    # What Ray says of lost actors would go to standard output; ``workers`` reports it.
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
     try:
         import ray
@@ -181,7 +181,7 @@ def _must_be_joined(ray: Any, address: str) -> None:
 
 
 def _is_outside(host: str) -> bool:
-    """Whether a host is a number, and not this machine's own for itself."""
+    """Return whether a host is a number that is not this machine's own."""
     try:
         return not ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -201,6 +201,6 @@ def _must_listen(address: str) -> None:
     except OSError as error:
         why = error.strerror or str(error)
         raise TrainingError(
-            f"nobody listens at {address} ({why}), so there is no Ray cluster. Begin one with: ray "
-            "start --head; or leave the address out, for this machine alone"
+            f"no program listens at {address} ({why}), so there is no Ray cluster. Start one with: "
+            "ray start --head; or leave the address out, for this machine alone"
         ) from error

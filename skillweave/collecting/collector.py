@@ -1,4 +1,4 @@
-"""What all collectors share: environments under way, from one rollout and process to the next."""
+"""The part that all collectors share: open environments, from one request to the next."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FIRST_INFO = 4
 
 @dataclass
 class Collected:
-    """What a learner is to learn from, and what people want to know of it."""
+    """The answer to a request: what learners learn from, and numbers for people."""
 
     batches: dict[str, Batch]
     """By path, what each learner did; \"\" where there is one."""
@@ -71,11 +71,11 @@ class Collector:
         self.log_info: tuple[str, ...] = ()
         """I keys of ``info`` whose values at the ends of episodes are logged."""
         self._info_keys: set[str] = set()
-        self._ended: list[Array] = []  # what is told of episodes, and in which environments
+        self._ended: list[Array] = []  # numbers of episodes that ended, and their environments
         self._who: list[Array] = []
 
     def start(self, seeds: Seeds) -> None:
-        """Start every environment anew, unless they are under way."""
+        """Start every environment, unless they have started."""
         if not self.begun:
             self.obs = np.array(self.engine.reset((seeds / "env").integer()))
             self._forget(self._all)
@@ -111,9 +111,9 @@ class Collector:
         for _ in range(limit):
             self._ended, self._who = [], []
             self._step()
-            for ids, told in zip(self._who, self._ended, strict=True):
+            for ids, episodes in zip(self._who, self._ended, strict=True):
                 first = playing[ids]
-                found[ids[first]], playing[ids[first]] = told[first], False
+                found[ids[first]], playing[ids[first]] = episodes[first], False
             playing &= ~self._given_up()
             if not playing.any():
                 return found
@@ -135,7 +135,7 @@ class Collector:
         """Stand where ``state`` says: play the open episodes again.
 
         Returns:
-            (k,) environments that begin anew, as they did not repeat themselves.
+            (k,) environments that start again, as they did not repeat themselves.
 
         Raises:
             RunError: the state is another collector's.
@@ -164,7 +164,7 @@ class Collector:
         self.engine.close()
 
     def like(self, engine: Engine, acting: Acting) -> Any:
-        """The same over other environments."""
+        """Return a collector of the same kind over other environments."""
         raise NotImplementedError
 
     def _prepare(self, request: Request) -> None:
@@ -172,7 +172,7 @@ class Collector:
         raise NotImplementedError
 
     def _step(self, out: Any = None) -> None:
-        """One step of every environment; ``out`` is told what is to be learnt from."""
+        """Step every environment; ``out`` takes what is to be learnt from."""
         raise NotImplementedError
 
     def _collect(self, request: Request) -> dict[str, Batch]:
@@ -193,26 +193,26 @@ class Collector:
     def _tell(
         self, ids: Array, info: Mapping[str, Any], success: Array | None = None, *, task: bool
     ) -> None:
-        """Keep what is told of the episodes of environments ``ids`` (k,), which are over.
+        """Keep the numbers of the episodes of environments ``ids`` (k,), which are over.
 
         Args:
             info: of all environments, at this step.
             success: (k,), whether they have succeeded.
             task: their return of the task is another one than that of who acts.
         """
-        told = np.full((len(ids), FIRST_INFO + len(self.log_info)), np.nan)
+        episodes = np.full((len(ids), FIRST_INFO + len(self.log_info)), np.nan)
         for column, key in enumerate(self.log_info, FIRST_INFO):
             numbers = info_numbers(info, key, ids, self.num_envs)
             if numbers is None:
                 self._info_keys |= set(info_keys(info))
             else:
-                told[:, column] = numbers
-        told[:, :3] = self.kept["sums"][ids]
+                episodes[:, column] = numbers
+        episodes[:, :3] = self.kept["sums"][ids]
         if not task:
-            told[:, TASK_RETURN] = np.nan
+            episodes[:, TASK_RETURN] = np.nan
         if success is not None:
-            told[:, SUCCESS] = success
-        self._ended.append(told)
+            episodes[:, SUCCESS] = success
+        self._ended.append(episodes)
         self._who.append(ids)
 
 
@@ -255,7 +255,7 @@ def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
 
 
 def joined_collected(parts: Sequence[Collected], members: int) -> Collected:
-    """What several collectors found as one: each member's environments stand side by side."""
+    """Join the answers of several collectors: each member's environments stand side by side."""
     if len(parts) == 1:
         return parts[0]
     paths, steps = parts[0].batches, sum(p.steps for p in parts)

@@ -1,7 +1,7 @@
 """The collector of a selector: a row is a decision, and the whole call that followed it.
 
-No environment waits for another: where a call is over, the selector decides anew, while the other
-calls go on. A call that is under way when the rows are full goes on in the next experience.
+No environment waits for another: where a call is over, the selector decides again, while the other
+calls go on. A call that is open when the rows are full goes on in the next batch.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class DecisionCollector(Collector):
             self._open = OpenCalls(self, self.player, self.selector, self.memory, keep_rewards)
 
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:
-        """The same over other environments."""
+        """Return a collector of the same kind over other environments."""
         return DecisionCollector(
             engine, acting, self.skills, self.keep_rewards, self.guide, self.as_skill
         )

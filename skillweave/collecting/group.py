@@ -36,7 +36,7 @@ class Collectors:
         """Environments that were lost with their worker, and did not repeat themselves."""
 
     def start(self, seeds: Seeds) -> None:
-        """Start every environment anew, unless they are under way."""
+        """Start every environment, unless they have started."""
         for i, part in enumerate(self.parts):
             part.start(seeds / i)
 
@@ -50,7 +50,7 @@ class Collectors:
         return joined_states([part.state() for part in self.parts])
 
     def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says; (k,) environments that begin anew."""
+        """Stand where ``state`` says; (k,) environments that start again."""
         states = split_states(state, len(self.parts))
         return self._columns([p.restore(s) for p, s in zip(self.parts, states, strict=True)])
 

@@ -16,7 +16,7 @@ SMOOTHED = 0.05
 
 @dataclass(frozen=True, slots=True)
 class LastCall:
-    """How the last call of n environments ended; where one still runs, that is said."""
+    """The last call of n environments, and how it ended; RUNNING where it has not."""
 
     skill: Array  # (n,) int64, its place in the hierarchy's list; −1: the episode has just begun
     why: Array  # (n,) int8, ``CallEnd`` it ended
@@ -24,17 +24,17 @@ class LastCall:
 
 
 class Ready(Protocol):
-    """What a guide needs of a ready selector; all it remembers is in its memory."""
+    """A ready selector as a guide uses it; its state is in the memory that it is given."""
 
     skills: tuple[str, ...]
 
     @property
     def ranges(self) -> dict[str, range]:
-        """What numbers in its memory may be, of those that choose among something, by name."""
+        """The valid ranges of indices in its memory, by name."""
         ...
 
     def start(self, n: int) -> Memory:
-        """The memory of n environments whose episodes begin."""
+        """Return the memory of n environments whose episodes start."""
         ...
 
     def act(
@@ -46,11 +46,11 @@ class Ready(Protocol):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The skill that it chooses, (n,)."""
+        """Return the skill that it chooses, (n,), and the memory after that."""
         ...
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """How likely it is to choose each skill, (n, S)."""
+        """Return the probability that it chooses each skill, (n, S), and the memory after that."""
         ...
 
     def allowed(self, memory: Memory) -> Array | None:
@@ -58,7 +58,7 @@ class Ready(Protocol):
         ...
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """The memory after a step."""
+        """Return the memory after a step."""
         ...
 
 
@@ -72,14 +72,14 @@ class ActiveGuide:
 
     selector: Ready
     restricts: bool = True
-    """Nothing is allowed but what it may choose."""
+    """Only what it may choose is allowed."""
     tells: bool = False
-    """How likely its choices are is kept, for who is to stay near it."""
+    """Record the guide's action probabilities for the KL penalty."""
     decides: bool = False
-    """Nobody else chooses."""
+    """It makes the choices itself."""
 
     def start(self, n: int) -> Memory:
-        """What it remembers of n environments whose episodes begin."""
+        """Return its memory of n environments whose episodes start."""
         return prefixed("guide", self.selector.start(n))
 
     def ask(
@@ -91,7 +91,7 @@ class ActiveGuide:
         greedy: bool = True,
         rng: np.random.Generator | None = None,
     ) -> Array:
-        """How likely it is to make each choice at decisions of environments ``rows`` (k,).
+        """Return the probability of each choice at decisions of environments ``rows`` (k,).
 
         Of a skill's lengths all are equally likely.
 
@@ -118,7 +118,7 @@ class ActiveGuide:
         return chances.repeat(lengths, axis=1) / np.float32(lengths)
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """What is left of choices (k, choices) bool in environments ``rows`` (k,), as far as known.
+        """Return the choices that it leaves, (k, choices) bool, in environments ``rows`` (k,).
 
         Nothing is asked of it, and nothing changes.
         """

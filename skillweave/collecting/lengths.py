@@ -1,4 +1,4 @@
-"""How long calls may last, where the selector chooses that, too."""
+"""Lengths of calls that a selector chooses together with the skill."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skillweave.messages import short
 
 @checked_names
 class Lengths:
-    """How long a call may last, where the selector chooses it together with the skill.
+    """Lengths of a call that the selector chooses together with the skill.
 
     ``Lengths(1, 4, 16)`` are three lengths; ``Lengths(1, ..., 128)`` doubles from 1 to 128.
 
@@ -67,13 +67,13 @@ class Lengths:
 
 
 def calls_to_json(value: int | Lengths | None) -> dict[str, Any]:
-    """How long calls last, as entries of a JSON object."""
+    """Return the limit of calls as entries of a JSON object."""
     if isinstance(value, Lengths):
         return {"call_steps": None, "call_lengths": list(value.steps)}
     return {"call_steps": value}
 
 
-def calls_from_json(told: Mapping[str, Any]) -> int | Lengths | None:
-    """The inverse of ``calls_to_json``."""
-    lengths, steps = told.get("call_lengths"), told["call_steps"]
+def calls_from_json(entry: Mapping[str, Any]) -> int | Lengths | None:
+    """Return the limit of calls; the inverse of ``calls_to_json``."""
+    lengths, steps = entry.get("call_lengths"), entry["call_steps"]
     return steps if lengths is None else Lengths(*lengths)

@@ -179,7 +179,7 @@ class NestedLevel(Level):
             own = unprefixed(prefix.removesuffix("."), memory)
             self.calls = OpenCalls(collector, player, self.selector, own, prefix=path)
             self.acted = np.zeros(collector.num_envs, bool)  # in the step before
-            self.open = np.zeros(collector.num_envs, bool)  # a call of its selector is under way
+            self.open = np.zeros(collector.num_envs, bool)  # a call of its selector is open
             collector.kept |= {f"{path}acted": self.acted, f"{path}open": self.open}
         self.out = Decisions(collector.num_envs)
 

@@ -1,4 +1,4 @@
-"""A selector's decisions whose calls are under way, and rows of those whose calls are over."""
+"""Pending calls: a selector's open decisions, and rows of those whose calls are over."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class OpenCalls:
         kept["tau"][ids] += 1
 
     def opened(self, name: str) -> Array | None:
-        """What is kept of open calls and has a shape that is known only when they begin."""
+        """Return values of open calls whose shape is known only when they start."""
         return self._collector.open.get(self._prefix + name)
 
     def row(
@@ -123,7 +123,7 @@ class OpenCalls:
 
     @property
     def chances(self) -> Array | None:
-        """How likely the guide's choices were when it was asked, (N, choices); None: not told."""
+        """The probabilities of the guide's latest choices, (N, choices); None: not recorded."""
         guide = self.player.guide
         return self._memory["chances"] if guide is not None and guide.tells else None
 
@@ -139,7 +139,7 @@ class OpenCalls:
         rewards[ids, self.kept["tau"][ids]] = reward
 
     def _next_mask(self, values: Mapping[str, Array], ids: Array) -> Array:
-        """Where skills may start in the true successors: all where that does not matter."""
+        """Return where skills may start in the true successors; all where that does not matter."""
         mask = np.ones_like(values["mask"])
         on = np.flatnonzero(~values["terminated"])
         if len(on):

@@ -34,7 +34,7 @@ from skillweave.types import Array, Memory, Memoryless, Policy, Step
 
 @dataclass(slots=True)
 class Turn:
-    """How a player acts in one step."""
+    """The way in which a player acts in one step."""
 
     deterministic: bool = True
     """The selector acts greedily, else it samples."""
@@ -102,7 +102,7 @@ class PolicyActor:
 
 @dataclass
 class Choice:
-    """What a learner did in its latest step, and by what."""
+    """A learner's latest actions, and what they followed from."""
 
     rows: Array  # (k,) environments
     obs: Array  # (k, …)
@@ -279,8 +279,8 @@ class Player:
         """Notice a step of environments ``rows`` (k,); return why calls ended, (k,) int8.
 
         Args:
-            step: of these environments; ``elapsed`` is the time as whoever calls this player counts
-                it, each skill sees that of its own call.
+            step: of these environments; ``elapsed`` counts as the caller of this player does; each
+                skill sees the time of its own call.
         """
         memory["elapsed"][rows] += 1
         elapsed, running = memory["elapsed"][rows], memory["skill"][rows]

@@ -1,7 +1,7 @@
 """Process groups: a worker and the processes that its environments start are one group.
 
 A worker that is killed cannot end these processes. Its group outlives it, so they can still be
-found and ended, whoever started them and how. A process that has left the group, as a daemon does,
+found and ended, however they were started. A process that has left the group, as a daemon does,
 stays.
 """
 

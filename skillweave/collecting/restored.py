@@ -1,4 +1,4 @@
-"""Whether what a checkpoint says of open episodes and calls can be gone on from."""
+"""Validate the open episodes and calls stored in a checkpoint."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def opened(
     obs: Array,
     observation_space: gym.Space[Any],
 ) -> Memory:
-    """What a checkpoint says of open calls, copied; observations as the environments have them.
+    """Return the open calls of a checkpoint, copied; observations as the environments have them.
 
     Args:
         open_calls: (N, …) each; observations that are structured as bytes.

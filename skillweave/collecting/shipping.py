@@ -100,27 +100,27 @@ _PACKAGES = {"site-packages", "dist-packages"}  # of another environment, or of 
 
 
 def is_own_code(module: ModuleType) -> bool:
-    """Whether a module is the user's own: no other machine has it installed."""
+    """Return whether a module is the user's own: no other machine has it installed."""
     name, file = getattr(module, "__name__", "__main__"), getattr(module, "__file__", None)
     if not isinstance(file, str) or name == "__main__" or sys.modules.get(name) is not module:
         return False
     top = name.partition(".")[0]
     if top == "skillweave":
         return False
-    # One that was loaded from its file, as recipes are, is found by its name by nobody else,
+    # One that was loaded from its file, as recipes are, is not found by its name elsewhere,
     # wherever it lies.
     return not _is_installed(file) or not _is_found(top, tuple(sys.path))
 
 
 @cache  # a sweep asks it of thousands of modules for each of its runs
 def _is_found(name: str, path: tuple[str, ...]) -> bool:
-    """Whether a module of this name is found in ``path``."""
+    """Return whether a module of this name is found in ``path``."""
     return PathFinder.find_spec(name, path) is not None
 
 
 @cache
 def _is_installed(file: str) -> bool:
-    """Whether a file lies where packages are installed, here or anywhere."""
+    """Return whether a file lies where packages are installed, here or anywhere."""
     path = Path(file).resolve()
     if _PACKAGES & set(path.parts):
         return True

@@ -26,12 +26,12 @@ PATIENCE = 5_000
 
 @dataclass
 class Judged:
-    """What a step was to the skill."""
+    """The outcome of a step for the skill, in all environments."""
 
     reward: Array  # (n,) float32
     terminated: Array  # (n,) bool
     truncated: Array  # (n,) bool, never where terminated
-    success: Array | None  # (n,) bool, or of the task float64, NaN where it is not told
+    success: Array | None  # (n,) bool, or of the task float64, NaN where unknown
 
 
 class SkillCollector(Collector):
@@ -52,8 +52,8 @@ class SkillCollector(Collector):
         reflexes: in force while the skill acts.
         starters: skills that can act already; None: random actions lead to where it may start.
         start_calls: the most calls of theirs that come first; their number is drawn evenly.
-        search_steps: an episode begins anew where the skill may not start after so many steps;
-            None: it goes on.
+        search_steps: reset an episode in which the skill cannot start within this many steps; None:
+            it goes on.
         episode_calls: the most calls of the skill in an episode.
     """
 
@@ -98,7 +98,7 @@ class SkillCollector(Collector):
         return self.kept["memory"] if self.kept["memory"].shape[1] else None
 
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
-        """The same over other environments."""
+        """Return a collector of the same kind over other environments."""
         starters = self._starters.skills if self._searches else None
         how = self._start_calls, self._search_steps, self._episode_calls
         return SkillCollector(engine, acting, self.skill, self.reflexes, starters, *how)
@@ -178,10 +178,10 @@ class SkillCollector(Collector):
             over = np.where(playing, ended, raw.terminated | raw.truncated)
         ids = np.flatnonzero(over)
         if len(ids):
-            told = ids if playing is None else np.flatnonzero(playing & ended)
-            success = None if judged.success is None else judged.success[told]
-            self._tell(told, raw.info, success, task=self.skill is not None)
-            more = self._call_again(told[(judged.truncated & ~raw.truncated)[told]])
+            called = ids if playing is None else np.flatnonzero(playing & ended)
+            success = None if judged.success is None else judged.success[called]
+            self._tell(called, raw.info, success, task=self.skill is not None)
+            more = self._call_again(called[(judged.truncated & ~raw.truncated)[called]])
             self._begin_anew(np.setdiff1d(ids, more) if len(more) else ids)
         if playing is not None:
             going_on = searching[~over[searching]]
@@ -207,7 +207,7 @@ class SkillCollector(Collector):
         return ids
 
     def _draw_calls(self) -> None:
-        """How many calls of others come first, where an episode has just begun."""
+        """Draw how many calls of others come first, where an episode has just started."""
         ids = np.flatnonzero(self.kept["calls_left"] < 0)
         if len(ids):
             self.kept["calls_left"][ids] = self._rng.integers(self._start_calls + 1, size=len(ids))
@@ -227,7 +227,7 @@ class SkillCollector(Collector):
                 self._look(ids)
 
     def _look(self, ids: Array) -> Array:
-        """Whether the skill may start now in environments ``ids`` (k,) that search.
+        """Find where the skill may start now among environments ``ids`` (k,) that search.
 
         Returns:
             Those in which it may not.
@@ -256,7 +256,7 @@ class SkillCollector(Collector):
         return waiting
 
     def _give_up(self, waiting: Array) -> None:
-        """Begin anew where it has waited for long enough: after a call of its own, at once."""
+        """Reset where it has waited for long enough: after a call of its own, at once."""
         enough = self._never[waiting]
         if self._search_steps is not None:
             enough = self.kept["age"][waiting] >= self._search_steps
@@ -272,13 +272,13 @@ class SkillCollector(Collector):
         return given_up
 
     def _sought(self) -> str:
-        """By whom a start was searched for."""
+        """Describe what searched for a start."""
         by = "random acting"
         if (skills := self._starters.skills) is not None:
             by = f"calling {', '.join(repr(s.name) for s in skills.skills)}"
         if self._search_steps is None:
             return f"of {by}"
-        return f"of {by}, begun anew after {self._search_steps:,} of them (search_steps)"
+        return f"of {by}, reset after {self._search_steps:,} of them (search_steps)"
 
     def _judge(self, step: Step, playing: Array | None) -> Judged:
         """Judge a step for the skill; anything where it did not play."""

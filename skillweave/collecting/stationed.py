@@ -1,4 +1,4 @@
-"""What stands on a node of a Ray cluster: an actor with a collector."""
+"""The actor on a node of a Ray cluster, which holds a collector."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def actor_class() -> type:
 
     class CollectorActor:
         def versions(self) -> dict[str, Any]:
-            """What runs here, and where that is."""
+            """Return the versions of what runs here, and the node."""
             found: dict[str, Any] = {"node": ray.util.get_node_ip_address()}
             found |= {"process": os.getpid(), "Python": platform.python_version()}
             for package in (*packages, "skillweave"):
@@ -77,7 +77,7 @@ class Stationed:
         return _tried(made)
 
     def answer(self, what: str, task: Any) -> tuple[SentError | None, Any]:
-        """What the station answers."""
+        """Return the station's answer."""
         if isinstance(task, dict):  # a state; arrays of the object store cannot be written to
             task = {k: np.array(v) for k, v in task.items()}
         station: Any = self.station

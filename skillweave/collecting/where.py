@@ -1,4 +1,4 @@
-"""Where workers run: in processes of this machine, or on Ray."""
+"""The placement of collectors and workers: in processes of this machine, or on Ray."""
 
 from __future__ import annotations
 

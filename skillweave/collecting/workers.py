@@ -1,8 +1,8 @@
 """Collectors that run elsewhere: what they are asked for, and how lost ones are made again.
 
-A collector is a function of its state and of what it is asked for. So whoever is lost, be it a
-process or a machine, is made again from its last known state, does what it was asked since, and
-finds the same.
+A collector is a function of its state and of what it is asked for. So a lost worker, a
+process or a machine, is recreated from its last state and repeats the requests since then; the
+result is identical.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Worker(Protocol):
         """Ask for something; see ``Station.answer``.
 
         Raises:
-            WorkerLost: nobody is there.
+            WorkerLost: it has ended.
         """
         ...
 
@@ -66,7 +66,7 @@ class Worker(Protocol):
         """The answer to the oldest task that has none.
 
         Raises:
-            WorkerLost: nobody is there any more.
+            WorkerLost: it has ended.
             SkillweaveError: the collector failed; the kind and the message are those of its error.
         """
         ...
@@ -77,7 +77,7 @@ class Worker(Protocol):
 
 
 class Station:
-    """What stands where a worker runs: a collector, or another, that answers tasks.
+    """The object at a worker that answers tasks: a collector, or part of a population.
 
     Args:
         each: its environments, if it is a collector.
@@ -164,7 +164,7 @@ class Workers:
             raise
 
     def ask(self, what: str, tasks: Sequence[Any], kept: bool = True) -> list[Any]:
-        """What workers answer, each to a task of its own; those that are lost are made again.
+        """Return the workers' answers, each to a task of its own; lost workers are recreated.
 
         Args:
             kept: the tasks change where workers stand.
@@ -175,13 +175,13 @@ class Workers:
         return self._completed(self._asked(range(len(self._workers)), what, tasks), path)
 
     def states(self) -> list[dict[str, Array]]:
-        """Where each worker stands; lost ones need go back no further from now on."""
+        """Return the states of the workers; lost ones go back no further from now on."""
         states: list[dict[str, Array]] = self.ask("state", [None] * len(self._workers), kept=False)
         self._past = [("restore", states)]
         return states
 
     def stand(self, states: Sequence[dict[str, Array]]) -> list[Array]:
-        """Stand where ``states`` say; of each, environments that begin anew."""
+        """Stand where ``states`` say; of each, environments that start again."""
         self._past = []
         return self.ask("restore", states)
 
@@ -193,7 +193,7 @@ class Workers:
     def _completed(
         self, found: dict[int, Any], path: Sequence[tuple[str, Sequence[Any]]]
     ) -> list[Any]:
-        """What all workers answer in the end; those that are not in ``found`` are made again."""
+        """Return the answers of all workers; those that are not in ``found`` are recreated."""
         for tried in range(self.tries):
             if lost := [i for i in range(len(self._workers)) if i not in found]:
                 found |= self._again(lost, path, must=tried == self.tries - 1)
@@ -215,12 +215,12 @@ class Workers:
         return found
 
     def _did_again(self, what: str, found: dict[int, Any]) -> None:
-        """What workers answered that did again what others had done."""
+        """Return the answers of workers that repeated what lost ones had done."""
 
     def _asked(
         self, numbers: Iterable[int], what: str, tasks: Sequence[Any], must: bool = False
     ) -> dict[int, Any]:
-        """What some workers answer; without those that are lost."""
+        """Return the answers of some workers, without those that are lost."""
         numbers = list(numbers)
         for i in numbers:
             with suppress(WorkerLost):  # that is found out when it should answer
@@ -228,7 +228,7 @@ class Workers:
         return self._received(numbers, must)
 
     def _received(self, numbers: Iterable[int], must: bool = False) -> dict[int, Any]:
-        """What some workers answer; ``must``: none may be lost."""
+        """Return the answers of some workers; ``must``: none may be lost."""
         found = {}
         for i in numbers:
             try:
@@ -243,11 +243,11 @@ class Workers:
     def _failed(self, number: int, lost: WorkerLost) -> TrainingError:
         return TrainingError(
             f"{self._name}: worker {number}{self._whose(number)} {lost}, and again when it was "
-            "made anew"
+            "made again"
         )
 
     def _whose(self, number: int) -> str:
-        """What a worker has, for messages."""
+        """Describe a worker's environments for messages."""
         return ""
 
 
@@ -271,7 +271,7 @@ class WorkerCollectors(Workers, Collectors):
         super().__init__(workers, name)
 
     def start(self, seeds: Seeds) -> None:
-        """Start every environment anew, unless they are under way."""
+        """Start every environment, unless they have started."""
         if not self._past:
             self.ask("start", self._divided(seeds))
 
@@ -289,7 +289,7 @@ class WorkerCollectors(Workers, Collectors):
         return joined_states(self.states())
 
     def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says; (k,) environments that begin anew."""
+        """Stand where ``state`` says; (k,) environments that start again."""
         return self._columns(self.stand(split_states(state, len(self._workers))))
 
     def _did_again(self, what: str, found: dict[int, Any]) -> None:

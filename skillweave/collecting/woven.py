@@ -37,7 +37,7 @@ class WovenCollector(DecisionCollector):
         skills: those that learn have any policy; ``UntrainedHierarchy`` where one is a hierarchy.
         learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
             ``skill_critic`` and ``inner/skill_critic`` say what skills are worth.
-        margins: by the paths of critics: calls are cut where deciding anew is worth so much more.
+        margins: by the paths of critics: calls end where a new decision is worth this much more.
         guide, as_skill: as of ``DecisionCollector``.
     """
 
@@ -76,7 +76,7 @@ class WovenCollector(DecisionCollector):
         return found
 
     def _part(self, path: str) -> Batch:
-        """What was collected for a learner."""
+        """Return what was collected for a learner."""
         node, _, name = path.rpartition("/")
         level = next(x for x in self.root.all() if x.path == (f"{node}/" if node else ""))
         assert self._rows is not None
@@ -162,7 +162,7 @@ class WovenCollector(DecisionCollector):
             self._rows.acts[level.path][out.row, ids] = True
 
     def _walk(self, level: Level, ids: Array, step: Step, end: Array) -> None:
-        """What a step was to the skills of a level, in environments ``ids`` (k,).
+        """Judge a step for the skills of a level, in environments ``ids`` (k,).
 
         Args:
             step: of all environments.

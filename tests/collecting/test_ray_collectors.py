@@ -280,7 +280,7 @@ def test_a_full_object_store_is_told(on_ray, monkeypatch):
 
 @pytest.mark.parametrize(
     ("address", "says"),
-    [("127.0.0.1:1", "nobody listens at 127.0.0.1:1"), ("nowhere", "write host:port")],
+    [("127.0.0.1:1", "no program listens at 127.0.0.1:1"), ("nowhere", "write host:port")],
 )
 def test_an_address_where_nobody_listens_is_told_at_once(monkeypatch, address, says):
     monkeypatch.setattr(ray, "is_initialized", lambda: False)

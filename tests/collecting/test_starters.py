@@ -149,7 +149,7 @@ def test_an_episode_in_which_it_may_not_start_begins_anew():
     # The step that leads there counts still, and who has started is not disturbed.
     found = collector_of(Forward, search_steps=20).collect(next(requests(200))).batches[""]
     assert set(np.unique(found["obs"][:, :, T][found["valid"]])) == set(range(20, 25))
-    with pytest.raises(SkillweaveError, match=r"begun anew after 19 of them \(search_steps\)"):
+    with pytest.raises(SkillweaveError, match=r"reset after 19 of them \(search_steps\)"):
         collector_of(Forward, search_steps=19).collect(next(requests(6_000)))
 
 

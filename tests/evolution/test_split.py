@@ -200,7 +200,7 @@ class Cursed(Walk):
 @pytest.mark.slow
 def test_a_part_that_dies_again_and_again_is_told(tmp_path):
     cursed = Agent(EnvSpec(Cursed, engine="sync", workers=2), SMALL, 240)
-    says = r"Cursed.*worker 0 died by signal 9.*, and again when it was made anew"
+    says = r"Cursed.*worker 0 died by signal 9.*, and again when it was made again"
     with pytest.raises(SkillweaveError, match=says):
         cursed.train(tmp_path / "run", quiet=True, evolve=EVOLVE)
 
