@@ -89,7 +89,7 @@ class SkillSet:
         return own or any(skills.restricts for skills in below if skills is not None)
 
     def _may_start(self, i: int, obs: Array) -> Array:
-        """Return where skill ``i`` may start, (n,); a hierarchy where one of its skills may, too."""
+        """Return where skill ``i`` may start, (n,); of a hierarchy, also one of its skills."""
         skill, below = self.skills[i], skills_below(self.policies[i])
         may = np.ones(len(obs), bool)
         if skill.defines("initiation"):
