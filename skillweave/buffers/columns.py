@@ -65,7 +65,8 @@ class Columns:
         action = np.dtype(action_dtype)
         if mask_size is not None and action.kind in "iu":
             action = np.dtype(next(k for k in INTEGERS if mask_size - 1 <= np.iinfo(k).max))
-        item, shape = obs_dtype(observation_space), obs_shape(observation_space)
+        item = obs_dtype(observation_space)
+        shape = obs_shape(observation_space)
         kinds: dict[str, tuple[tuple[int, ...], Any]] = {
             "obs": (shape, item),
             "action": (action_shape, action),
@@ -138,11 +139,11 @@ class Columns:
         if "call" not in self.data:
             return self.data["reward"].take(slot)
         places, steps = self._places(slot.ravel())
-        begins = steps.cumsum() - steps
-        power = np.arange(len(places)) - begins.repeat(steps)
+        offsets = steps.cumsum() - steps
+        power = np.arange(len(places)) - offsets.repeat(steps)
         factor = np.broadcast_to(np.float64(gamma), slot.shape).ravel().repeat(steps)
         each = factor**power * self._rewards.take(places)
-        reward: Array = np.add.reduceat(each, begins).reshape(slot.shape).astype(np.float32)
+        reward: Array = np.add.reduceat(each, offsets).reshape(slot.shape).astype(np.float32)
         return reward
 
     def power(self, gamma: Array, slot: Array) -> Array:
@@ -232,15 +233,17 @@ class Columns:
         place = (self.newest + ~self._open)[None]
         if len(ended) > 1:  # a slot for each row before, and for each end before
             before = np.ones_like(ended) if valid is None else valid
-            taken = before + (ended & before).astype(np.int64)
-            place = place + taken.cumsum(0) - taken
+            slots_needed = before + (ended & before).astype(np.int64)
+            place = place + slots_needed.cumsum(0) - slots_needed
         slot: Array = place % self.rows * self.num_envs + self._column
         if valid is None:
-            self.newest, self._open = place[-1] + 1, ~ended[-1]
+            self.newest = place[-1] + 1
+            self._open = ~ended[-1]
             return slot.ravel()
         column = np.flatnonzero(valid.any(0))
         last = len(valid) - 1 - valid[::-1, column].argmax(0), column
-        self.newest[column], self._open[column] = place[last] + 1, ~ended[last]
+        self.newest[column] = place[last] + 1
+        self._open[column] = ~ended[last]
         return slot[valid]
 
     def _start(self, name: str) -> None:
@@ -301,8 +304,8 @@ class Columns:
     def _places(self, slot: Array) -> tuple[Array, Array]:
         """Return the places of the rewards of calls (k,), call after call, and their steps (k,)."""
         steps = self.data["steps"].take(slot).astype(np.int64)
-        begins = steps.cumsum() - steps
-        first = (self.data["call"].take(slot) - begins).repeat(steps)
+        offsets = steps.cumsum() - steps
+        first = (self.data["call"].take(slot) - offsets).repeat(steps)
         return first + np.arange(len(first)), steps
 
 

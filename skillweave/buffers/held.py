@@ -123,7 +123,8 @@ def check_columns(
         if x.dtype.kind == "f" and name != "obs":
             in_range[name] = in_range.get(name, True) and np.isfinite(x).all()
     if "call" in written:
-        call, room = written["call"][transition], len(written["rewards"])
+        call = written["call"][transition]
+        room = len(written["rewards"])
         in_range["call"] = ((call >= 0) & (call + steps[transition] <= room)).all()
     if wrong := [name for name, right in in_range.items() if not right]:
         raise ValueError(f"{wrong[0]!r} of its replay buffer is out of range")

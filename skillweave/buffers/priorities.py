@@ -62,7 +62,8 @@ class SumTrees:
         tree = np.repeat(trees, fraction.shape[1])
         total = self._levels[-1].reshape(self._trees, -1)[trees].sum(1)
         target = (fraction * total[:, None]).reshape(-1)
-        leaf, each = np.zeros_like(tree), np.arange(len(tree))
+        leaf = np.zeros_like(tree)
+        each = np.arange(len(tree))
         for level, nodes in zip(reversed(self._levels), reversed(self._nodes), strict=True):
             children = level.reshape(-1, FAN_OUT).take(tree * nodes + leaf, axis=0)
             running = children.cumsum(1, dtype=np.float64)

@@ -228,13 +228,15 @@ class ReplayStore:
                     goes_on &= ~outcome.ended[..., k - 1]
                 slot = np.where(goes_on, slots[..., k], slot)
                 between.append((slot, np.where(goes_on, discount, np.float32(0))))
-            here = columns.reward(factor, slot) if outcome is None else outcome["reward"][..., k]
+            row_reward = (
+                columns.reward(factor, slot) if outcome is None else outcome["reward"][..., k]
+            )
             power = columns.power(factor, slot)
             if k:
-                reward += np.where(goes_on, discount * here, np.float32(0))
+                reward += np.where(goes_on, discount * row_reward, np.float32(0))
                 discount = np.where(goes_on, discount * power, discount)
             else:
-                reward = here
+                reward = row_reward
                 discount = power
         after = columns.after(slot)
         terminated = data["kind"].take(slot) == TERMINATED
@@ -263,7 +265,8 @@ class ReplayStore:
 
         Both are (P, B, n). A row that does not follow has the slot of the last one that does.
         """
-        slots, follows = [start], [np.ones(start.shape, bool)]
+        slots = [start]
+        follows = [np.ones(start.shape, bool)]
         for _ in range(self._n_step - 1):
             after = self._columns.after(slots[-1])
             follows.append(self._columns.data["kind"].take(after) != NOTHING)
@@ -276,10 +279,10 @@ class ReplayStore:
         if "steps" in data:
             raise TrainingError("transitions of several steps cannot be judged again")
         flat = slots.reshape(-1, slots.shape[-1])
-        named = {k: data[k].take(flat, axis=0) for k in ("obs", "action", "reward", *columns.raw)}
+        stored = {k: data[k].take(flat, axis=0) for k in ("obs", "action", "reward", *columns.raw)}
         never = np.zeros(flat.shape, bool)
         rows = Batch(
-            **named,
+            **stored,
             next_obs=data["obs"].take(columns.after(flat), axis=0),
             terminated=never,
             truncated=never,

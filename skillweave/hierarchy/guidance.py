@@ -142,11 +142,11 @@ def adopt_guide(declared: Declaration, entry: Mapping[str, Any], where: str) -> 
         )
 
 
-def check_guided(mine: bool, theirs: bool, where: str) -> None:
+def check_guided(is_guided: bool, recorded: bool, where: str) -> None:
     """Raise a RunError where only one of two selectors has a guide."""
-    if mine != theirs:
+    if is_guided != recorded:
         has = ("no guide", "a guide")
         raise RunError(
-            f"{where}: the selector has {has[theirs]}, but the selector of this hierarchy has "
-            f"{has[mine]}: declare guide= as it was, or train again"
+            f"{where}: the selector has {has[recorded]}, but the selector of this hierarchy has "
+            f"{has[is_guided]}: declare guide= as it was, or train again"
         )

@@ -146,9 +146,9 @@ def check_ends(declared: Declaration) -> None:
 
 def _check_ends(above: tuple[Any, ...], path: str) -> None:
     for skill, inner in inner_hierarchies(above[-1].skills):
-        here = f"{path}{skill.name}"
+        inner_path = f"{path}{skill.name}"
         if any(inner is other for other in above):
             raise DeclarationError(
-                f"{here} is a hierarchy that contains itself: it is among its own skills"
+                f"{inner_path} is a hierarchy that contains itself: it is among its own skills"
             )
-        _check_ends((*above, inner), f"{here}/")
+        _check_ends((*above, inner), f"{inner_path}/")

@@ -114,16 +114,16 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         turns = 0
         while len(rows):
             turns = self._turn(turns, rows, skill)
-            here = obs if len(rows) == n else obs[rows]
+            rows_obs = obs if len(rows) == n else obs[rows]
             allowed = allowed_rows(self.engine.mask(), rows)
-            action = self._player.act_in_calls(self._memory, rows, here, allowed, turn)
+            action = self._player.act_in_calls(self._memory, rows, rows_obs, allowed, turn)
             raw = self.engine.step(action, None if len(rows) == n else rows)
             reward[rows] += discount[rows] * raw.reward
             call_return[rows] += raw.reward
             discount[rows] *= self._gamma
             steps[rows] += 1
             next_obs[rows] = raw.next_obs
-            over = self._observe(rows, here, action, raw, steps[rows])
+            over = self._observe(rows, rows_obs, action, raw, steps[rows])
             ended = raw.terminated | raw.truncated
             if len(rows) == n:
                 obs = raw.next_obs.copy()
@@ -137,7 +137,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 over = over | ended
             if over.any():
                 rows = rows[~over]
-        self._obs, self._mask = obs, self.skills.mask(obs)
+        self._obs = obs
+        self._mask = self.skills.mask(obs)
         info = {
             "steps": steps,
             "discount": (discount * ~terminated).astype(np.float32),

@@ -179,8 +179,8 @@ def _sampling(run: RunDirectory, names: tuple[str, ...]) -> tuple[bool, bool]:
             if to_be_judged(entry):
                 continue
             return True, False  # not evaluated: skills act as they did while the selector learnt
-        if (kept := entry["kept"]["kept"]) != "before":
-            return SAMPLING[kept]
+        if (choice := entry["kept"]["kept"]) != "before":
+            return SAMPLING[choice]
     return False, False
 
 

@@ -101,7 +101,7 @@ def _trained(
     declaration: Declaration,
     run: RunDirectory,
     listeners: tuple[Listener, ...],
-    known: Policies,
+    policies: Policies,
     make_learner: MakeLearner,
     nodes: tuple[str, ...] = (),
     as_skill: Skill | None = None,
@@ -109,19 +109,19 @@ def _trained(
     """Return all policies after the stages of a hierarchy and of those below it, by path.
 
     Args:
-        known: the policies before.
+        policies: the policies before.
         nodes: the names on the way to the hierarchy, where it is a skill of another one.
         as_skill: the hierarchy as a skill.
     """
     if declaration.learns_apart:
         for skill, inner in inner_hierarchies(declaration.skills):
             below = (*nodes, skill.name)
-            known = _trained(inner, run, listeners, known, make_learner, below, skill)
+            policies = _trained(inner, run, listeners, policies, make_learner, below, skill)
     stages = own_stages(settled(declaration, run, nodes), as_skill)
     for name in reversed(nodes):
         stages = [stage.inside(name) for stage in stages]
     apart = [s for s in stages if s.kind != "together"]
-    before = train_stages(apart, run, listeners, known, make_learner)
+    before = train_stages(apart, run, listeners, policies, make_learner)
     if len(apart) == len(stages):
         return before
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
@@ -188,7 +188,7 @@ def _entry_of(run: RunDirectory, path: str) -> dict[str, Any]:
 
 
 def _selector_entry(declaration: Declaration) -> dict[str, Any]:
-    """Where a ready selector comes from, or the guide of a trained one."""
+    """Return the entry of a ready selector's source, or of a trained one's guide."""
     selector = declaration.ready_selector
     return guide_entry(declaration) if selector is None else {SELECTOR: source_of(selector)}
 
@@ -221,8 +221,10 @@ def _hierarchy_entry(declaration: Declaration, *, together: bool) -> dict[str, A
         together: all its parts learn together in a stage; else skills and selector are greedy by
             default.
     """
-    selection, apart = declaration.selection, declaration.apart
-    skills, selector = selection.greedy_skills, selection.greedy_selector
+    selection = declaration.selection
+    apart = declaration.apart
+    skills = selection.greedy_skills
+    selector = selection.greedy_selector
     return {
         **calls_to_json(declaration.call_steps),
         "learn": declaration.learn,

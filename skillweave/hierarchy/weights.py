@@ -196,16 +196,17 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     if header["kind"] == "agent":
         return read_agent(declaration.spec, tensors, header, path)
     skills = dict(every_skill(declaration.skills))
-    names, inner = list(skills), {name for name, _ in every_hierarchy(declaration) if name}
+    names = list(skills)
+    inner = {name for name, _ in every_hierarchy(declaration) if name}
     inner_headers = header["hierarchies"]
     if (
         header["skills"] != names
         or header["env"] != declaration.spec.name
         or set(inner_headers) != inner
     ):
-        theirs = ", ".join(header["skills"])
+        recorded_skills = ", ".join(header["skills"])
         raise RunError(
-            f"{path} is of skills {theirs[:300]} on {header['env'][:100]}, but the "
+            f"{path} is of skills {recorded_skills[:300]} on {header['env'][:100]}, but the "
             f"hierarchy has {', '.join(names)} on {declaration.spec.name}"
         )
 
@@ -220,12 +221,15 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
         return None if content is None else content.contiguous().numpy().tobytes()
 
     policies: dict[str, Policy] = {}
-    ready, recorded = declaration.ready_policies(), header["ready"]
+    ready = declaration.ready_policies()
+    recorded = header["ready"]
     for name, policy in ready.items():
-        read, where = partial(copied, name), f"{path}: skill {name!r}"
+        read = partial(copied, name)
+        where = f"{path}: skill {name!r}"
         policies[name] = as_recorded(policy, recorded.get(name), read, where)
     for name, hierarchy in every_hierarchy(declaration):
-        node, where = f"{name}/" if name else "", f"{path}: {name}" if name else str(path)
+        node = f"{name}/" if name else ""
+        where = f"{path}: {name}" if name else str(path)
         entry = inner_headers[name] if name else header
         adopt_calls(hierarchy, entry)
         check_selector(hierarchy.ready_selector is not None, node + SELECTOR in recorded, where)
@@ -262,12 +266,12 @@ def adopt_calls(declaration: Declaration, entry: Mapping[str, Any]) -> None:
         declaration.together = replace(declaration.together, margin=margin)
 
 
-def check_selector(mine: bool, theirs: bool, where: str) -> None:
+def check_selector(is_ready: bool, recorded: bool, where: str) -> None:
     """Raise a RunError where one selector is ready and the other is trained."""
-    if mine != theirs:
+    if is_ready != recorded:
         kinds = ("a trained selector", "a ready one (a function, an automaton or a tree)")
         raise RunError(
-            f"{where} has {kinds[theirs]}, but this hierarchy has {kinds[mine]}: declare the "
+            f"{where} has {kinds[recorded]}, but this hierarchy has {kinds[is_ready]}: declare the "
             "selector as it was, or train again"
         )
 
