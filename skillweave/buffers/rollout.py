@@ -16,7 +16,7 @@ from skillweave.types import Array, unprefixed
 
 
 class RolloutStore:
-    """Batches that are stored until a ``Rollout`` of them is taken, once.
+    """Store of batches until a ``Rollout`` of them is taken, once.
 
     The store has N = P·B columns as in ``Batch``. In a rollout the valid rows of a column come
     first. Several batches stand side by side, as further columns. Columns without a valid row are

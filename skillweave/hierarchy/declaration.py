@@ -167,7 +167,7 @@ class Declaration(Nestable):
         """Return the action space of a selector, critic or skill at ``path``.
 
         Args:
-            actions: the environment's action space, which is that of skills.
+            actions: the environment's action space, on which skills act.
         """
         node, _, name = path.rpartition("/")
         if name not in (SELECTOR, CRITIC):

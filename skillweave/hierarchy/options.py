@@ -32,7 +32,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     ``info`` of a step, arrays over N environments: ``steps`` (τ), ``discount`` (γ^τ, or 0 where
     terminated), ``call_return`` (Σ rₖ), ``next_obs`` (the true successors, one array whatever the
     space: see ``spaces.pack``), and Gymnasium's ``final_obs``. Where initiation sets exist:
-    ``action_mask`` (N, S), and ``next_action_mask``, that of ``next_obs`` (all True where the
+    ``action_mask`` (N, S), and ``next_action_mask``, the mask of ``next_obs`` (all True where the
     episode terminated, or no skill may start).
 
     Args:

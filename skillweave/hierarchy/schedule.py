@@ -59,7 +59,7 @@ def own_stages(
     as_skill: Skill | None = None,
     budgets: Mapping[str, int] | None = None,
 ) -> list[Stage]:
-    """Return the stages of a hierarchy without those of hierarchies below."""
+    """Return the stages of a hierarchy without the stages of hierarchies below."""
     budgets = declaration.budgets() if budgets is None else budgets
     apart = _apart(declaration, as_skill, budgets) if declaration.learns_apart else []
     if not declaration.learns_together:

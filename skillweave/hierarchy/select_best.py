@@ -169,7 +169,7 @@ def _set_sampling(declared: Declaration, skills: bool, selector: bool) -> None:
 
 
 def _sampling(run: RunDirectory, names: tuple[str, ...]) -> tuple[bool, bool]:
-    """Return whether skills and selector sample, by the latest stage in which all learnt."""
+    """Return two flags, skills and selector sample, by the latest stage in which all learnt."""
     stages: dict[str, Mapping[str, Any]] = {s["name"]: s for s in run.manifest["stages"]}
     for depth in range(len(names) + 1):
         entry = stages.get("/".join((*names[:depth], TOGETHER)))

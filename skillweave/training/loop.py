@@ -232,7 +232,7 @@ class _Loop:
             self.at.metrics |= self.learner.learn(*arguments)
 
     def _finish_update(self) -> None:
-        """Wait for a pending update."""
+        """Finish a pending update: wait for it, and keep its metrics."""
         if self._pending is not None:
             metrics = self._pending.result()
             self._pending = None
