@@ -95,11 +95,11 @@ class HierarchyPolicy:
         return memory
 
     def acting(self, memory: Memory) -> Array | None:
-        """Return the running skill of each environment, (n,) int64."""
+        """Return the running skills in a ``memory``, (n,) int64."""
         return memory["skill"]
 
     def acts(self, memory: Memory, row: int = 0) -> str:
-        """Return the path of the skill that acts in environment ``row``: ``inner/skill``."""
+        """Return the path of the skill that acts in ``row`` of the ``memory``: ``inner/skill``."""
         i = int(memory["skill"][row])
         name = self.labels[i]
         policy = self.skills.policies[i]
